@@ -50,6 +50,7 @@ class Uniform(sr.Maximiser):
         return np.inf
 
 
+@pytest.mark.slow
 class TestAnHonestMaximiser(MaximiserContract):
     component = Uniform
 

@@ -294,7 +294,9 @@ def test_the_papers_system_has_the_value_of_its_linear_program(run, row):
     assert_cost(run(config, overrides), value, accuracy)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    "solver", [pytest.param(name, marks=pytest.mark.slow if name == "proxqp" else ()) for name in SOLVERS]
+)
 def test_all_solvers_agree_on_the_papers_first_experiment(run, solver):
     outcome = run(EXPERIMENT_1, {"solver.name": solver})
     assert_cost(outcome, run(EXPERIMENT_1).result.cost, 1e-6)

@@ -264,6 +264,7 @@ def test_forged_costs_and_multipliers_of_an_effort_are_refused(tmp_path: Path) -
         assert verdicts(multipliers(change))["lower bound"] == "fails"
 
 
+@pytest.mark.slow
 def test_affine_answers_are_the_best_of_all_causal_ones_for_the_worst_effort_of_a_spring(tmp_path: Path) -> None:
     """The bound over trees of signals meets the bound over affine policies; forged shares are refused."""
     spring = {**SCALAR, **PLANE, "horizon": 5.0, "disturbance": {"box": [0.2, 0.2]}, "terminal": [{"box": [0.3, 0.3]}]}

@@ -55,7 +55,7 @@ def test_bounds_of_state_and_control_together_cost_what_a_linear_program_says(co
     bracketed(outcome.result.cost, programs)
 
 
-@pytest.mark.parametrize("cost", ["nominal", "peak"])
+@pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 def test_a_path_that_moves_costs_what_a_linear_program_says(cost: str, tmp_path: Path) -> None:
     outcome = run({**SPRING, "path": [MOVING]}, tmp_path / "run", cost)
     proven(outcome)
@@ -99,9 +99,10 @@ def step_rows(independent: PolicyProgram, least: float, most: float, first: floa
     ("changed", "rows"),
     [
         (STEPS, lambda independent: step_rows(independent, -0.5, 0.5, 0.0)),
-        (
+        pytest.param(
             {"control_step": {"box": {"lower": -0.4, "upper": 0.6}}},
             lambda independent: step_rows(independent, -0.4, 0.6, None),
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["from the control before", "uneven"],
@@ -121,9 +122,8 @@ def test_steps_of_the_control_cost_what_a_linear_program_says(
     bracketed(outcome.result.cost, programs)
 
 
-@pytest.mark.parametrize(
-    "cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak", pytest.param("worst", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
 def test_everything_together_keeps_every_guarantee(cost: str, tmp_path: Path) -> None:
     together = {
         **SPRING,

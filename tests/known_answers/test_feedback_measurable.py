@@ -69,6 +69,7 @@ def test_finer_pieces_of_the_disturbance_cost_more_and_more_and_measurable_ones_
         assert measurable.result.cost - lower[0] > 1e-3  # what pieces of the control's length leave out
 
 
+@pytest.mark.slow
 def test_what_is_held_is_the_worst_where_one_state_is_disturbed(tmp_path: Path) -> None:
     """``x' = -x + u + w``: the worst disturbance of a piece is constant on it, so pieces leave nothing out."""
     problem = {
@@ -87,6 +88,7 @@ def test_what_is_held_is_the_worst_where_one_state_is_disturbed(tmp_path: Path) 
     assert found[0].result.cost == pytest.approx(found[1].result.cost, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_a_control_beside_the_state_has_answered_what_happened_until_it_jumped(tmp_path: Path) -> None:
     """``x' = u + w``, ``|x + u| <= 1/2`` from 1, where the control jumps, to 1.2: the second piece of the control takes
     back all that the first one of the disturbance did, so that ``2 + v_0 + v_1 <= 1/2`` is all that is asked for."""

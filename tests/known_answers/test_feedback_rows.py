@@ -75,7 +75,7 @@ def bracketed(cost: float, programs: Callable[[int], float], within: float = 2e-
     assert cost == pytest.approx(fine, rel=within)
 
 
-@pytest.mark.parametrize("cost", ["nominal", "peak"])
+@pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 @pytest.mark.parametrize(
     "begun",
     [[0.3, 0.0], pytest.param([0.1, 0.1], marks=pytest.mark.slow), pytest.param([0.05, 0.4], marks=pytest.mark.slow)],
@@ -104,7 +104,9 @@ STATES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("disturbed", [pytest.param(True, marks=pytest.mark.slow), False])
-@pytest.mark.parametrize("name", STATES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "an ellipsoid" else ()) for name in STATES]
+)
 def test_sets_of_initial_states_keep_every_guarantee(name: str, disturbed: bool, tmp_path: Path) -> None:
     disturbance = SPRING["disturbance"] if disturbed else None
     problem = {**SPRING, "initial_state": {"centre": [-1, 1], **STATES[name]}, "disturbance": disturbance}

@@ -171,6 +171,7 @@ def test_a_round_set_of_controls_reaches_along_the_straight_line() -> None:
     assert_between(margin(problem, 4, tolerance=1e-3), 1.5, 2e-2)
 
 
+@pytest.mark.slow
 def test_horizons_before_a_window_begins_do_not_know_of_it() -> None:
     """|x| <= 1.6 is met from 0.4 on; the window from 0.5 asks for |x(0.5)| <= 1.2, and 1.5 is the least: an island."""
     island = {**RATE, "horizon": 2.0, "terminal": [{"box": [1.6]}], "path": [{"box": [1.2], "from": 0.5}]}

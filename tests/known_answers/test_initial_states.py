@@ -87,6 +87,7 @@ def test_just_inside_is_certified_and_just_outside_has_a_farkas_certificate(cart
         assert feasible(beyond) == "infeasible"
 
 
+@pytest.mark.slow
 def test_a_disturbance_shrinks_the_set(cart: sr.InitialStates) -> None:
     noisy = sr.initial_states(CART, NOISY, directions=16, values=0)
     assert noisy.outer_area < cart.inner_area

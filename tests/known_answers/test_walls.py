@@ -52,7 +52,7 @@ def least_heat(pieces: int) -> float:
     ("pieces", "uncertain"),
     [
         (16, False),
-        (16, True),
+        pytest.param(16, True, marks=pytest.mark.slow),
         pytest.param(64, False, marks=pytest.mark.slow),
         pytest.param(64, True, marks=pytest.mark.slow),
     ],
@@ -98,7 +98,7 @@ def ridden(wall: str, pieces: int, uncertain: bool = False, feedback: bool = Fal
     ("wall", "uncertain", "feedback", "most"),
     [
         ("sloped", False, False, 6),
-        ("sloped", True, False, 11),
+        pytest.param("sloped", True, False, 11, marks=pytest.mark.slow),
         ("moving", False, False, 14),
         pytest.param("moving", True, False, 16, marks=pytest.mark.slow),
         pytest.param("moving", False, True, 14, marks=pytest.mark.slow),

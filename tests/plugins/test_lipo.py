@@ -115,6 +115,7 @@ def test_the_bound_of_lipo_is_never_below_the_maximum(seed, budget, slack, d):
     assert report.upper_bound >= function(centres).max()
 
 
+@pytest.mark.slow
 def test_the_bound_closes_on_the_maximum():
     gaps = [
         sr.maximise(TWO, UNIT, "lipo", budget=budget, constant=3.0, polish=0.0).upper_bound - 1.0

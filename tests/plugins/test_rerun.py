@@ -133,6 +133,7 @@ def test_the_walk_has_the_values_of_the_trace_and_steps_to_what_was_accepted(sea
     assert (walk[accepted] == trace.value[accepted]).all()
 
 
+@pytest.mark.slow
 def test_rounds_have_the_bounds_of_the_history_on_all_three_timelines(exchanged: sr.Outcome) -> None:
     chunks = read(exchanged.directory / "recording.rrd")["/rounds/bounds"]
     assert all({"evaluation", "round", "time"} <= set(chunk.timeline_names) for chunk in chunks)

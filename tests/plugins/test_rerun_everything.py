@@ -21,7 +21,6 @@ pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 
 BUDGET = 40
 NAMES = sorted(file.name for file in CONFIGS.glob("*.yaml"))
-FEW = ("experiment1_scenario.yaml",)  # what is tried in the first stage as well
 MAXIMISERS = load_own_registry().names("maximiser")
 
 
@@ -66,9 +65,8 @@ def both(config: str, changes: dict[str, object], directory: Path, caplog: pytes
     assert not [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
 
 
-@pytest.mark.parametrize(
-    "config", [pytest.param(name, marks=() if name in FEW else pytest.mark.slow) for name in NAMES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("config", NAMES)
 def test_every_config_is_watched_and_shown_again(config: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     both(config, cheap(config), tmp_path, caplog)
 

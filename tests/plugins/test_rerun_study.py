@@ -156,6 +156,7 @@ def test_no_panel_of_a_study_is_empty(
         assert "cost J" in said or len(shown) == 2
 
 
+@pytest.mark.slow
 def test_the_map_has_every_status_with_its_colour_and_the_words_count_them(config: Path, tmp_path: Path) -> None:
     from sparserob_core.experiment.run.viewer import recorder
     from sparserob_rerun.study.board import shaded

@@ -131,12 +131,13 @@ def test_every_study_of_the_folder_can_be_run_and_says_what_it_shows() -> None:
 COARSE = {"dictionaries.control.pieces": 20, "dictionaries.disturbance.pieces": 20}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "size"),
     [
         pytest.param("experiment1_reduced", COARSE, id="coarse reduced"),
-        pytest.param("experiment1_literal", COARSE, marks=pytest.mark.slow, id="coarse literal"),
-        *(pytest.param(name, {}, marks=pytest.mark.slow, id=name) for name in SEARCHES),
+        pytest.param("experiment1_literal", COARSE, id="coarse literal"),
+        *(pytest.param(name, {}, id=name) for name in SEARCHES),
     ],
 )
 def test_every_maximiser_takes_part_in_every_experiment_and_none_claims_too_much(

@@ -78,7 +78,9 @@ def test_the_signal_of_a_direction_attains_the_support_function_and_no_sampled_s
         assert a @ pushed <= float(found.support(a)) * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "four integrators" else ()) for name in CASES]
+)
 def test_every_point_of_the_set_has_an_admissible_signal(name: str) -> None:
     A, E, length, bound = CASES[name]
     found, rng = Zonoid.of(A, E, length, bound), np.random.default_rng(3)

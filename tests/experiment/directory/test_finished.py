@@ -274,7 +274,7 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     "kind",
-    [pytest.param(kind, marks=pytest.mark.slow if kind not in ("shorter", "text", "gone") else ()) for kind in WRONG],
+    [pytest.param(kind, marks=pytest.mark.slow if kind != "shorter" else ()) for kind in WRONG],
 )
 def test_whatever_is_wrong_with_an_array_is_an_error_of_the_input_or_none(
     searched: Path, tmp_path: Path, kind: str

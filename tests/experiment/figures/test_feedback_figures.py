@@ -92,6 +92,7 @@ def driven(outcome: sr.Outcome, worst: Adversary) -> np.ndarray:
     return np.array(acted)
 
 
+@pytest.mark.slow
 def test_what_answers_a_measurable_disturbance_is_drawn_too(tmp_path: Path) -> None:
     config = {
         "problem": pushed_spring(0.25),

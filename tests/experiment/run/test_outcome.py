@@ -83,6 +83,7 @@ def test_a_result_is_taken_wherever_a_run_is(solved: sr.SolvedProblem, saved: sr
     assert [curve.status for curve in comparison.curves] == [solved.status, nominal.status, solved.status]
 
 
+@pytest.mark.slow
 def test_a_problem_and_a_run_are_taken_wherever_a_config_is(
     solved: sr.SolvedProblem, saved: sr.Outcome, tmp_path: Path
 ) -> None:

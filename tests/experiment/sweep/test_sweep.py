@@ -493,7 +493,8 @@ def test_a_sweep_that_is_killed_loses_at_most_what_was_running(counting: Path, t
     assert {path.name for path in (out / "runs").iterdir()} == {row["run"] for row in study.table}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_sweep_says_how_to_go_on_and_can(counting: Path, tmp_path: Path, number: int) -> None:
     out = tmp_path / "out"
     with sweeping(counting, out) as process:

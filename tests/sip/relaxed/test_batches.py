@@ -95,6 +95,7 @@ def test_every_maximiser_finds_the_same_to_the_last_bit_with_workers_and_without
         assert workers.calls > 2, "nothing was sent to the workers"
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_costs_nothing(worth):
     workers = Elsewhere(broken=1)
     assert searched({"name": "random_search"}) == searched({"name": "random_search"}, workers)
