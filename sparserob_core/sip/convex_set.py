@@ -24,6 +24,9 @@ SPIKE = 1e-12  # of the set's extent: half the thickness below which a set count
 TILT = 1e-14  # by which a ray is turned in the choice of pivots, so that no choice is a tie
 PLAIN = 3  # dimension up to which a set is sampled by rejection
 MIXING = 8  # steps of hit and run per dimension
+# Of a set's extent: a point that is so near to the boundary is on it but for rounding, and how far it is then drawn
+# inwards. Ten times less, and rounding decides again; ten times more would move the nominal trajectory by what is told.
+EDGE, INWARDS = 1e-13, 1e-12
 TRIES = 10_000  # points drawn per wanted point before rejection sampling gives up
 
 
@@ -155,7 +158,15 @@ class ConvexSet(ABC):
         middle: Array = np.where(
             bounded, (np.where(bounded, box.lower, 0.0) + np.where(bounded, box.upper, 0.0)) / 2, 0.0
         )
-        if self.violation(middle) <= 0.0:
+        size = float((box.upper - box.lower)[bounded].max(initial=0.0))
+        out = float(self.violation(middle))
+        if (
+            abs(out) <= EDGE * size and bounded.all()
+        ):  # of a triangle it may be halfway along a side: rounding says where
+            within = self.interior_point()
+            inwards: Array = middle + INWARDS * (within - middle)
+            return middle if float(self.violation(within)) >= -EDGE * size else inwards
+        if out <= 0.0:
             return middle
         if bounded.all():
             return self.interior_point()
