@@ -14,6 +14,9 @@ from tests.support.places import ROOT
 DOCS = ROOT / "docs"
 NUMBERS = json.loads((DOCS / "paper" / "numbers.json").read_text())
 RELATIVE, ABSOLUTE = 0.02, 2e-3  # of numbers that depend on what a solver of another version rounds differently
+# An annealing takes another path from the first rounding on that is another: 14 or 37 of ten thousand draws break what
+# it finds with two kernels of the same linear algebra, at 0.6587 or 0.6638.
+SEARCHED = (".runs.search1", ".draws.search1")
 
 
 @pytest.fixture
@@ -41,10 +44,10 @@ def differences(found, stored, where=""):
     if where.endswith(".message"):
         return []
     if isinstance(stored, int | float) and isinstance(found, int | float) and not isinstance(stored, bool):
+        freedom = 10 if where.startswith(SEARCHED) else 1
         share = 20 if where.endswith(".broken") else ABSOLUTE  # draws: 0.2 % of ten thousand
-        return (
-            [] if found == pytest.approx(stored, rel=RELATIVE, abs=share) else [f"{where}: {found} instead of {stored}"]
-        )
+        same = found == pytest.approx(stored, rel=freedom * RELATIVE, abs=freedom * share)
+        return [] if same else [f"{where}: {found} instead of {stored}"]
     return [] if found == stored else [f"{where}: {found!r} instead of {stored!r}"]
 
 
