@@ -150,9 +150,14 @@ class ConvexSet(ABC):
         return centre
 
     @shaped
+    def amid(self) -> Float[Array, " d"]:
+        """A point ``(d,)`` amid a bounded set: the same in other units, where that can be had."""
+        return self.interior_point()
+
+    @shaped
     def middle(self) -> Float[Array, " d"]:
-        """What the set is scaled about, ``(d,)``: the middle of its bounding box, 0 along sides that are free; an
-        interior point where that is not in the set. Raises `InputError` where a side is free and 0 is not inside."""
+        """What the set is scaled about, ``(d,)``: the middle of its bounding box, 0 along sides that are free; a point
+        amid the set where that is not in it. Raises `InputError` where a side is free and 0 is not inside."""
         box = self.bounding_box()
         bounded = np.isfinite(box.lower) & np.isfinite(box.upper)
         middle: Array = np.where(
@@ -163,13 +168,13 @@ class ConvexSet(ABC):
         if (
             abs(out) <= EDGE * size and bounded.all()
         ):  # of a triangle it may be halfway along a side: rounding says where
-            within = self.interior_point()
+            within = self.amid()
             inwards: Array = middle + INWARDS * (within - middle)
             return middle if float(self.violation(within)) >= -EDGE * size else inwards
         if out <= 0.0:
             return middle
         if bounded.all():
-            return self.interior_point()
+            return self.amid()
         raise InputError(
             "it has no centre to be enlarged about: it is free on a side, and 0 is outside of it; give it bounds on"
             " both sides",

@@ -325,3 +325,17 @@ def test_a_forged_final_state_is_found(name: str, tmp_path: Path, fixed: Path) -
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forged_initial_state_is_found(name: str, tmp_path: Path, begun: Path) -> None:
     assert forged(begun, tmp_path / "copy", FORGERIES[name]) == "refuted"
+
+
+def test_a_simplex_of_disturbances_has_one_middle_in_all_units(tmp_path: Path) -> None:
+    """That of its bounding box is outside; solver and checker count deviations from the same point."""
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0, 1, 0], [0, 0, 1], [0, 0, 0]], "B": [[0], [0], [1]]},
+        "horizon": 3.0,
+        "initial_state": [1000.0, 0.0, 0.0],
+        "control": {"box": 4000.0},
+        "disturbance": {"polytope": {"H": [[-1, 0, 0], [0, -1, 0], [0, 0, -1], [1, 0.1, 0.01]], "h": [0, 0, 0, 10]}},
+        "terminal": [{"box": [4000.0, 4000.0, 4000.0]}],
+    }
+    proven(run(problem, tmp_path / "run", "nominal", 6))

@@ -124,6 +124,11 @@ class Polytope(ConvexSet):
     def interior_point(self) -> Float[Array, " d"]:
         return self.chebyshev[0].copy()
 
+    @shaped
+    def amid(self) -> Float[Array, " d"]:
+        """The mean of the vertices, where they are known; the centre of the largest ball depends on units."""
+        return self.interior_point() if self.vertices is None else np.asarray(self.vertices.mean(axis=0))
+
     @cached_property
     def is_bounded(self) -> bool:
         axes = np.eye(self.dimension)

@@ -3,6 +3,8 @@ linear program."""
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -253,3 +255,28 @@ def test_an_ellipsoid_in_units_far_apart_still_tells_inside_from_outside() -> No
         assert np.isfinite(ellipsoid.violation(rim.T)).all()
         assert (ellipsoid.violation(0.5 * rim.T) < 0.0).all()
         assert (ellipsoid.violation(2.0 * rim.T) > 0.0).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_middle_on_the_boundary_is_drawn_inwards_whatever_rounding_says(seed):
+    """Of a triangle with a right angle the middle of the bounding box is halfway along the third side."""
+    rng = np.random.default_rng(seed)
+    a, b, corner = *rng.uniform(0.1, 10.0, 2), rng.uniform(-1.0, 1.0, 2)
+    H = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0 / a, -1.0 / b]])
+    # with the corners c, c - (a, 0) and c - (0, b)
+    h = np.array([corner[0], corner[1], 1.0 - corner[0] / a - corner[1] / b])
+    triangle = Polytope(H, h)
+    expected = corner - np.array([a, b]) / 2
+    found = triangle.middle()
+    assert found == pytest.approx(expected, abs=1e-11 * max(a, b))
+    exact = [sum((Fraction(x) * Fraction(y) for x, y in zip(row, found, strict=True)), Fraction(0)) for row in H]
+    assert all(value < Fraction(limit) for value, limit in zip(exact, h, strict=True))
+    units = np.array([2.0**7, 2.0**-5])
+    assert triangle.in_units(units).middle() * units == pytest.approx(found, rel=1e-13, abs=1e-13 * max(a, b))
+
+
+def test_a_point_amid_a_simplex_is_the_same_in_other_units():
+    simplex = Polytope(np.vstack([-np.eye(3), np.ones((1, 3))]), np.array([0.0, 0.0, 0.0, 1.0]))
+    units = np.array([2.0**-6, 1.0, 2.0**9])
+    assert simplex.middle() == pytest.approx([0.25] * 3, rel=1e-12)  # that of the bounding box is outside
+    assert simplex.in_units(units).middle() * units == pytest.approx(simplex.middle(), rel=1e-12)
