@@ -202,6 +202,17 @@ def test_a_forged_certificate_is_found(name: str, honest: Path, tmp_path: Path) 
     assert sr.check(tmp_path / "run").status == "refuted"
 
 
+@pytest.mark.parametrize("name", ["gains", "observer"])
+def test_what_a_certificate_leaves_out_is_not_what_a_solution_holds(name: str, honest: Path, tmp_path: Path) -> None:
+    shutil.copytree(honest, tmp_path / "run")
+    file = tmp_path / "run" / "certificate.json"
+    data = json.loads(file.read_text())
+    del data[name]
+    file.write_text(json.dumps(data))
+    verdicts = {one.name: one.verdict for one in sr.check(tmp_path / "run").claims}
+    assert verdicts["solution.npz"] == "fails"
+
+
 def test_a_controller_is_told_outputs_and_says_when_they_cannot_be(honest: Path) -> None:
     controller = sr.controller(str(honest))
     u = controller.step(0.0, [0.31])

@@ -15,7 +15,7 @@ import numpy as np
 
 from sparserob_core.control.feedback.innovations import KNOWN, Answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces
-from sparserob_core.control.feedback.observer import Observer, between
+from sparserob_core.control.feedback.observer import Observer, innovations_of
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -77,6 +77,12 @@ class ClosedLoop:
         """``M (K, K, m, d)``."""
         return self.answers.gains(x[self.nominal_size : self.nominal_size + self.answers.variables])
 
+    def written(self, x: Array | None) -> dict[str, Array]:
+        """What is written down of how a decision answers: its `gains`, where there is a decision, and of outputs the
+        ``observer (K, d, p)``."""
+        observer = {} if self.observer is None else {"observer": self.observer.L}
+        return observer if x is None else {"gains": self.gains(x), **observer}
+
     @cached_property
     def steps(self) -> Steps:
         """Matrices and transitions of the system."""
@@ -121,11 +127,7 @@ class ClosedLoop:
         seen = innovations_seen(
             problem.response, problem.dictionary, problem.disturbance, begun > 0, pieces=self.measurable
         )
-        if self.anew:
-            seen = np.insert(seen, np.full(begun, seen.shape[2] - begun), 0.0, axis=2)
-        if self.observer is None:
-            return seen
-        return self.observer.seen(seen, between(problem.response, problem.dictionary), begun)
+        return innovations_of(seen, begun, self.observer, self.anew)
 
     @cached_property
     def expected(self) -> tuple[Array, Array]:

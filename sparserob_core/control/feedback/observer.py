@@ -39,11 +39,13 @@ def between(response: Response, control: Dictionary) -> Array:
 @final
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """``C (p, d)``, the gains ``L (K, d, p)`` of every breakpoint, the last of which nothing follows, and the middle of
-    the noise ``(p,)``; ``noisy``: whether there is any."""
+    """``C (p, d)``, the gains ``L (K, d, p)`` of every breakpoint, the last of which nothing follows, the transitions
+    ``flows (K - 1, d, d)`` of the state from each to the next, and the middle of the noise ``(p,)``; ``noisy``: whether
+    there is any."""
 
     C: Array
     L: Array
+    flows: Array
     middle: Array
     noisy: bool
 
@@ -68,9 +70,13 @@ class Observer:
             L[j] = flows[j] @ P @ C.T @ np.linalg.pinv(S, rcond=TELLING, hermitian=True)
             left = flows[j] - L[j] @ C
             P = left @ P @ left.T + (L[j] * noise**2) @ L[j].T + entered[j + 1] @ entered[j + 1].T
-        return Observer(C, L, middle, measured.noise is not None)
+        return Observer(C, L, flows, middle, measured.noise is not None)
 
-    def seen(self, D: Array, flows: Array, begun: int) -> Array:
+    def outputs(self, states: Array, noise: Array | None = None) -> Array:
+        """What is measured of ``states (d, n)``, ``(p, n)``; with the middle of the noise unless it is given."""
+        return np.asarray(self.C @ states + (self.middle[:, None] if noise is None else noise))
+
+    def seen(self, D: Array, begun: int) -> Array:
         """The innovations ``(K, p, Q + K p)`` of the deviations that enter the state as ``D (K, d, Q)`` from breakpoint
         to breakpoint, and of those of the noise, which stand before the last ``begun``, of the initial state."""
         (K, d, Q), p = D.shape, self.C.shape[0]
@@ -84,10 +90,18 @@ class Observer:
                 place = Q - begun + j * p
                 found[j, :, place : place + p] += np.eye(p)
             if j + 1 < K:
-                error = flows[j] @ error - self.L[j] @ found[j]
+                error = self.flows[j] @ error - self.L[j] @ found[j]
         return found
 
     def in_units(self, states: Array, outputs: Array) -> Observer:
         """The same where one of a state was ``states (d,)``, and one of an output ``outputs (p,)``."""
-        C = self.C * outputs[:, None] / states
-        return Observer(C, self.L * states[:, None] / outputs, self.middle * outputs, self.noisy)
+        C, L = self.C * outputs[:, None] / states, self.L * states[:, None] / outputs
+        return Observer(C, L, self.flows * states[:, None] / states, self.middle * outputs, self.noisy)
+
+
+def innovations_of(entering: Array, begun: int, observer: Observer | None, anew: bool) -> Array:
+    """The innovations ``(K, p, Q)`` of all deviations, where those of disturbance and initial state enter the state as
+    ``entering (K, d, Q')``: those of the noise stand before the last ``begun``, of the initial state, and with ``anew``
+    so many of the next period's initial state between them, which nobody sees in this one."""
+    seen = entering if observer is None else observer.seen(entering, begun)
+    return np.insert(seen, np.full(begun, seen.shape[2] - begun), 0.0, axis=2) if anew else seen

@@ -120,9 +120,8 @@ class Controller:
         measured = None if state is None else self._measured(state)
         if period > self._period:
             self._begin(period)
-        anew = (
-            period > 0 and piece == 0 and self._observer is None
-        )  # from any of the initial states the proof holds for another period
+        # from any of the initial states the proof holds for another period
+        anew = period > 0 and piece == 0 and self._observer is None
         covered = measured is not None and (self._covered or anew) and self._within(measured)
         self._ever = self._ever or not covered
         answer = None
@@ -245,17 +244,13 @@ class Controller:
     def _innovations(self, state: Array) -> list[Array]:
         """What the applied plan knows of the disturbance when this state is measured, one vector for each breakpoint
         since it began."""
-        feedback = self._plan.known.feedback
-        if self._measuring is None or feedback is None:
-            return [np.zeros(state.size)]
-        return self._measuring.seen(state)
+        return [np.zeros(state.size)] if self._measuring is None else self._measuring.seen(state)
 
     def _control(self, piece: int, state: Array | None) -> Array:
         nominal = self._nominal[:, piece]
         if self._measuring is None:
             return nominal.copy()
-        numbers = np.flatnonzero(self._measuring.commanded == piece).tolist()
         seen = self._measuring.predicted() if state is None else state[:, None]
-        for number in numbers:
+        for number in np.flatnonzero(self._measuring.commanded == piece).tolist():
             self._measuring.after(number, lambda _: seen)
         return self._plan.drawn_in(self._measuring.command(piece)[:, 0], nominal)

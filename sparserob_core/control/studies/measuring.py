@@ -43,7 +43,7 @@ class Measuring:
     def seen(self, measured: Array) -> list[Array]:
         """The innovations ``(p,)`` so far, when ``measured (p,)`` is what is seen as the next piece begins; nothing is
         changed."""
-        return [*(one[:, 0] for one in self._innovations), self._new(measured[:, None])[:, 0]]
+        return [*(one[:, 0] for one in self._innovations), self._new(measured[:, None], self._observed())[:, 0]]
 
     def _loop(self) -> ClosedLoop:
         assert self.model.feedback is not None
@@ -52,18 +52,16 @@ class Measuring:
     def outputs(self, k: int, state: Array) -> Array:
         """What is measured of states ``(d, n)`` as piece ``k`` of the control begins, ``(p, n)``."""
         observer = self._loop().observer
-        if observer is None:
-            return state
-        return np.asarray(observer.C @ state + (observer.middle[:, None] if self.noises is None else self.noises[k]))
+        return state if observer is None else observer.outputs(state, None if self.noises is None else self.noises[k])
 
-    def _new(self, measured: Array) -> Array:
-        """What is new in what is measured ``(p, n)`` as the next piece begins."""
+    def _new(self, measured: Array, predicted: Array) -> Array:
+        """What is new in what is measured ``(p, n)`` as the next piece begins, where ``(d, n)`` is ``predicted``."""
         loop = self._loop()
-        observer, first = loop.observer, self._predicted is None
-        if observer is None and first:  # from one initial state nothing is new in it
-            return measured - loop.start[:, None] if loop.begins.any() else np.zeros_like(measured)
-        predicted = self._observed()
-        return measured - (predicted if observer is None else observer.C @ predicted + observer.middle[:, None])
+        if loop.observer is not None:
+            return measured - loop.observer.outputs(predicted)
+        if self._predicted is None and not loop.begins.any():  # from one initial state nothing is new in it
+            return np.zeros_like(measured)
+        return measured - predicted
 
     def _observed(self) -> Array:
         """What the state ``(d, n)`` is predicted to be as the next piece begins."""
@@ -77,7 +75,7 @@ class Measuring:
     def predicted(self) -> Array:
         """What is measured, ``(p, n)``, as the next piece begins where nothing is new in it."""
         observer, state = self._loop().observer, self._observed()
-        return state if observer is None else np.asarray(observer.C @ state + observer.middle[:, None])
+        return state if observer is None else observer.outputs(state)
 
     def command(self, k: int) -> Array:
         """The control ``(m, n)`` on its piece ``k``, which has begun."""
@@ -97,9 +95,8 @@ class Measuring:
         if piece == 0 or k != commanded[piece - 1]:
             if piece == 0:
                 self._predicted, self._innovations = None, []
-            now = measured(k)
-            new, predicted = self._new(now), self._observed()
-            self._innovations.append(new)
+            now, predicted = measured(k), self._observed()
+            self._innovations.append(self._new(now, predicted))
             u = np.repeat(self.nominal[:, k, None], now.shape[1], axis=1)
             for j, innovation in enumerate(self._innovations):
                 if self.gains[k, j].any():

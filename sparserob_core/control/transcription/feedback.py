@@ -17,7 +17,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
 from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
-from sparserob_core.control.feedback.observer import Observer, between
+from sparserob_core.control.feedback.observer import Observer, between, innovations_of
 from sparserob_core.control.feedback.zonoid import has_corners
 from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -60,17 +60,14 @@ def with_feedback(
     seen = innovations_seen(own.response, own.control, own.functionals.disturbance, begins, pieces)
     outputs, observed, theirs_observed, begun = units.states, None, None, units.states[: len(units.states) * begins]
     if problem.measurements is not None and own.problem.measurements is not None:
-        outputs, flows = problem.measurements.units(units.states), between(own.response, own.control)
+        outputs = problem.measurements.units(units.states)
         radii = np.delete(spread.radii, np.arange(deviations.size, spread.size - begun.size))
-        observed = Observer.of(own.problem.measurements, seen, flows, radii)
+        observed = Observer.of(own.problem.measurements, seen, between(own.response, own.control), radii)
         theirs_observed = observed.in_units(units.states, outputs)
-        seen = observed.seen(seen, flows, begun.size)
         deviations = np.append(deviations, np.tile(outputs, own.control.pieces if observed.noisy else 0))
     anew = _begins_anew(own)
     deviations = np.concatenate([deviations, begun, *[begun] * anew])
-    if anew:  # nobody sees the next period's initial state in this one
-        seen = np.insert(seen, np.full(begun.size, seen.shape[2] - begun.size), 0.0, axis=2)
-    seen = seen * (spread.chords > 0.0)  # what cannot deviate is not answered
+    seen = innovations_of(seen, begun.size, observed, anew) * (spread.chords > 0.0)  # else not answered
     scaled = answers(seen, mask, own.problem.system.controls)
     known = _in_users(scaled, outputs, deviations)
 

@@ -15,7 +15,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfiniteProgram
 
@@ -101,6 +101,12 @@ class Transcription:
     def response(self) -> Response:
         """The responses of the system on the merged grid."""
         return self.functionals.response
+
+    @property
+    def noise(self) -> ConvexSet | None:
+        """The set of the noise of what the control measures and answers; ``None`` where there is none."""
+        measured = None if self.feedback is None else self.problem.measurements
+        return None if measured is None else measured.noise
 
     def pieces(self, theta: Array) -> Array:
         """The control ``(m, K)`` on the pieces of its dictionary, of a decision ``theta (m, N)`` or ``(m N,)``; under

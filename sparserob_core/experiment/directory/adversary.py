@@ -147,9 +147,8 @@ def _require_shapes(file: Path, arrays: Mapping[str, Array], model: Transcriptio
             raise InputError(
                 f"{file}: {name}: expected finite numbers of shape {shape}, got shape {arrays[name].shape}"
             )
-    measured = model.problem.measurements if model.feedback is not None else None
-    if measured is not None and measured.noise is not None:
-        shape = (sizes["f"], model.control.pieces, measured.outputs)
+    if model.noise is not None:
+        shape = (sizes["f"], model.control.pieces, model.noise.dimension)
         given = arrays.get("noises", np.zeros(0))
         if given.shape != shape or given.dtype.kind != "f" or not np.isfinite(given).all():
             raise InputError(f"{file}: noises: expected finite numbers of shape {shape}, got shape {given.shape}")

@@ -66,8 +66,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     answered: dict[str, Any] = {}
     if feedback is not None:
         answered["policy"] = {"cost": feedback.charge.cost, "answers": [_runs(row) for row in feedback.answers]}
-        answered |= {} if theta is None else {"gains": feedback.loop.gains(np.asarray(result.decision))}
-        answered |= {} if feedback.loop.observer is None else {"observer": feedback.loop.observer.L}
+        answered |= feedback.loop.written(None if result.decision is None else np.asarray(result.decision))
     causal = result.causal if isinstance(result, ControlResult) and result.causal and result.causal.rows else None
     return {
         "format": FORMAT,

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 UNFINISHED = "the run has not finished"
 NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
+ANSWERS = ("gains", "observer")  # how a decision answers what is measured, where it does: states, or outputs
 SAME = 1e-9  # of the largest number of an array, how far it may be from what follows from another
 LARGEST = 2**31
 """Bytes of arrays in one file, at most: no run writes as many, and a small file can pretend to hold any number."""
@@ -178,7 +179,7 @@ class FinishedRun:
         claims of that control is true is for `check` to say."""
         file = self.directory / "certificate.json"
         said = read_json(file) if file.is_file() else {}
-        held = {"decision": self.theta} | {name: self.solution.get(name, np.zeros(0)) for name in ("gains", "observer")}
+        held = {"decision": self.theta} | {name: self.solution.get(name, np.zeros(0)) for name in ANSWERS}
         for name in (name for name in held if said.get(name) is not None):
             try:
                 same = np.array_equal(np.array(said[name], dtype=float), held[name])
@@ -195,14 +196,12 @@ class FinishedRun:
         model = self.experiment.transcription
         followed = {"theta": model.nominal(decision), "control": model.pieces(decision)}
         if model.feedback is not None:
-            followed["gains"] = model.feedback.loop.gains(decision)
-            observer = model.feedback.loop.observer
-            followed |= {} if observer is None else {"observer": observer.L}
+            followed |= model.feedback.loop.written(decision)
         elif self.solution.get("decision", np.zeros(0)).shape == decision.shape:
             followed["decision"] = decision
         for name, value in followed.items():
             held = self.solution.get(name)
-            if held is None and name not in ("gains", "observer"):
+            if held is None and name not in ANSWERS:
                 continue
             size = float(np.abs(value).max(initial=0.0))
             if (

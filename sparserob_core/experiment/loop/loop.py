@@ -191,11 +191,11 @@ class _Closing:
 
     def _measured(self, state: Array) -> Array:
         """What is measured of a state ``(d,)``."""
-        measured = None if self.model.feedback is None else self.model.problem.measurements
-        if measured is None:
+        observer = None if self.model.feedback is None else self.model.feedback.loop.observer
+        if observer is None:
             return state
-        seen: Array = np.asarray(measured.C) @ state
-        return seen if self.noise is None else seen + self.noise[self._asked]
+        noise = None if self.noise is None else self.noise[self._asked, :, None]
+        return observer.outputs(state[:, None], noise)[:, 0]
 
 
 def _replayed(worst: Mapping[str, Array], periods: int) -> Iterator[Drawn]:
@@ -213,17 +213,15 @@ def _sampled(
     model: Transcription, worst: Mapping[str, Array], counts: tuple[int, int], rng: np.random.Generator
 ) -> Iterator[Drawn]:
     """So many loops of every law, of so many periods; one loop where nothing is uncertain."""
-    functionals, parameters = model.functionals, model.parameters
-    measured = None if model.feedback is None else model.problem.measurements
-    bound, (count, periods) = None if measured is None else measured.noise, counts
-    if not functionals.disturbed and parameters.set is None and bound is None:
+    functionals, parameters, (count, periods) = model.functionals, model.parameters, counts
+    if not functionals.disturbed and parameters.set is None and model.noise is None:
         yield "iid", [None] * periods, np.zeros((1, 0)), None, [None] * periods
         return
     known = tuple(worst[name] for name in ("times", "directions", "parameters")) if worst else (np.zeros(0),) * 3
     uncertainty = Uncertainty(functionals, parameters, model.constraints, (known[0], known[1], known[2]))
     for law in (law for law in LAWS if law != ADVERSARY and (worst or law != "neighbours")):
         disturbances, drawn, begun = uncertainty.draw(cast(LawName, law), count * periods, rng)
-        seen = noises(bound, cast(LawName, law), count * periods, model.control.pieces, rng)
+        seen = noises(model.noise, cast(LawName, law), count * periods, model.control.pieces, rng)
         for row in range(count):
             one, turns = slice(row, row + 1), range(row, count * periods, count)
             every = [None if disturbances is None else disturbances[p : p + 1] for p in turns]

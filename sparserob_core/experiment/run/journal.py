@@ -129,7 +129,9 @@ class Journal(Observer):
         `StudyProgress` where a figure takes longer."""
         experiment, write = self.experiment, self.directory
         control, summary = self.record(result)
-        answers = answers_of(experiment, result)
+        model = self._model
+        feedback = None if model is None or result.decision is None else model.feedback
+        answers = {} if feedback is None else feedback.loop.written(np.asarray(result.decision))
         write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control, answers))
         rounds = self.rounds or list(result.history)
         write.write_arrays("trace.npz", trace_columns(rounds))
@@ -157,16 +159,6 @@ class Journal(Observer):
         from sparserob_core.experiment.run.drawing import drawn
 
         return control, summary, drawn(experiment, result, write.path, worst, notify)
-
-
-def answers_of(experiment: Experiment, result: Result) -> dict[str, Array]:
-    """The ``gains (K, K, m, p)`` of a decision, and the ``observer (K, d, p)`` where outputs are measured; nothing
-    without feedback."""
-    feedback = experiment.transcription.feedback if isinstance(experiment, ControlExperiment) else None
-    if feedback is None or result.decision is None:
-        return {}
-    observer = {} if feedback.loop.observer is None else {"observer": feedback.loop.observer.L}
-    return {"gains": feedback.loop.gains(np.asarray(result.decision)), **observer}
 
 
 def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str, str]]:

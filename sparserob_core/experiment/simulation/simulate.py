@@ -114,8 +114,7 @@ def _sampled(
 ) -> Simulation:
     model = finished.experiment.transcription
     response, parameters = model.response, model.parameters
-    acting, measured = _Acting(), None if model.feedback is None else model.problem.measurements
-    noise = None if measured is None else measured.noise
+    acting = _Acting()
     ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
     fine = Response(response.system, finer(response.grid, times), response.initial_state)
@@ -133,7 +132,7 @@ def _sampled(
     while done < count:
         size = min(block, count - done)
         disturbances, drawn, begun = uncertainty.draw(law, size, rng)
-        seen = noises(noise, law, size, model.control.pieces, rng)
+        seen = noises(model.noise, law, size, model.control.pieces, rng)
         control = controlled(model, finished.decision, np.arange(response.grid.pieces), seen)
         control = acting.of(control) if callable(control) else control
         for one in counts:
