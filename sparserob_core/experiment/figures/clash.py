@@ -185,17 +185,7 @@ def _draw(ax: Axes, strip: Strip) -> None:
 def _forbidden(ax: Axes, strip: Strip, y: float, left: float, right: float) -> None:
     for edge, end in ((strip.low, left), (strip.high, right)):
         if np.isfinite(edge):
-            ax.fill_betweenx(
-                [y - 0.42, y + 0.42],
-                edge,
-                end,
-                facecolor=look.MIST,
-                edgecolor="#C4C4C4",
-                hatch="////",
-                linewidth=0,
-                zorder=0,
-                label="forbidden",
-            )
+            ax.fill_betweenx([y - 0.42, y + 0.42], edge, end, **look.EXCLUDED, label="forbidden")
             ax.plot([edge, edge], [y - 0.42, y + 0.42], color=look.VERMILLION, linewidth=1.6, zorder=1, label="wall")
 
 

@@ -121,17 +121,7 @@ def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
     corners = np.vstack([frame, frame[:1], hole, hole[:1]])
     drawn = [Path.LINETO] * (len(hole) - 1)
     codes = [Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY, Path.MOVETO, *drawn, Path.CLOSEPOLY]
-    ax.add_patch(
-        PathPatch(
-            Path(corners, codes),
-            facecolor=look.MIST,
-            edgecolor="#C4C4C4",
-            hatch="////",
-            linewidth=0,
-            zorder=0,
-            label="forbidden",
-        )
-    )
+    ax.add_patch(PathPatch(Path(corners, codes), **look.EXCLUDED, label="forbidden"))
     for one, other in zip(allowed, np.roll(allowed, -1, axis=0), strict=True):
         if not ((one == other) & ((one == frame[0]) | (one == frame[2]))).any():  # the edge of the picture is no wall
             ax.plot(*np.stack([one, other]).T, color=look.GREY, linewidth=1.0, zorder=1)

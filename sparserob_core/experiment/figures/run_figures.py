@@ -324,17 +324,7 @@ def _forbidden(ax: Axes, wall: Wall) -> None:
     low, high = ax.get_ylim()
     for side, outside in zip(wall.sides, (low, high), strict=True):
         if np.isfinite(side).all():
-            ax.fill_between(
-                [wall.start, wall.end],
-                side,
-                outside,
-                facecolor=look.MIST,
-                edgecolor="#C4C4C4",
-                hatch="////",
-                linewidth=0,
-                zorder=0,
-                label="forbidden",
-            )
+            ax.fill_between([wall.start, wall.end], side, outside, **look.EXCLUDED, label="forbidden")
             ax.plot([wall.start, wall.end], side, color=look.GREY, linewidth=1.0, zorder=1)
 
 

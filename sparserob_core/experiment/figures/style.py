@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 # Okabe and Ito (2008), "Color universal design".
 BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE = "#0072B2", "#56B4E9", "#D55E00", "#E69F00", "#009E73", "#CC79A7"
 INK, GREY, MIST = "#222222", "#7A7A7A", "#E9E9E9"
+EXCLUDED: dict[str, Any] = {"facecolor": MIST, "edgecolor": "#C4C4C4", "hatch": "////", "linewidth": 0, "zorder": 0}
+"""How an area is drawn in which nothing may be, or nothing is."""
+
 WIDTH = 6.2
 """Width of every figure in inches: a text column at full size."""
 

@@ -105,15 +105,7 @@ def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
         edge, critical = found.infeasible.factor, (found.lower + found.upper) / 2
         left, right = (left, edge + room) if found.sense == "largest" else (max(edge - room, 0.0), right)
         beyond = (edge, right) if found.sense == "largest" else (left, edge)
-        ax.axvspan(
-            *beyond,
-            facecolor=look.MIST,
-            edgecolor="#C4C4C4",
-            hatch="////",
-            linewidth=0,
-            zorder=0,
-            label="proven infeasible",
-        )
+        ax.axvspan(*beyond, **look.EXCLUDED, label="proven infeasible")
         ax.axvline(critical, color=look.VERMILLION, linewidth=1.1, zorder=1, label=f"critical factor {critical:.7g}")
     ax.set_xlim(left, right)
 
