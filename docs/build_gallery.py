@@ -24,6 +24,7 @@ STORIES: dict[str, tuple[str, ...]] = {
     "tracking_corridor": ("states",),
     "motor_voltage": ("states",),
     "experiment1_feedback": ("states", "gains", "effort", "answers"),
+    "output_feedback": ("outputs",),
     "singular": ("control",),
 }
 """The configs of the page, and which of their figures it shows."""

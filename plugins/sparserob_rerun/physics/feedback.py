@@ -55,7 +55,7 @@ def pictures(data: sr.FigureData) -> Iterator[tuple[str, tuple[int, int], str, F
         u = data.names.control(channel)
         for state in range(min(states, STATES)):
             path = f"feedback/gains/u{channel + 1}_x{state + 1}"
-            title = f"gain of {u} on {f'y{state + 1}' if data.outputs else data.names.state(state)}"
+            title = f"gain of {u} on {f'y{state + 1}' if data.outputs is not None else data.names.state(state)}"
             yield path, (channel, state), title, data.gains[:, :, channel, state]
         if data.answers is not None:
             place = (channel, min(states, STATES))

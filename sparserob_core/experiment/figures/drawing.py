@@ -21,7 +21,7 @@ from sparserob_core.control.transcription.transcribe import path_names
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
-from sparserob_core.experiment.figures.figure_data import FigureData, Limit, Plane, Wall
+from sparserob_core.experiment.figures.figure_data import FigureData, Limit, Outputs, Plane, Wall
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
@@ -144,10 +144,33 @@ def _answered(model: Transcription, decision: Array, times: Array, draws: int) -
         "control_least": nominal - loop.spread.support(-effects).T,
         "control_most": nominal + loop.spread.support(effects).T,
         "gains": loop.gains(decision),
-        "outputs": loop.observer is not None,
+        "outputs": _outputs(model, decision, times),
         **(_drawn(loop, nominal, effects, draws) if draws and held else {}),
         **(_moved(model, decision) if draws else {}),
     }
+
+
+def _outputs(model: Transcription, decision: Array, times: Array) -> Outputs | None:
+    """The outputs that a policy measures with their noise; ``None`` where it measures states."""
+    assert model.feedback is not None
+    measured, loop, points = model.problem.measurements, model.feedback.loop, model.control.breakpoints
+    if measured is None:
+        return None
+    C = np.asarray(measured.C)
+    instants = points[:-1][measured.known(points).any(axis=0)]
+    lower, upper = -supports(model, decision, times, -C), supports(model, decision, times, C)
+    axes = np.eye(len(C))
+    noise = (np.zeros(len(C)),) * 2 if measured.noise is None else [measured.noise.support(s * axes) for s in (-1, 1)]
+    return Outputs(
+        C=C,
+        nominal=C @ loop.states(decision, times)[:, :, 0].T,
+        lower=lower,
+        upper=upper,
+        instants=instants,
+        read_lower=-supports(model, decision, instants, -C) - noise[0][:, None],
+        read_upper=supports(model, decision, instants, C) + noise[1][:, None],
+        latency=measured.latency,
+    )
 
 
 def _times(points: Array) -> Array:

@@ -79,6 +79,22 @@ class Plane:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Outputs:
+    """What is measured: ``y = C x`` with ``C (p, d)`` at ``nominal (p, T)``, and the worst case ``lower``, ``upper
+    (p, T)``, at the times of the figure; at the breakpoints ``instants (k,)`` that some piece of the control knows, the
+    readings ``read_lower``, ``read_upper (p, k)``, noise included, which are known ``latency`` later."""
+
+    C: Array
+    nominal: Array
+    lower: Array
+    upper: Array
+    instants: Array
+    read_lower: Array
+    read_upper: Array
+    latency: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FigureData:
     """A solved control problem, ready to be drawn.
 
@@ -91,10 +107,11 @@ class FigureData:
     ``names`` what everything is called, ``plane`` where the system moves, if the problem says that it does so in one.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
-    disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or states, and ``alone_lower``,
-    ``alone_upper (d, T)`` is the tube that the nominal control alone has. ``effort (3, m, K)`` are quantiles of ``|u|``
-    over ``draws`` admissible disturbances (5 %, 50 %, 95 %), and ``answers (K, K, m)`` what the control on every piece
-    adds for the innovation of every breakpoint in the ``worst_case`` that is named; each where it was asked for.
+    disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and
+    ``alone_lower``, ``alone_upper (d, T)`` is the tube that the nominal control alone has. ``effort (3, m, K)`` are
+    quantiles of ``|u|`` over ``draws`` admissible disturbances (5 %, 50 %, 95 %), and ``answers (K, K, m)`` what the
+    control on every piece adds for the innovation of every breakpoint in the ``worst_case`` that is named; each where
+    it was asked for.
     """
 
     title: str
@@ -119,7 +136,7 @@ class FigureData:
     control_least: Array | None = None
     control_most: Array | None = None
     gains: Array | None = None
-    outputs: bool = False
+    outputs: Outputs | None = None
     effort: Array | None = None
     draws: int = 0
     answers: Array | None = None
@@ -160,9 +177,18 @@ class FigureData:
         """The axis label of one state component."""
         return label(self.names.states, self.names.state_units, "x", component, self.state.shape[0])
 
+    def output_label(self, output: int) -> str:
+        """The axis label of an output: that of the state which is measured as it is, or else the letter."""
+        assert self.outputs is not None
+        row = self.outputs.C[output]
+        alone = np.flatnonzero(row)
+        if alone.size == 1 and row[alone[0]] == 1.0:
+            return self.state_label(int(alone[0]))
+        return label((), (), "y", output, len(self.outputs.C))
+
     def gain_label(self, channel: int, component: int) -> str:
         """The label of a gain: of which control on which state, and its unit where both are known."""
-        if self.outputs:
+        if self.outputs is not None:
             return f"gain on $y_{{{component + 1}}}$"
         u, x = self.names.control_units, self.names.state_units
         unit = f" [{plain(u[channel])} per {plain(x[component])}]" if u and x and u[channel] and x[component] else ""

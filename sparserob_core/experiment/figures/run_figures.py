@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.figure_data import FigureData, Wall
+from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall, plain
 from sparserob_core.experiment.figures.plane_figure import draw_plane
 from sparserob_core.experiment.figures.style import draw_legend, held, panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.result import relative_gap
@@ -26,8 +26,9 @@ IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
 
 
 def write_figures(directory: Path, data: FigureData) -> list[Path]:
-    """Draw ``control``, ``states``, ``plane`` where the system moves in one, under feedback ``gains``, ``effort`` and
-    ``answers``, and when there is a history ``convergence`` into ``directory``, each as PDF and PNG.
+    """Draw ``control``, ``states``, ``plane`` where the system moves in one, under feedback ``outputs`` where these are
+    measured, ``gains``, ``effort`` and ``answers``, and when there is a history ``convergence`` into ``directory``,
+    each as PDF and PNG.
 
     Returns the files. Raises `InputError` when matplotlib is missing.
     """
@@ -42,6 +43,7 @@ def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
         "control": (True, draw_control),
         "states": (True, draw_states),
         "plane": (data.plane is not None, draw_plane),
+        "outputs": (data.outputs is not None, draw_outputs),
         "gains": (data.gains is not None, draw_gains),
         "effort": (data.effort is not None, draw_effort),
         "answers": (data.answers is not None, draw_answers),
@@ -125,6 +127,39 @@ def draw_states(data: FigureData) -> Figure:
         ax.set_ylabel(data.state_label(component))
     draw_time_axis(axes[-1], data)
     axes[0].set_title(data.title + data.of_states)
+    draw_legend(figure, axes)
+    return figure
+
+
+def draw_outputs(data: FigureData) -> Figure:
+    """Every output in the worst case, and the readings that noise makes of it at the instants of its measurement."""
+    outputs = data.outputs
+    assert outputs is not None
+    count = min(len(outputs.C), MOST_STATES)
+    figure, axes = panels(count, 1.9, extra=0.4)
+    for output, ax in enumerate(axes):
+        lower, upper = outputs.lower[output], outputs.upper[output]
+        ax.fill_between(
+            data.times,
+            lower,
+            upper,
+            color=look.SKY,
+            alpha=0.45,
+            linewidth=0,
+            zorder=2,
+            label="worst case, with feedback",
+        )
+        ax.plot(data.times, outputs.nominal[output], color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
+        ends = outputs.read_lower[output], outputs.read_upper[output]
+        ax.vlines(outputs.instants, *ends, color=look.VERMILLION, linewidth=0.9, zorder=4, label="readings, with noise")
+        for end in ends:
+            ax.plot(outputs.instants, end, linestyle="", marker="_", markersize=4, color=look.VERMILLION, zorder=4)
+        ax.set_ylabel(data.output_label(output))
+    draw_time_axis(axes[-1], data)
+    unit = f" {plain(data.names.time)}" if data.names.time else ""
+    late = f"known {outputs.latency:g}{unit} later" if outputs.latency else "known at once"
+    some = f"  ·  {count} of {len(outputs.C)} outputs" if count < len(outputs.C) else ""
+    _title(axes[0], data.title, f"measured at {outputs.instants.size} instants, {late}{some}")
     draw_legend(figure, axes)
     return figure
 

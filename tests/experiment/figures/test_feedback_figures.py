@@ -17,6 +17,7 @@ from sparserob_core.experiment.figures import drawing, run_figures
 from sparserob_core.experiment.figures.figure_data import FigureData
 from tests.support.places import CONFIGS
 from tests.support.problems import pushed_spring
+from tests.support.problems import double_integrator
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +141,33 @@ def test_a_policy_with_two_channels_can_be_drawn(tmp_path: Path) -> None:
     given = {"dictionaries.control.pieces": 6, "method.rounds": 1}
     out = sr.run(CONFIGS / "coupled_masses_feedback.yaml", given, out=tmp_path / "run", quiet=True)
     assert out.directory is not None and (out.directory / "figures" / "effort.png").exists()
+
+
+def test_readings_are_outputs_in_the_worst_case_and_their_noise(tmp_path: Path) -> None:
+    problem = {
+        **double_integrator(0.05),
+        "horizon": 2.0,
+        "initial_state": [0.3, 0.0],
+        "path": [{"box": [1.0, 1.0]}],
+        "terminal": [{"box": [0.2, 0.2]}],
+        "measurements": {
+            "C": [[1, 0], [1, 2]],
+            "noise": {"box": {"lower": [-0.01, -0.03], "upper": [0.03, 0.03]}},
+            "latency": 0.5,
+        },
+    }
+    pieces = {"control": {"name": "piecewise_constant", "pieces": 4}}
+    config = {"problem": problem, "dictionaries": pieces, "policy": {"name": "affine", "causal_signals": 0}}
+    result = sr.run(config, quiet=True, figures=False, out=tmp_path / "run")
+    assert isinstance(result.experiment, ControlExperiment) and result.result.decision is not None
+    drawn = drawing.figure_data(result.experiment, result.result.decision, np.empty(0), (), None)
+    outputs = drawn.outputs
+    assert outputs is not None and outputs.latency == 0.5
+    assert outputs.instants.tolist() == [0.0, 0.5, 1.0]
+    at = np.searchsorted(drawn.times, outputs.instants)
+    assert np.allclose(outputs.nominal[0], drawn.state[0])
+    assert np.allclose(outputs.lower[0], drawn.tube_lower[0]) and np.allclose(outputs.upper[0], drawn.tube_upper[0])
+    assert np.allclose(outputs.read_upper - outputs.upper[:, at], [[0.03], [0.03]])
+    assert np.allclose(outputs.lower[:, at] - outputs.read_lower, [[0.01], [0.03]])
+    figure = result.plot("outputs")
+    assert [ax.get_ylabel() for ax in figure.axes] == ["$x_{1}(t)$", "$y_{2}(t)$"]
