@@ -132,6 +132,7 @@ from sparserob_core.control.policies.affine import AffinePolicy as AffinePolicy
 from sparserob_core.control.policies.policy import Charge as Charge
 from sparserob_core.control.policies.policy import OpenLoop as OpenLoop
 from sparserob_core.control.policies.policy import Policy as Policy
+from sparserob_core.experiment.config.problems import ControlKeys as ControlKeys
 from sparserob_core.experiment.config.problems import LinearKeys as LinearKeys
 from sparserob_core.experiment.config.problems import LinearProblem as LinearProblem
 from sparserob_core.experiment.config.set_options import SetOptions as SetOptions

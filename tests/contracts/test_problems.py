@@ -25,11 +25,20 @@ KNOWN = {
 EXAMPLES = {
     "linear": {**KNOWN, "control": {"box": 1.0}},
     "minimum_attention": {**KNOWN, "rate": {"box": 2.0}, "control": {"box": 1.0}},
+    "rendezvous": {
+        "orbit": {"semi_major_axis": 1.0, "mu": 1.0},
+        "horizon": 3.0,
+        "initial_state": [-1.0, 0.2, 0.0, 0.0],
+        "disturbance": {"box": 0.01},
+        "path": [{"box": [2.0, None, None, None], "from": 1.0}],
+        "terminal": [{"box": 0.5}],
+        "control": {"box": 1.0},
+    },
 }
 
 
 def test_every_registered_problem_has_an_example():
-    own = {"linear", "minimum_attention"}
+    own = {"linear", "minimum_attention", "rendezvous"}
     assert own <= set(REGISTRY.names("problem")) and own == set(EXAMPLES)
 
 

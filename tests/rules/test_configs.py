@@ -56,6 +56,7 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "tracking_corridor": ("certified", 1.420693, 1e-5),
     "two_modes": ("certified", 0.6343468, 2e-6),
     "singular": ("certified", 1.0, 1e-9),
+    "prisma_transfer": ("certified", 0.106849764762, 1e-9),
     "quadratic_cost": ("certified", 0.983009, 1e-6),
     "rendezvous": ("certified", 0.5584942610, 2e-7),
     "walsh": ("certified", 0.537065, 5e-6),
@@ -64,6 +65,7 @@ UNCHECKED = {("experiment1_scenario", "lower bound")}  # its constraints are sam
 ELSEWHERE = {"experiment1_paper"}  # what is found by it is tested in known_answers/test_paper.py
 SLOW = {  # every status, formulation and kind of uncertainty has a lighter config
     "atv_transfer",
+    "prisma_transfer",
     "simbol_x_transfer",
     "breakpoints",
     "experiment1_literal",

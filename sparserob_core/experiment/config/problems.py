@@ -430,11 +430,9 @@ class MeasurementOptions(Options):
         return Measurements(self.C, noise, self.latency)
 
 
-class LinearKeys(ProblemFactory, Options):
-    """The keys that problems about a linear system share; what the control is, they say themselves."""
-
-    system: SystemOptions
-    """The system."""
+class ProblemKeys(ProblemFactory, Options):
+    """The keys that all problems about a linear system share; what the system and the control are, they say
+    themselves."""
 
     horizon: float = Field(gt=0.0)
     """Final time."""
@@ -517,7 +515,7 @@ class LinearKeys(ProblemFactory, Options):
                     path=f"{where}.E", expected=f"{system.states} rows, one per state", got=f"{len(one.E)}"
                 )
             rows = None if one.E is None else one.E + [[0.0] * len(one.E[0])] * below
-            E = None if rows is None else parse_matrix(f"{where}.E", rows, self.system.names())
+            E = None if rows is None else parse_matrix(f"{where}.E", rows, tuple(system.names))
             width = system.disturbances if one.E is None else len(one.E[0])
             found.append(Disturbance(one.bound.build(f"{where}.set", width), E, one.kind, one.start or 0.0, one.stop))
         return found
@@ -532,10 +530,15 @@ class LinearKeys(ProblemFactory, Options):
         return [end for i, item in enumerate(self.terminal) for end in item.ends(f"terminal.{i}", states)]
 
 
-@final
-class LinearProblem(LinearKeys):
-    """Sparse robust control of ``x' = A(p) x + B(p) u + E w`` from an initial state, at the least integral of
-    ``|u|``."""
+class LinearKeys(ProblemKeys):
+    """The keys of problems that write their system as matrices; what the control is, they say themselves."""
+
+    system: SystemOptions
+    """The system."""
+
+
+class ControlKeys(ProblemKeys):
+    """The keys of problems whose control is that of the system; what the system is, they say themselves."""
 
     control: SetOptions
     """Set that the control takes its values in, bounded."""
@@ -550,13 +553,14 @@ class LinearProblem(LinearKeys):
     measurements: MeasurementOptions | None = None
     """What a policy measures and answers: ``{C: ..., noise: ..., latency: ...}``; all states, without noise and at
     once, unless given."""
+
     repeat: bool = False
     """Whether the plan begins again at the horizon, for ever: every final state is then one of the initial states, and
     ``control_step`` holds from the last control to the first one too. Not with a delay."""
 
-    def build(self) -> OptimalControlProblem:
-        """The problem; raises `InputError` that begins with the key at fault."""
-        system = self.system.build(self.horizon)
+    def problem(self, system: System, names: Names | None = None) -> OptimalControlProblem:
+        """The problem of a system; raises `InputError` that begins with the key at fault. ``names``: other ones than
+        those that the keys give."""
         if self.initial_control is not None and self.control_step is None and not system.delay > 0.0:
             raise InputError(
                 path="initial_control",
@@ -580,7 +584,7 @@ class LinearProblem(LinearKeys):
             control_step=(
                 None if self.control_step is None else self.control_step.build("control_step", system.controls)
             ),
-            names=self.names.build(),
+            names=self.names.build() if names is None else names,
             measurements=None if self.measurements is None else self.measurements.build(),
             repeat=self.repeat,
         )
@@ -590,3 +594,13 @@ class LinearProblem(LinearKeys):
         if given is None or isinstance(given, list):
             return given
         return [given] * controls
+
+
+@final
+class LinearProblem(ControlKeys, LinearKeys):
+    """Sparse robust control of ``x' = A(p) x + B(p) u + E w`` from an initial state, at the least integral of
+    ``|u|``."""
+
+    def build(self) -> OptimalControlProblem:
+        """The problem; raises `InputError` that begins with the key at fault."""
+        return self.problem(self.system.build(self.horizon))

@@ -14,7 +14,7 @@ from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.problems import LinearKeys
+from sparserob_core.experiment.config.problems import ProblemKeys
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
 from sparserob_core.experiment.margin.causal import causal_upper
@@ -165,7 +165,7 @@ def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[lis
     """For every entry of ``path`` and of ``terminal`` in the config, the sets of the problem that it became: none, one
     or several."""
     factory = loaded.registry.build("problem", loaded.config.problem.name, loaded.config.problem.options)
-    if not isinstance(factory, LinearKeys):
+    if not isinstance(factory, ProblemKeys):
         return [[i] for i in range(len(problem.path))], [[i] for i in range(len(problem.terminal))]
     states = problem.system.states
     entries = [item.entries(f"path.{i}", states, factory.horizon) for i, item in enumerate(factory.path)]

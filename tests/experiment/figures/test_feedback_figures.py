@@ -16,8 +16,7 @@ from sparserob_core.experiment.assemble import ControlExperiment
 from sparserob_core.experiment.figures import drawing, run_figures
 from sparserob_core.experiment.figures.figure_data import FigureData
 from tests.support.places import CONFIGS
-from tests.support.problems import pushed_spring
-from tests.support.problems import double_integrator
+from tests.support.problems import double_integrator, pushed_spring
 
 
 @pytest.fixture(scope="module")
