@@ -169,7 +169,8 @@ class Report:
     (``inf``: none).
 
     ``stopped`` says why the search ended; ``missing`` evaluations gave NaN, which counts as ``-inf``;
-    ``best_point`` is NaN ``(d,)`` when nothing was evaluated.
+    ``best_point`` is NaN ``(d,)`` when nothing was evaluated. Of a search for the minimum (`ask_tell`) the best value
+    is the least, NaN counts as ``inf``, and what is proven is a ``lower_bound`` of the minimum (``-inf``: none).
     """
 
     best_value: float
@@ -180,5 +181,6 @@ class Report:
     stopped: str
     interrupted: bool = False
     missing: int = 0
+    lower_bound: float = -np.inf
 
     __repr__ = brief

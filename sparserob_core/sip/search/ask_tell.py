@@ -212,15 +212,9 @@ class AskTell:
             self._answer()
 
     def report(self) -> Report:
-        """The report of the search; before its end, what is known by now. A search maximises: with ``minimise`` its
-        values have the other sign. Raises what the maximiser has raised."""
-        if not (self.done and isinstance(self._end, Report)):
-            return self._so_far("the search has not ended")
-        if self._ranges.plain:
-            return self._end
-        trace = replace(self._end.trace, points=self._ranges.shown(self._end.trace.points))
-        best = self._ranges.shown(self._end.best_point[np.newaxis])[0]
-        return replace(self._end, best_point=best, trace=trace)
+        """The report of the search; before its end, what is known by now. Values are those that were told: with
+        ``minimise`` the best is the least. Raises what the maximiser has raised."""
+        return self._end if self.done and isinstance(self._end, Report) else self._so_far("the search has not ended")
 
     def state(self) -> dict[str, Any]:
         """Everything told so far, as plain data that JSON can hold; what was asked and not told is asked again.
@@ -260,7 +254,7 @@ class AskTell:
                 self._batch = _keys(self._ranges.shown(wanted))
                 self._answers = [None] * len(self._batch)
             else:
-                self._end = wanted
+                self._end = self._turned(wanted) if isinstance(wanted, Report) else wanted
             self._answer()
         if isinstance(self._end, BaseException):
             raise self._end
@@ -339,9 +333,29 @@ class AskTell:
     def _so_far(self, stopped: str) -> Report:
         points = np.array(self._points).reshape(-1, self.domain.dimension)
         values = self._usable()
-        trace = Trace(points, values, np.maximum.accumulate(values), np.array(self._seconds))
-        best = float(values.max(initial=-np.inf))
-        return Report(best, self.best_point, self.evaluations, np.inf, trace, stopped)
+        trace = Trace(
+            points, self._sign * values, self._sign * np.maximum.accumulate(values), np.array(self._seconds)
+        )
+        return Report(self.best_value, self.best_point, self.evaluations, np.inf, trace, stopped)
+
+    def _turned(self, report: Report) -> Report:
+        """The maximiser's report in the coordinates and with the sign of whoever asks."""
+        trace = replace(
+            report.trace,
+            points=self._ranges.shown(report.trace.points),
+            values=self._sign * report.trace.values,
+            best=self._sign * report.trace.best,
+        )
+        best = self._ranges.shown(report.best_point[np.newaxis])[0]
+        upper, lower = (np.inf, -report.upper_bound) if self._about["minimise"] else (report.upper_bound, -np.inf)
+        return replace(
+            report,
+            best_value=self._sign * report.best_value,
+            best_point=best,
+            upper_bound=upper,
+            lower_bound=lower,
+            trace=trace,
+        )
 
     def _usable(self) -> Array:
         """The values as those of a maximisation ``(n,)``; NaN is ``-inf``."""

@@ -235,7 +235,11 @@ def test_minimising_is_maximising_with_the_other_sign():
     by_hand(down, lambda points: -bowl(points))
     assert down.report().trace.points.tolist() == up.report().trace.points.tolist()
     assert (down.best_value, down.best_point.tolist()) == (-up.best_value, up.best_point.tolist())
-    assert down.report().best_value == up.best_value
+    least, most = down.report(), up.report()
+    assert (least.best_value, least.lower_bound) == (-most.best_value, -most.upper_bound)
+    assert (least.upper_bound, most.lower_bound) == (np.inf, -np.inf)
+    assert least.trace.values.tolist() == (-most.trace.values).tolist()
+    assert least.trace.best.tolist() == np.minimum.accumulate(least.trace.values).tolist()
     with pytest.raises(sr.InputError, match=r"state\.minimise: expected False, as given, got True"):
         sr.ask_tell(BOX, "sequool", budget=30, state=down.state())
 
@@ -290,6 +294,17 @@ def test_ranges_that_there_are_not_are_refused_by_their_key(ranges, words):
         sr.ask_tell(MIXED, "sequool", **ranges)
     with pytest.raises(sr.InputError, match=r"logarithmic\.0: expected a positive lower bound, got 0.0"):
         sr.ask_tell(sr.Box([0.0], [1.0]), "sequool", logarithmic=[0])
+
+
+def test_a_search_that_is_not_over_reports_the_least_value_where_it_was_told():
+    search = sr.ask_tell(MIXED, "sobol", budget=40, minimise=True, **RANGES)
+    by_hand(search, lambda points: points[:, 1], until=7)
+    before = search.report()
+    search.close()
+    for report in (before, search.report(), pickle.loads(pickle.dumps(search)).report()):
+        assert report.best_value == report.best_point[1] == search.best_value == report.trace.values.min()
+        assert report.trace.points[:, 1].tolist() == report.trace.values.tolist()
+        assert report.trace.best.tolist() == np.minimum.accumulate(report.trace.values).tolist()
 
 
 @pytest.mark.parametrize("name", ["simulated_annealing", "maxlipo", "random_search"])
