@@ -104,7 +104,8 @@ def _bounds(lower: float, upper: float, gap: float) -> str:
 
 
 def _round(event: sr.RoundFinished) -> str:
-    where = f" in {event.worst_family}" if event.worst_family else ""
+    unit = f" {event.measured}" if event.measured else ""
+    where = f"{unit} in {event.worst_family}" if event.worst_family else ""
     cost = "" if math.isnan(event.cost) else f"  cost {_number(event.cost)}"
     return f"{event.round}{cost}  violation {event.violation:.1e}{where}  eps {event.epsilon:.1e}"
 
@@ -152,7 +153,8 @@ def _proof(event: sr.ProofProgress) -> str:
     rate = f" at {_rate(event.examined, event.seconds)}/s" if event.examined and event.seconds > 0.0 else ""
     seen = f"  {event.examined} examined{rate}" if event.examined else ""
     before = "" if math.isnan(event.bound_before) else f", half a minute ago {event.bound_before:.1e}"
-    return f"of {event.family}  cells open {event.cells}{seen}  violation not excluded {event.bound:.1e}{before}"
+    unit = f" {event.measured}" if event.measured else ""
+    return f"of {event.family}  cells open {event.cells}{seen}  violation not excluded {event.bound:.1e}{unit}{before}"
 
 
 def _rate(count: int, seconds: float) -> str:

@@ -174,8 +174,8 @@ class RoundFinished(Event):
 
     ``lower_bound`` and ``upper_bound`` enclose the value of the unregularised program (``-inf``, ``inf`` while
     unknown); ``violation`` is the worst constraint violation of this round's decision over the continuum, reached in
-    ``worst_family``; ``active_indices`` are the rows kept, ``cuts_added`` and ``cuts_dropped`` the change since the
-    round before; ``seconds`` since the start.
+    ``worst_family``, in the unit ``measured`` where that is known; ``active_indices`` are the rows kept, ``cuts_added``
+    and ``cuts_dropped`` the change since the round before; ``seconds`` since the start.
 
     ``decision (n,)`` has this ``cost``, of what the method minimises. ``separations``: per family what was found most
     violated at it, worst first.
@@ -208,12 +208,13 @@ class RoundFinished(Event):
     simplified: bool = False
     gap: float = np.inf
     proven: float = np.inf
+    measured: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProofProgress(Event):
     """A proof over the continuum goes on: ``cells`` of ``family`` are still open, ``bound`` is the violation not yet
-    excluded.
+    excluded, in the unit ``measured`` where that is known.
 
     ``examined`` cells were bounded so far, of a ``budget`` after which the proof is given up (0: unknown).
     ``bound_before`` is the ``bound`` of half a minute ago, NaN while the proof is younger; where it has hardly fallen
@@ -228,6 +229,7 @@ class ProofProgress(Event):
     budget: int = 0
     bound_before: float = np.nan
     hindrance: str = ""
+    measured: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -100,9 +100,9 @@ class Proof:
 
     ``leaves``: the lower and upper corners ``(k, d)`` of the closed cells that prove it, a subdivision of the family's
     ``cells``, in lexicographic order; ``None`` unless proven by branch and bound. ``formulation`` is that of the index.
-    ``unit``: what a violation of 1 of that row is in the user's units, and ``units (r,)`` of all rows. ``bound`` is in
-    the units of the program that was solved; ``share`` is what it was in each row's own unit, once it is told in the
-    user's.
+    ``unit``: what a violation of 1 of that row is in the user's units, called ``measured`` where that is known, and
+    ``units (r,)`` of all rows. ``bound`` is in the units of the program that was solved; ``share`` is what it was in
+    each row's own unit, once it is told in the user's.
     """
 
     family: str
@@ -116,6 +116,7 @@ class Proof:
     leaves: tuple[Array, Array] | None = None
     formulation: Formulation = "reduced"
     unit: float = 1.0
+    measured: str = ""
     units: Array | None = None
     share: float | None = None
 

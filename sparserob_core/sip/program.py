@@ -149,6 +149,8 @@ class ConstraintFamily:
     ``hindrance(lower (d,), upper (d,))``  what keeps the enclosure of a cell wide, and what would help, in words;
     ``row_units (r,)``, ``index_units (d,)``  what a violation of 1 and each coordinate of an index are in the user's
         units, for a family in units of its own (`OwnUnits`);
+    ``measured (r,)``, ``along``  what these units are called, for every row and for the first coordinate of an index,
+        where that is known;
     ``explain(index (d,), row)``  one constraint for people (an `Explanation`);
     ``excess(x, indices (k, d))``  the violations ``(k, r)`` at indices, where no rows need be built for them;
     ``uncertain(index (d,))``  for rows that must hold for every deviation in the program's `Spread`: these rows. Such a
@@ -176,6 +178,8 @@ class ConstraintFamily:
     hindrance: Callable[[Array, Array], str] | None = None
     row_units: Array | None = None
     index_units: Array | None = None
+    measured: Sequence[str] = ()
+    along: str = ""
     uncertain: Callable[[Array], UncertainRows] | None = None
     excess: Callable[[Array, Array], Array] | None = None
     start: Array | None = None
@@ -207,6 +211,13 @@ class ConstraintFamily:
     def row_unit(self, row: int) -> float:
         """What a violation of 1 of a row is in the user's units."""
         return 1.0 if self.row_units is None else float(self.row_units[row])
+
+    def measure(self, row: int | None = None) -> str:
+        """What a violation of a row is measured in, or, without one, that of any of them, such as ``m or m/s``; empty
+        where that is not known."""
+        if row is not None:
+            return self.measured[row] if row < len(self.measured) else ""
+        return " or ".join(dict.fromkeys(self.measured)) if all(self.measured) else ""
 
     @shaped
     def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:

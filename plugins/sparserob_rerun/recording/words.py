@@ -24,12 +24,13 @@ def round_lines(event: sr.RoundFinished, inspection: sr.Inspection | None) -> li
     """One round in words: its bounds, what is violated, and the cuts that come of it."""
     known = inspection is not None and any(family.name == event.worst_family for family in inspection.program.families)
     tolerance = inspection.tolerance(event.worst_family) if inspection is not None and known else 0.0
+    unit = f" {event.measured}" if event.measured else ""
     if event.violation > tolerance:
-        violated = f"{event.worst_family} is violated by {event.violation:.2e}"
+        violated = f"{event.worst_family} is violated by {event.violation:.2e}{unit}"
     elif event.violation > 0.0:
-        violated = f"every constraint holds, {event.worst_family} to within {event.violation:.1e}"
+        violated = f"every constraint holds, {event.worst_family} to within {event.violation:.1e}{unit}"
     else:
-        violated = f"every constraint holds with {-event.violation:.2e} to spare"
+        violated = f"every constraint holds with {-event.violation:.2e}{unit} to spare"
     if event.simplified:
         violated += ", with some of the uncertainty only"
     known_above = math.isfinite(event.upper_bound) and not event.simplified

@@ -22,6 +22,7 @@ from sparserob_core.checker.reach.varying import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, Return
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
@@ -30,7 +31,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb_mat
 
-RETURN = "return"
+RETURN, EQUALS, STEP = "return", "equals", "control_step"
 INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: ten times what counts as no violation, so
 # that none is handed on from period to period
 
@@ -258,6 +259,18 @@ class Case:
         if window.reference is None and not window.is_mixed:
             return None
         return Beside(window, basis, gains, self.scene, self.control.breakpoints.tolist(), self.pieces)
+
+    def at(self, time: float) -> str:
+        """A time in words."""
+        return f"t = {time:.6g} {self.problem.names.time}".rstrip()
+
+    def measured(self, name: str, direction: Array) -> str:
+        """The unit of a row of a constraint with its normal, with a space before it; of a curved set none."""
+        held = {self.of_control: self.problem.control, STEP: self.problem.control_step}
+        shape = held[name] if name in held else None if name == EQUALS else self.window(name).shape
+        if shape is not None and shape.halfspaces() is None:
+            return ""
+        return measured_in(direction, self.problem.names, 0 if name in held else self.problem.system.states)
 
     def units(self, window: Window) -> RowUnits:
         """What violations of a constraint are judged by."""

@@ -172,7 +172,7 @@ def _control(case: Case) -> str:
         seen.add(id(piece))
         over, where = known(case.problem.control).excess(piece.entries())
         if over > TOLERANCE:
-            raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from t = {float(start):.6g} on")
+            raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from {case.at(float(start))} on")
         worst = max(worst, over)
     return f"{case.control.pieces} pieces in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
 
@@ -187,7 +187,8 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
     fixed, centre = dict(case.equalities), np.asarray(case.problem.initial_state, dtype=float)
     for state in case.single:
         if fixed.get(state) != float(centre[state]):
-            raise Broken(f"x{state + 1} begins at {float(centre[state])!r}, and does not end there")
+            name = case.problem.names.state(state)
+            raise Broken(f"{name} begins at {float(centre[state])!r}, and does not end there")
     if case.returned is not None:
         _strictly(case, case.returned)
     needed = [name for name, verdict in verdicts.items() if name not in (*ASIDE, "cost", "lower bound")]
@@ -198,7 +199,7 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
     if len(case.single) == centre.size:
         back = "the final state is the initial one, to rounding"
     elif case.single:
-        back += ", in " + ", ".join(f"x{state + 1}" for state in case.single) + " to rounding"
+        back += ", in " + ", ".join(case.problem.names.state(state) for state in case.single) + " to rounding"
     return f"{back}, so that all constraints hold in every period"
 
 
@@ -238,9 +239,8 @@ def _steps(case: Case) -> str:
         over, where = known(bound).excess([u - v for u, v in zip(next_, last, strict=True)])
         if over > TOLERANCE:
             where = "the change of the control" if where == "it" else f"the change of {where}"
-            raise Broken(
-                f"{where} leaves its set by {over:.3g} of its own unit, at t = {float(case.control.breakpoints[k]):.6g}"
-            )
+            at = case.at(float(case.control.breakpoints[k]))
+            raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, at {at}")
         worst = max(worst, over)
     return f"{len(found)} steps in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
 
@@ -263,7 +263,8 @@ def _counted(case: Case) -> str:
     _agrees("J", number(case.certificate, "J"), derived, CANCELLED * case.price.added(case.pieces))
     if case.letters is not None and not np.isin(case.control.control(case.theta), case.letters).all():
         raise Broken(f"the control takes other values than {list(case.letters)}")
-    return f"it acts for {acted * total:.9g} of {total:.9g}, J = {float(derived.mid()):.12g}"
+    unit = f" {case.problem.names.time}" if case.problem.names.time else ""
+    return f"it acts for {acted * total:.9g}{unit} of {total:.9g}{unit}, J = {float(derived.mid()):.12g}"
 
 
 def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
@@ -444,7 +445,7 @@ def _lower(case: Case) -> str:
         written, least = number(case.certificate, "lower_bound"), _tree(case)
         if not written <= least + FIGURES * max(1.0, abs(least)):
             raise Broken(f"{written!r} is written, the leaves prove {least!r}")
-        return f"no control of these acts for less than {written:.9g}"
+        return f"no control of these acts for less than {written:.9g} {case.problem.names.time}".rstrip()
     written, derived = number(case.certificate, "lower_bound"), _multiplied(case, priced=True)
     if written <= 0.0:  # absolute values, lengths and positive semidefinite squares: no multiplier is needed for that
         return f"no control costs less than {written:.12g}, for no term of the cost is negative"
@@ -560,7 +561,7 @@ def _witness(case: Case) -> str:
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no witness")
     if case.policy is not None:
-        return _exceeded(*_feedback(case).driven(data), data)
+        return _exceeded(case, *_feedback(case).driven(data), data)
     window, time = case.window(str(data.get("constraint"))), number(data, "time")
     direction, parameter = (numbers(data.get(key), key) for key in ("direction", "parameter"))
     _sized(direction, window.shape.dimension, window.name)
@@ -573,18 +574,19 @@ def _witness(case: Case) -> str:
     if case.measurable:  # the worst is no signal on pieces: how far all of them reach is enclosed instead
         k = _piece(case, window, data, time) if window.is_mixed else None
         over = _feedback(case).farthest(*window.split(direction), time, k) - height
-        return _exceeded(over, case.units(window).slack(direction, height), data)
+        return _exceeded(case, over, case.units(window).slack(direction, height), data)
     state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
     if window.is_mixed:
         state = state + case.pieces[_piece(case, window, data, time)].entries()
     over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), -height)
-    return _exceeded(over, case.units(window).slack(direction, height), data)
+    return _exceeded(case, over, case.units(window).slack(direction, height), data)
 
 
-def _exceeded(over: arb, slack: float, data: Mapping[str, Any]) -> str:
+def _exceeded(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> str:
     """A constraint is exceeded by ``over``, up to ``slack`` of which is none, as the witness says."""
     if not over > slack:
         raise Broken(f"it leads to a violation of {float(over.mid()):.3g}, up to {slack:.3g} is none")
     if abs(float(over.mid()) - number(data, "violation")) > 1e-6 * abs(float(over.mid())) + slack:
         raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over.mid())!r} is derived")
-    return f"{data.get('constraint')} is exceeded by {float(over.lower()):.6g} at t = {number(data, 'time'):.6g}"
+    name, unit = data.get("constraint"), case.measured(str(data.get("constraint")), numbers(data.get("direction"), ""))
+    return f"{name} is exceeded by {float(over.lower()):.6g}{unit} at {case.at(number(data, 'time'))}"

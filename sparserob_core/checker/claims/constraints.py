@@ -215,13 +215,20 @@ def equalities(case: Case) -> str:
     worst = 0.0
     for state, value in case.equalities:
         if _reached(case, state):
-            raise Unchecked(f"the uncertainty may reach x{state + 1}, which is to be fixed")
+            raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
         missed = abs(last[state, 0] - balls([value])[0])
         most = EQUALITY * max(float(sums[state]), abs(value))
         if not missed <= most:
-            raise Broken(f"x{state + 1} is missed by up to {float(missed.upper()):.3g}, rounding is at most {most:.1e}")
+            name = case.problem.names.state(state)
+            raise Broken(f"{name} is missed by up to {float(missed.upper()):.3g}, rounding is at most {most:.1e}")
         worst = max(worst, float(missed.upper()))
-    return f"kept to {worst:.1e}"
+    return f"kept to {worst:.1e}{of_fixed(case)}"
+
+
+def of_fixed(case: Case) -> str:
+    """The units of the states that are fixed."""
+    units = case.problem.names.state_units
+    return joined(units[state] if units else "" for state, _ in case.equalities)
 
 
 def _last(case: Case, flow: VaryingFlow) -> arb_mat:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, below
-from sparserob_core.checker.claims.case import Case, number, numbers
-from sparserob_core.checker.claims.constraints import covered, cut, normals_of
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, number, numbers
+from sparserob_core.checker.claims.constraints import covered, cut, normals_of, of_fixed
 from sparserob_core.checker.claims.duality import before, steps
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 MOST_CELLS = 40_000  # cells of time examined for each constraint
-PEAK, EQUALS, STEP = "peak", "equals", "control_step"
+PEAK = "peak"
 WORST, EFFORT = "worst", "effort"
 FIGURES = 1e-11  # of an effort: how closely it is known
 
@@ -138,7 +138,7 @@ class FeedbackClaims:
                         f"it leaves its set by {over:.3g} of its own unit, on piece {k + 1}, for some disturbance"
                     )
                 worst = max(worst, over)
-        return f"{len(loop.effects)} pieces in their set for every disturbance, to {worst:.1e} of its own units"
+        return f"{len(loop.effects)} pieces in their set for every disturbance, {_to(worst)}"
 
     def _control_turning(self) -> str:
         """Every piece of the control in its curved set, for every disturbance."""
@@ -170,7 +170,7 @@ class FeedbackClaims:
                         f" at t = {loop.breakpoints[k]:.6g}"
                     )
                 worst = max(worst, over)
-        return f"{len(found)} steps in their set for every disturbance, to {worst:.1e} of its own units"
+        return f"{len(found)} steps in their set for every disturbance, {_to(worst)}"
 
     def _changes(self, k: int, rows: Array) -> list[arb]:
         """The largest change along every row, at the beginning of piece ``k``. Across the seam of a plan that repeats
@@ -249,7 +249,7 @@ class FeedbackClaims:
             if not start < half < stop:
                 raise Unchecked(f"the times around {start!r} cannot be halved any more")
             todo += [(piece, start, half), (piece, half, stop)]
-        return f"kept for every disturbance, to {most:.1e} of its own unit ({count} cells)"
+        return f"kept for every disturbance, {_to(most)} ({count} cells)"
 
     def _cuts(self, window: Window) -> Array:
         """The times at which the state, or what stands beside it, turns or jumps."""
@@ -309,12 +309,13 @@ class FeedbackClaims:
             sums = self._added(row)
             most = EQUALITY * max(sums, abs(value))
             if not missed <= most:
+                name = case.problem.names.state(row)
                 raise Broken(
-                    f"x{row + 1} is missed by up to {float(missed.upper()):.3g} for some disturbance or initial state,"
+                    f"{name} is missed by up to {float(missed.upper()):.3g} for some disturbance or initial state,"
                     f" rounding is at most {most:.1e}"
                 )
             worst = max(worst, float(missed.upper()))
-        return f"kept for every disturbance to {worst:.1e}"
+        return f"kept for every disturbance to {worst:.1e}{of_fixed(case)}"
 
     def _missed(self, state: list[list[arb]], row: int, value: float) -> arb:
         """By how much a fixed state is missed at most."""
@@ -924,6 +925,11 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
             reach.append(least)
         found.append(reach[0] + reach[1])
     return found
+
+
+def _to(worst: float) -> str:
+    """By how much a set is left at most, or how much room there is, in words."""
+    return f"to {worst:.1e} of its own unit" if worst > 0.0 else f"with a margin of {-worst:.1e} of its own unit"
 
 
 def _largest(values: list[arb]) -> arb:

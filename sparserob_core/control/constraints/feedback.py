@@ -8,10 +8,11 @@ from typing import Protocol, final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.explanation import TimedExplanation, combination
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop, shared
+from sparserob_core.control.problem.names import measured_in
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
@@ -43,6 +44,10 @@ class Uncertain(Protocol):
     @property
     def loop(self) -> ClosedLoop:
         """The loop that it is about."""
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The unit of every row, empty where it has none that is known."""
 
     def excess(self, x: Array, indices: Array) -> Array:
         """Violations ``(k, r)`` at indices, under the worst deviations."""
@@ -77,6 +82,8 @@ def indexed(constraint: Uncertain, index_set: Box, start: Array, source: object)
         enclosure=constraint.enclosure,
         cells=constraint.cells,
         explain=constraint.explain,
+        measured=constraint.measured,
+        along=constraint.loop.functionals.names.time,
         source=source,
     )
     far = np.concatenate([constraint.loop.spread.radii])
@@ -109,6 +116,11 @@ class FeedbackConstraint:
     def name(self) -> str:
         """The name of the constraint."""
         return self.flat.name
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The unit of every row, empty where it has none that is known."""
+        return self.flat.measured
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
@@ -285,7 +297,8 @@ class FeedbackConstraint:
         if not self._unanswered[row]:
             return found
         last = float(self.loop.functionals.dictionary.breakpoints[-2])
-        late = f"{found.text} (what comes after the last measurement, at {last:.6g}, reaches it unanswered)"
+        at = f"{last:.6g} {self.loop.functionals.names.time}".rstrip()
+        late = f"{found.text} (what comes after the last measurement, at {at}, reaches it unanswered)"
         return replace(found, text=late)
 
     @cached_property
@@ -391,13 +404,17 @@ class FeedbackControl:
         bounds = (found + ROUND_OFF * size).max(axis=1)[self.pieces((lower[:, 0] + upper[:, 0]) / 2)]
         return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
 
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The unit of every row, empty where it has none that is known."""
+        return _of_controls(self)
+
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people."""
-        time, direction = float(index[0]), self.H[row]
-        terms = [f"{'-' if v < 0 else ''}{'' if abs(v) == 1 else f'{abs(v):.4g} '}u{i + 1}({time:.6g})"
-                 for i, v in enumerate(direction) if v]  # fmt: skip
-        right = "its peak" if self.bound is not None else f"{self.h[row] + 0.0:.6g}"
-        text = f"{self.name}: {' + '.join(terms)} <= {right}"
+        time, direction, names = float(index[0]), self.H[row], self.loop.functionals.names
+        terms = combination(direction, names, f"({time:.6g})", 0)
+        right = f"{self.h[row] + 0.0:.6g} {self.measured[row]}".rstrip() if self.bound is None else "its peak"
+        text = f"{self.name}: {terms} <= {right}"
         said = TimedExplanation(text, self.name, text, time, direction)
         return told(said, self.loop, index[1:], controls=True)
 
@@ -483,12 +500,23 @@ class FeedbackSteps:
         bounds = (found + ROUND_OFF * size).max(axis=1)[self._steps((lower[:, 0] + upper[:, 0]) / 2)]
         return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
 
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The unit of every row, empty where it has none that is known."""
+        return _of_controls(self)
+
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people."""
-        time = float(self.times[self._steps(index[:1])[0]])
-        terms = " + ".join(f"{value:.4g} u{i + 1}" for i, value in enumerate(self.H[row]) if value)
-        text = f"{self.name}: the change of {terms} at {time:.6g} <= {self.h[row] + 0.0:.6g}"
+        time, names = float(self.times[self._steps(index[:1])[0]]), self.loop.functionals.names
+        at = f"{time:.6g} {names.time}".rstrip()
+        limit = f"{self.h[row] + 0.0:.6g} {self.measured[row]}".rstrip()
+        text = f"{self.name}: the change of {combination(self.H[row], names, states=0)} at {at} <= {limit}"
         return told(TimedExplanation(text, self.name, text, time, self.H[row]), self.loop, index[1:], True)
+
+
+def _of_controls(one: FeedbackControl | FeedbackSteps) -> tuple[str, ...]:
+    """The unit of every row on the control."""
+    return tuple(measured_in(normal, one.loop.functionals.names, 0).strip() for normal in one.H)
 
 
 def worst_of_each(found: Array, times: Array) -> Separation:

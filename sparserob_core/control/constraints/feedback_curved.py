@@ -82,6 +82,11 @@ class Turning(ABC):
     def source(self) -> object:
         """What the family is of."""
 
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The unit of its one row: none, since that is in multiples of the set's gauge."""
+        return ("",)
+
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         cube = np.ones(self._b)

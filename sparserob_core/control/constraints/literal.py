@@ -46,6 +46,8 @@ class LiteralConstraint:
             reduced=reduced,
             explain=self.explain,
             formulation="literal",
+            measured=self.base.measured,
+            along=self.base.functionals.names.time,
             source=self.base,
         )
 

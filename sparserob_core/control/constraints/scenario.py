@@ -45,6 +45,8 @@ class ScenarioConstraint:
             rows=self.rows,
             worst=self.worst,
             formulation="sampled",
+            measured=self.base.measured,
+            along=self.base.functionals.names.time,
             source=self.base,
         )
 

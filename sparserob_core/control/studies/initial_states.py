@@ -239,6 +239,8 @@ class _Joined(_OfPlane):
             enclosure=self.enclosure if offers else None,
             explain=self.explain,
             row_units=self.base.row_units,
+            measured=self.base.measured,
+            along=self.base.along,
             index_units=self.base.index_units,
             source=self.base.source,
         )
@@ -278,6 +280,8 @@ class _JoinedUncertain(_OfPlane):
             enclosure=self.enclosure,
             explain=self.explain,
             row_units=base.row_units,
+            measured=base.measured,
+            along=base.along,
             index_units=base.index_units,
             source=base.source,
         )

@@ -116,7 +116,14 @@ def made_again(model: Transcription, charge: Charge) -> Transcription:
     program, loop = model.feedback.made(model, charge)
     named = {family.name: family for family in model.program.families}
     families = [
-        replace(one, explain=told.explain, row_units=told.row_units, index_units=told.index_units)
+        replace(
+            one,
+            explain=told.explain,
+            row_units=told.row_units,
+            index_units=told.index_units,
+            measured=told.measured,
+            along=told.along,
+        )
         for one, told in ((one, named.get(one.name, one)) for one in program.families)
     ]
     program = replace(program, families=families, cost_unit=model.program.cost_unit)
@@ -313,7 +320,14 @@ def _told_by(
     def told(one: ConstraintFamily, scale: Array) -> ConstraintFamily:
         said = other.explain
         assert said is not None
-        return replace(one, explain=lambda index, row: said(index * scale, row), row_units=rows, index_units=scale)
+        return replace(
+            one,
+            explain=lambda index, row: said(index * scale, row),
+            row_units=rows,
+            index_units=scale,
+            measured=other.measured,
+            along=other.along,
+        )
 
     reduced = told(family, index)
     return replace(reduced, literal=replace(told(literal, np.concatenate([index, deviations])), reduced=reduced))

@@ -365,6 +365,8 @@ def _told_by(
             hindrance=None if hindered is None else (lambda low, high: hindered(low * scale, high * scale)),
             row_units=rows,
             index_units=scale,
+            measured=other.measured,
+            along=other.along,
         )
 
     draw = family.sample
@@ -655,5 +657,7 @@ def _reduced(constraint: StateConstraint) -> ConstraintFamily:
         gradient=Sensitivity(constraint).gradient,
         explain=constraint.explain,
         hindrance=lambda lower, upper: hindrance(response.system, float(response.grid.breakpoints[-1])),
+        measured=constraint.measured,
+        along=constraint.functionals.names.time,
         source=constraint,
     )

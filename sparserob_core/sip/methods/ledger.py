@@ -159,6 +159,7 @@ class Ledger:
             upper_bound=upper,
             violation=worst.violation,
             worst_family=worst.constraint,
+            measured=self.program.family(worst.constraint).measure(worst.row) if worst.constraint else "",
             active_indices=kept,
             cuts_added=len(added),
             cuts_dropped=len(dropped),

@@ -54,7 +54,10 @@ def prove(
     }
     proven = (family.reduced or family for family in program.families)
     found = [(one, prove_family(one, x, notify, budgets[one.name], time_left)) for one in proven]
-    return tuple(replace(proof, formulation=one.formulation, unit=one.row_unit(proof.row)) for one, proof in found)
+    return tuple(
+        replace(proof, formulation=one.formulation, unit=one.row_unit(proof.row), measured=one.measure(proof.row))
+        for one, proof in found
+    )
 
 
 def prove_family(
@@ -98,15 +101,16 @@ class Course:
 
     def opened(self, lower: Array, upper: Array) -> None:
         """Note the open cells ``(k, d)``: how much of the first coordinate they cover, and from where to where."""
-        unit = 1.0 if self.family.index_units is None else float(self.family.index_units[0])
-        ends, box = unit * np.stack([lower[:, 0], upper[:, 0]]), self.family.index_set
-        whole = unit * float(box.upper[0] - box.lower[0]) if box.dimension else 0.0
+        factor = 1.0 if self.family.index_units is None else float(self.family.index_units[0])
+        ends, box = factor * np.stack([lower[:, 0], upper[:, 0]]), self.family.index_set
+        whole = factor * float(box.upper[0] - box.lower[0]) if box.dimension else 0.0
         if whole <= 0.0 or not np.isfinite(whole):
             return
         first = np.argsort(ends[0], kind="stable")
         starts, reached = ends[0, first], np.maximum.accumulate(ends[1, first])
         covered = float(np.maximum(reached - np.maximum(starts, np.append(starts[0], reached[:-1])), 0.0).sum())
-        self.along = f"open along {covered:.3g} of {whole:.3g}, from {starts[0]:.5g} to {reached[-1]:.5g}"
+        unit = f" {self.family.along}" if self.family.along else ""
+        self.along = f"open along {covered:.3g} of {whole:.3g}{unit}, from {starts[0]:.5g} to {reached[-1]:.5g}{unit}"
 
     def tell(self, cells: int, bound: float, lower: Array, upper: Array, pending: int = 0) -> None:
         """Tell that ``cells`` are open, of which the worst, from ``lower (d,)`` to ``upper (d,)``, has this bound;
@@ -127,6 +131,7 @@ class Course:
                 budget=self.budget,
                 bound_before=before,
                 hindrance="" if not bound >= ADVANCED * before else self.hindrance(bound, lower, upper),
+                measured=self.family.measure(),
             )
         )
 
@@ -141,6 +146,7 @@ class Course:
         lower, upper = (lower, upper) if known is None or known.size != lower.size else (lower * known, upper * known)
         allowed = bound * (1.0 if self.family.row_units is None else float(self.family.row_units.max()))
         cell = f"the cell from {_shown(lower)} to {_shown(upper)} still allows {allowed:.1e}"
+        cell += f" {self.family.measure()}" if self.family.measure() else ""
         cell = f"{self.along}; {cell}" if self.along else cell
         return f"{self.family.name}: {cell}; {advice or ADVICE}"
 

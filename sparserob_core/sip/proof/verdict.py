@@ -27,7 +27,7 @@ NAMED = 6  # reasons, or members of an infeasible subsystem, that are named; of 
 def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Status, str]:
     """The status that the proofs and the gap allow, and a sentence."""
     refuted = [
-        f"{proof.family} is violated by {proof.violation * proof.unit:.4g}"
+        f"{proof.family} is violated by {proof.violation * proof.unit:.4g} {proof.measured}".rstrip()
         for proof in proofs
         if proof.verdict == "refuted"
     ]
@@ -57,6 +57,7 @@ def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
         row=int(found.rows[0]),
         formulation=family.formulation,
         unit=family.row_unit(int(found.rows[0])),
+        measured=family.measure(int(found.rows[0])),
     )
 
 

@@ -148,6 +148,8 @@ def _family(factored: ParametricProgram, one: ConstraintFamily, two: ConstraintF
         formulation=one.formulation,
         source=one.source,
         row_units=one.row_units,
+        measured=one.measured,
+        along=one.along,
     )
 
 
@@ -169,6 +171,8 @@ def _relaxed(family: ConstraintFamily) -> ConstraintFamily:
         formulation=family.formulation,
         source=family.source,
         row_units=family.row_units,
+        measured=family.measured,
+        along=family.along,
         cells=family.cells,
         worst=None if family.worst is None else partial(worst, separation=family.worst),
     )

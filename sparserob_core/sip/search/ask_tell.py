@@ -333,9 +333,7 @@ class AskTell:
     def _so_far(self, stopped: str) -> Report:
         points = np.array(self._points).reshape(-1, self.domain.dimension)
         values = self._usable()
-        trace = Trace(
-            points, self._sign * values, self._sign * np.maximum.accumulate(values), np.array(self._seconds)
-        )
+        trace = Trace(points, self._sign * values, self._sign * np.maximum.accumulate(values), np.array(self._seconds))
         return Report(self.best_value, self.best_point, self.evaluations, np.inf, trace, stopped)
 
     def _turned(self, report: Report) -> Report:

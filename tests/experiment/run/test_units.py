@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import sparserob_core as sr
@@ -65,6 +66,63 @@ def test_margins_of_a_check_have_the_units_of_their_rows(outcome: sr.Outcome) ->
     said = {claim.name: claim.text for claim in sr.check(outcome).claims}
     assert " m (" in said["path"]
     assert " m or m/s (" in said["terminal"]
+
+
+class Heard(sr.Observer):
+    def __init__(self) -> None:
+        self.rounds: list[sr.RoundFinished] = []
+
+    def receive(self, event: sr.Event) -> None:
+        if isinstance(event, sr.RoundFinished):
+            self.rounds.append(event)
+
+
+@pytest.mark.parametrize("policy", ["open_loop", "affine"])
+def test_what_refutes_a_control_has_the_unit_of_its_row(tmp_path: Path, policy: str) -> None:
+    moved = {"terminal": [{"box": 0.12}], "control_step": {"box": 0.9}}
+    names = NAMES | {"units": NAMES["units"] | {"controls": ["kN", "kN"]}}
+    config: dict[str, Any] = {
+        "problem": {**PROBLEM, **moved, "names": names},
+        "dictionaries": PIECES,
+        "policy": {"name": policy},
+        "method": {"name": "exchange" if policy == "affine" else "nominal"},
+    }
+    heard = Heard()
+    outcome = sr.run(config, out=tmp_path / "run", quiet=True, figures=False, observers=[heard])
+    said = {claim.name: claim.text for claim in sr.check(outcome).claims}
+    rows = outcome.summary["units"]["rows"]
+    for event in heard.rounds:
+        family = event.separations[event.worst_family]
+        mine = rows[event.worst_family]
+        assert event.measured == mine[0 if len(mine) == 1 else int(family.rows[0])]
+    if policy == "affine":
+        assert {event.measured for event in heard.rounds} <= {"m", "m/s", "kN"}
+        assert "with a margin of" in said["control"]
+    else:
+        worst = outcome.summary["units"]["worst"]
+        assert f" {worst}" in outcome.result.message.partition("terminal is violated by ")[2]
+        assert said["violation"].endswith(f" {worst} at t = 2 s")
+
+
+def test_a_row_of_the_control_under_feedback_is_told_by_name_and_unit() -> None:
+    names = sr.Names(controls=["pull", "push"], control_units=["N", "N"], time="s")
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(A=[[0.0]], B=[[1.0, 1.0]]),
+        horizon=2.0,
+        initial_state=[0.0],
+        control=sr.Box([-1, -2], [1, 2]),
+        control_step=sr.Box([-0.5, -0.5], [0.5, 0.5]),
+        disturbance=sr.Box([-0.1], [0.1]),
+        names=names,
+    )
+    pieces = sr.Dictionary([0.0, 0.5, 1.0, 1.5, 2.0], np.eye(4))
+    program = sr.transcribe(problem, pieces, policy=sr.AffinePolicy())
+    control, step = (program.family(name) for name in ("control", "control_step"))
+    index = control.index_set.lower
+    texts = [control.explanation(index, row).short() for row in range(4)]
+    assert sorted(texts)[0].startswith("control: -pull(0") and any("push(0) <= 2 N" in text for text in texts)
+    assert "the change of pull at 0.5 s <= 0.5 N" in step.explanation(step.index_set.lower, 0).short()
+    assert {*control.measured, *step.measured} == {"N"}
 
 
 def test_tables_of_samples_and_loops_have_units(outcome: sr.Outcome) -> None:
