@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -188,6 +189,15 @@ class Result:
             return self
         counts = {**self.counts, "solver_calls": solver.failures.calls}
         return replace(self, unanswered=tuple(solver.failures), counts=counts)
+
+    def charged(self, others: Iterable[Result]) -> Result:
+        """The same with the programs of ``others``, which were solved on the way, on its account: how many they were,
+        and whose answers."""
+        solved_by, programs = Counter(self.solved_by), self.counts.get("relaxed_programs", 0)
+        for other in others:
+            solved_by.update(other.solved_by)
+            programs += other.counts.get("relaxed_programs", 0)
+        return replace(self, solved_by=dict(solved_by), counts={**self.counts, "relaxed_programs": programs})
 
     def __repr__(self) -> str:
         lines = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
@@ -213,6 +213,12 @@ class Failures:
         key = (kind, NUMBERS.sub("#", reason), by)
         known = self._known.get(key, Unanswered(kind, 0, reason, by))
         self._known[key] = replace(known, count=known.count + count)
+
+    def resume(self, calls: int, missed: Iterable[Unanswered]) -> None:
+        """Go on from an account that was kept before."""
+        self.calls += calls
+        for one in missed:
+            self.add(one.kind, one.reason, one.by, one.count)
 
     def __iter__(self) -> Iterator[Unanswered]:
         return iter(tuple(self._known.values()))

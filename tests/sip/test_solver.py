@@ -69,6 +69,8 @@ WAYS = {
     "exchange": {},
     "sparserob": {"method": {"name": "sparserob", "indices": 2}, "budget": 5},
     "sparsest": {"method": "sparsest"},
+    "letters": {"method": {"name": "sparsest", "alphabet": [-1.0, 0.0, 1.0]}},
+    "reweighted": {"method": "reweighted"},
     "scenario": {"method": {"name": "scenario", "scenarios": 20}},
     "nominal": {"method": "nominal"},
     "norms": {"regulariser": "smoothness"},
@@ -88,6 +90,7 @@ def test_a_solver_that_is_named_answers_every_program(way):
     assert named.status == auto.status
     assert named.lower_bound == pytest.approx(auto.lower_bound, abs=1e-6)
     assert "Spied" not in auto.solved_by
+    assert sum(auto.solved_by.values()) == auto.counts["relaxed_programs"]
 
 
 @pytest.mark.parametrize("policy", ["open_loop", "affine"])

@@ -40,6 +40,7 @@ from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
+from sparserob_core.sip.solver import Named
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -140,6 +141,8 @@ class SolvedProblem(ControlResult):
     def _saved(self, path: Path, figures: bool) -> Outcome:
         experiment = self.experiment
         loaded, tools = experiment.loaded, tools_of(experiment.loaded)
+        if isinstance(tools.solver, Named):  # the account goes on where it was
+            tools.solver.failures.resume(self.counts.get("solver_calls", 0), self.unanswered)
         plain = loaded.config.plain()
         text = write_yaml(plain, HEADING)
         require_readable(plain, text)
@@ -181,7 +184,7 @@ def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Noti
     notify(StudyProgress(text="certificate: what the multipliers prove without rounding", phase=True))
     known = bounded(experiment, result) if result.sparsest is None else result
     notify(StudyProgress(text="fewest active: how little any admissible control must act", phase=True))
-    known = with_activity(experiment, known, tools)
+    known = with_activity(experiment, known, tools).accounted(tools.solver)
     notify(StudyProgress(text="causal bound: what no causal policy can do", phase=True))
     concluding = with_causal(SolvedProblem.run(known, experiment), tools)
     concluding.__dict__["experiment"] = experiment

@@ -1,7 +1,8 @@
 """Branch and bound over which entries count: a tree of convex programs, every leaf with multipliers that prove it.
 
-The simplex method only says where to look. What is claimed of a leaf is weak duality with its multipliers, or Farkas'
-lemma, evaluated by `inner.duality`; whoever doubts the tree follows it with the multipliers alone (`checker`).
+The simplex method, or the solver that was named, only says where to look. What is claimed of a leaf is weak duality
+with its multipliers, or Farkas' lemma, evaluated by `inner.duality`; whoever doubts the tree follows it with the
+multipliers alone (`checker`).
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import NO_BOUND, Branch, Dual, Leaf
-from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.finite import HIGHS, NOBODY, FiniteProgram
 from sparserob_core.sip.inner.duality import farkas_margin, proving
 from sparserob_core.sip.inner.solve import elastic_program, unrelaxed
-from sparserob_core.sip.inner.vertex import simplex
+from sparserob_core.sip.inner.vertex import Corner, simplex
 from sparserob_core.sip.methods.counting import MISSED, convex_below, prices_of, whole
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
@@ -65,7 +66,9 @@ class Branching:
     def __post_init__(self) -> None:
         base = self.program.finite
         self.prices = prices_of(self.program)
-        self._add(Part(-1, 0, float(base.lower[0]), float(base.upper[0]), False))
+        whole = Part(-1, 0, float(base.lower[0]), float(base.upper[0]), False)
+        self.parts, self.nodes = [whole], [Leaf(NO_BOUND)]
+        self._heap = [(self._renewed(0), 0)]
 
     @property
     def lower(self) -> float:
@@ -89,15 +92,14 @@ class Branching:
             image = self._undecided(number, x)
             if image is None and look(x):
                 if self._safe(bound) < incumbent() * (1.0 - MISSED):
-                    heapq.heapreplace(self._heap, (self._measured(number), number))
+                    heapq.heapreplace(self._heap, (self._renewed(number), number))
                 continue
             if image is None and (image := self._free(number)) is None:
                 return
-            heapq.heappop(self._heap)
             self._divide(number, image, float(self.program.finite.image(x)[image]))
 
     def _divide(self, number: int, image: int, value: float) -> None:
-        low, high, _ = self._bounds(number)
+        low, high, _ = self._bounds(self.parts[number])
         below, above = float(low[image]), float(high[image])
         if self.letters is None:
             at = None
@@ -112,43 +114,56 @@ class Branching:
                 Part(number, image, below, float(allowed[left]), False),
                 Part(number, image, float(allowed[right]), above, False),
             ]
-        first = len(self.nodes)
-        for child in children:
-            self._add(child)
-        self.nodes[number] = Branch(image, first, first + 1, at)
+        # measured before anything is changed: whoever is interrupted leaves a tree that covers every decision
+        measured, first = [self._measured(child, Leaf(NO_BOUND)) for child in children], len(self.nodes)
+        heap = [entry for entry in self._heap if entry[1] != number]
+        heap += [(part.bound, first + k) for k, (part, _) in enumerate(measured)]
+        heapq.heapify(heap)
+        self.parts += [part for part, _ in measured]
+        self.nodes += [leaf for _, leaf in measured]
+        self.nodes[number], self._heap = Branch(image, first, first + 1, at), heap
         self.parts[number] = replace(self.parts[number], x=None)
 
-    def _add(self, part: Part) -> None:
-        self.parts.append(part)
-        self.nodes.append(Leaf(NO_BOUND))
-        number = len(self.nodes) - 1
-        heapq.heappush(self._heap, (self._measured(number), number))
+    def _renewed(self, number: int) -> float:
+        """Bound one part anew; the bound that is known of it now."""
+        leaf = self.nodes[number]
+        assert isinstance(leaf, Leaf)
+        self.parts[number], self.nodes[number] = self._measured(self.parts[number], leaf)
+        return self.parts[number].bound
 
-    def _measured(self, number: int) -> float:
-        """Bound one part anew, with all rows; keeps what is known of it where that is better."""
-        finite, certain = self._finite(number)
-        corner = simplex(finite)
+    def _measured(self, part: Part, leaf: Leaf) -> tuple[Part, Leaf]:
+        """A part and its leaf, bounded with all rows; with what was known of it where that is better."""
+        finite, certain = self._finite(part)
+        corner = self._corner(finite)
+        y, mu, z = corner.y, corner.mu, corner.z
+        known = replace(part, bound=max(part.bound, 0.0))
         if corner.status == "infeasible":
-            y, mu, z = unrelaxed_of(finite)
             amount, magnitude = farkas_margin(finite, y, mu, z)
-            if amount > IMPOSSIBLE * max(1.0, magnitude):
-                size = float(y @ np.linalg.norm(finite.G, axis=1) + np.abs(mu) @ np.linalg.norm(finite.A, axis=1))
-                z = None if z is None else z / size
-                self.nodes[number] = Leaf(self._told(finite, y / size, mu / size, z, amount, False), feasible=False)
-                self.parts[number] = replace(self.parts[number], bound=np.inf, x=None)
-                return np.inf
-            return max(self.parts[number].bound, 0.0)
+            if not amount > IMPOSSIBLE * max(1.0, magnitude):
+                return known, leaf
+            size = float(y @ np.linalg.norm(finite.G, axis=1) + np.abs(mu) @ np.linalg.norm(finite.A, axis=1))
+            z = None if z is None else z / size
+            told = self._told(finite, y / size, mu / size, z, amount, False)
+            return replace(part, bound=np.inf, x=None), Leaf(told, feasible=False)
         if corner.status == "failed":
-            return max(self.parts[number].bound, 0.0)
-        offers = [(corner.y, corner.mu, corner.z), (np.zeros_like(corner.y), np.zeros_like(corner.mu), None)]
-        proven = [proving(finite, y, mu, z) for y, mu, z in offers]
+            return known, leaf
+        offers = [(y, mu, z), (np.zeros_like(y), np.zeros_like(mu), None)]
+        proven = [proving(finite, *offer) for offer in offers]
         bound, y, mu, z = max(proven, key=lambda one: one[0])
         bound += certain - self.relaxed.rounding(finite, y, mu, corner.x)
-        part = self.parts[number]
         if bound > part.bound:
-            self.nodes[number] = Leaf(self._told(finite, y, mu, z, bound))
-        self.parts[number] = replace(part, bound=max(bound, part.bound), x=corner.x)
-        return self.parts[number].bound
+            leaf = Leaf(self._told(finite, y, mu, z, bound))
+        return replace(part, bound=max(bound, part.bound), x=corner.x), leaf
+
+    def _corner(self, finite: FiniteProgram) -> Corner:
+        """The answer to the linear program of a part, with multipliers that may prove it infeasible where it is said to
+        be: of the solver that was named, or of the simplex method, whose vertices have zeros."""
+        if self.relaxed.counted.instead is not None:
+            answer = self.relaxed.answered(finite)
+            return Corner(answer.status, answer.x, answer.y, answer.mu, None if finite.S is None else answer.z)
+        corner = simplex(finite)
+        self.relaxed.count(NOBODY if corner.status == "failed" else HIGHS)
+        return _unrelaxed(finite) if corner.status == "infeasible" else corner
 
     def _told(
         self, finite: FiniteProgram, y: Array, mu: Array, z: Array | None, bound: float, priced: bool = True
@@ -159,28 +174,27 @@ class Branching:
         of = replace(finite, q=finite.q / unit, weights=finite.weights / unit)
         return self.relaxed.dual(self.rows, y / unit, mu / unit, z / unit, bound / unit, priced=priced, of=of)
 
-    def _bounds(self, number: int) -> tuple[Array, Array, np.ndarray]:
+    def _bounds(self, part: Part) -> tuple[Array, Array, np.ndarray]:
         """The bounds of all images in one part, and which count there whatever their value."""
         base = self.program.finite
         lower, upper, on = base.lower.copy(), base.upper.copy(), np.zeros(base.lower.size, dtype=bool)
         seen: set[int] = set()
-        while number > 0:
-            part = self.parts[number]
+        while part.above >= 0:
             if part.image not in seen:
                 lower[part.image], upper[part.image], on[part.image] = part.lower, part.upper, part.on
                 seen.add(part.image)
-            number = part.above
+            part = self.parts[part.above]
         return lower, upper, on
 
-    def _finite(self, number: int) -> tuple[FiniteProgram, float]:
-        lower, upper, on = self._bounds(number)
+    def _finite(self, part: Part) -> tuple[FiniteProgram, float]:
+        lower, upper, on = self._bounds(part)
         base = replace(self.relaxed.finite(self.rows.G, self.rows.h, 0.0), lower=lower, upper=upper)
         finite, _, certain = convex_below(base, self.prices, on)
         return finite, certain
 
     def _undecided(self, number: int, x: Array) -> int | None:
         """The image that is furthest from being decided at ``x``; ``None`` where each is 0, on, or a letter."""
-        lower, upper, on = self._bounds(number)
+        lower, upper, on = self._bounds(self.parts[number])
         image = self.program.finite.image(x)
         counted = self.prices > 0.0
         if self.letters is not None:
@@ -197,21 +211,19 @@ class Branching:
 
     def _free(self, number: int) -> int | None:
         """An image that may still be 0 or not, or one of several letters."""
-        lower, upper, on = self._bounds(number)
+        lower, upper, on = self._bounds(self.parts[number])
         free = (self.prices > 0.0) & ~on & (lower < upper)
         if self.letters is None:
             free &= (lower <= 0.0) & (upper >= 0.0)
         return int(np.argmax(free)) if free.any() else None
 
 
-def unrelaxed_of(program: FiniteProgram) -> tuple[Array, Array, Array | None]:
+def _unrelaxed(program: FiniteProgram) -> Corner:
     """Multipliers that may prove that a finite program is infeasible: those of its elastic program."""
-    relaxed = elastic_program(program)
-    corner = simplex(relaxed)
+    corner = simplex(elastic_program(program))
     if corner.status != "optimal":
-        return np.zeros(program.h.size), np.zeros(program.b.size), None
-    _, y, mu, z = unrelaxed(program, (corner.x, corner.y, corner.mu, corner.z))
-    return y, mu, z
+        return Corner("infeasible", np.zeros(program.n), np.zeros(program.h.size), np.zeros(program.b.size))
+    return Corner("infeasible", *unrelaxed(program, (corner.x, corner.y, corner.mu, corner.z)))
 
 
 def proposed(

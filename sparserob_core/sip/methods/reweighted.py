@@ -57,7 +57,8 @@ class Reweighted(Method, Options):
         first = Exchange(tolerance=self.tolerance, rounds=self.rounds).solve(program, tools)
         if first.decision is None or first.status not in PROVEN or first.stopped:
             return first
-        best = x = first.decision
+        best, spent = first.decision, list[Result]()
+        x = best
         known = [*first.indices, *first.dual.cuts]
         plain = replace(tools, notify=ignore, regulariser=None)
         exchange = Exchange(tolerance=self.tolerance, rounds=self.rounds)
@@ -66,6 +67,7 @@ class Reweighted(Method, Options):
                 break
             heavier = replace(program, weights=program.finite.weights * self._weights(program, x), twin=None)
             found = exchange.close(heavier, plain, unproven, imposed_cuts(known))
+            spent.append(found)
             if found.decision is None or found.status not in PROVEN:
                 break
             known = [*first.indices, *first.dual.cuts, *found.indices]
@@ -74,14 +76,15 @@ class Reweighted(Method, Options):
             if settled:
                 break
         if best is first.decision:
-            return first
+            return first.charged(spent)
         result = on_support(program, best, tools, exchange, known)
+        spent.append(result)
         if (
             result.decision is None
             or result.status not in PROVEN
             or count(program, result.decision) >= count(program, first.decision)
         ):
-            return first
+            return first.charged(spent)
         gap = relative_gap(first.lower_bound, result.cost, result.cost_scale)
         status, message = verdict(result.proofs, gap, self.tolerance)
         return replace(
@@ -94,7 +97,7 @@ class Reweighted(Method, Options):
             counts=first.counts,
             solved_by=first.solved_by,
             seconds=first.seconds + result.seconds,
-        )
+        ).charged(spent)
 
     def _weights(self, program: SemiInfiniteProgram, x: Array) -> Array:
         """The slope of the penalty at ``x (n,)``, ``(k,)``, 1 at 0; 1 where nothing counts."""

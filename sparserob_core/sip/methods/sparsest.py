@@ -144,12 +144,15 @@ class _Search:
     rounds: list[RoundFinished] = field(default_factory=list)
     tree: Branching | None = None
     tried: set[bytes] = field(default_factory=set)
+    spent: list[Result] = field(default_factory=list)
+    """What was solved on the way: the convex program, and one for every set of entries that was tried."""
     missed: float = 0.0
     """By how much the last decision of letters missed constraints that were not yet imposed, in their norms."""
 
     def __post_init__(self) -> None:
         self.relaxed = RelaxedProgram(self.bounded, self.tools.solver, None, deadline=self.tools.deadline)
         self.rows = Rows.none(self.program.n)
+        self.spent += [] if self.plain is None else [self.plain]
         if self.plain is not None and self.plain.status in PROVEN and self.plain.decision is not None:
             self.best, self.least = self.plain, count(self.program, self.plain.decision)
             self._keep(self.plain.indices)
@@ -174,6 +177,7 @@ class _Search:
         tools = replace(self.tools, notify=forwarded(self.tools.notify, RoundFinished, heard), regulariser=None)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
         result = method.close(below.program, tools, unproven, imposed_cuts(self.rows.cuts))
+        self.spent.append(result)
         if result.status == "infeasible":
             letters = tuple(self.method.alphabet or ())
             said = f"no control with values in {list(letters)}: {result.message}" if letters else result.message
@@ -210,6 +214,7 @@ class _Search:
         self.tried.add(key)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
         result = on_support(self.program, x, self.tools, method, self.rows.cuts)
+        self.spent.append(result)
         fresh = self._keep([*result.indices, *result.dual.cuts])
         if result.status in PROVEN and result.decision is not None:
             counted = count(self.program, result.decision)
@@ -283,7 +288,7 @@ class _Search:
             cost=self.least / unit,
             decision=self.told.decision if decision is None else decision,
             gap=relative_gap(self.lower, self.least),
-            relaxed_programs=self.relaxed.solves,
+            relaxed_programs=self.relaxed.solves + sum(one.counts["relaxed_programs"] for one in self.spent),
         )
         self.rounds.append(self.told)
         self.tools.notify(self.told)
@@ -343,7 +348,7 @@ class _Search:
                 sparsest=Sparsest(np.nan, None, None, tree, letters),
                 history=history,
                 seconds=seconds,
-            )
+            ).charged(self.spent)
         lower = min(self.tree.lower, self.least)
         status, message = verdict(self.best.proofs, relative_gap(lower, self.least), self.method.tolerance)
         plain = self.plain if self.plain is not None and self.plain.status in PROVEN else None
@@ -372,7 +377,7 @@ class _Search:
             history=history,
             seconds=seconds,
             cost_scale=self.least / unit,
-        )
+        ).charged(self.spent)
 
 
 def _none(program: SemiInfiniteProgram, result: Result, letters: Sequence[float]) -> Result:

@@ -341,14 +341,23 @@ class RelaxedProgram:
         self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float, guess: FiniteSolution | None
     ) -> FiniteSolution:
         self.deadline.check()
-        self.solves += 1
         small = SMALL_COST if epsilon == 0.0 else np.inf  # the bounds are to meet there
-        finite = self.finite(G, h, epsilon)
+        return self.answered(self.finite(G, h, epsilon), guess, small)
+
+    def answered(
+        self, finite: FiniteProgram, guess: FiniteSolution | None = None, small: float = np.inf
+    ) -> FiniteSolution:
+        """The checked solution of a finite program by the solver, whose answer is counted; see `solve_finite`."""
         solution = solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
-        self.solved_by[solution.by] += 1
+        self.count(solution.by)
         if solution.unanswered:
             self.counted.failures.add(RELAXED, solution.unanswered, solution.by)
         return solution
+
+    def count(self, by: str) -> None:
+        """Count one program that was answered ``by`` somebody."""
+        self.solves += 1
+        self.solved_by[by] += 1
 
     @shaped
     def finite(self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float) -> FiniteProgram:

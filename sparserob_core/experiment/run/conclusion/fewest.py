@@ -54,6 +54,8 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
     most, other = count(program, np.asarray(result.decision)) if proven else np.inf, None
     if factor is None or (proven and not is_vertex(program, result)):
         other = _other(experiment, result, tools, most)
+    if other is not None:  # the relaxed programs of the method are what they were
+        result = replace(result, solved_by=result.charged([other]).solved_by)
     activity = Activity(_share(program, least) or 0.0, _share(program, most), norm=norm)
     if other is not None and _safe(program, other.lower_bound) > least:
         least = _safe(program, other.lower_bound)
