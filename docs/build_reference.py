@@ -53,7 +53,8 @@ FILES = {
     ),
     "solution.npz": (
         "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`,"
-        " `families`, `formulations`, `multipliers`"
+        " `families`, `formulations`, `multipliers`; under feedback the same of the constraints that prove the lower"
+        " bound, each at its deviation, as `bound_indices`, ..., and `bound_equalities`"
     ),
     "evaluations.npz": (
         "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound,"

@@ -80,7 +80,8 @@ def test_a_policy_that_is_shown_again_has_the_same_pictures(answered: sr.Outcome
     again = tmp_path / "again.rrd"
     assert command("replay", str(answered.directory), "--save", str(again)) == 0
     first, second = read(answered.directory / "recording.rrd"), read(again)
-    assert set(second) >= FEEDBACK
+    assert set(second) >= {*FEEDBACK, "/landscape/map/g"}
+    assert not [line for line in texts(second["/log"], "TextLog:text") if "no landscape" in line]
     one, other = (scalars(part["/signals/effort/u1"], "t")[1] for part in (first, second))
     np.testing.assert_array_equal(one, other)
 

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     import sparserob_core as sr
 
 LEFT, WIDTH, HEIGHT, GAP = 74.0, 640.0, 136.0, 66.0
-ONE = (-20.0, LEFT + WIDTH + 94.0, -44.0, HEIGHT + 48.0)
-BOTH = (-20.0, LEFT + WIDTH + 94.0, -44.0, 2 * HEIGHT + GAP + 48.0)
+ABOVE = 36.0  # the caption, which is as wide as the plot, is above the highest number upwards
+ONE = (-20.0, LEFT + WIDTH + 94.0, -64.0, HEIGHT + 48.0)
+BOTH = (-20.0, LEFT + WIDTH + 94.0, -64.0, 2 * HEIGHT + GAP + 48.0)
 """Left, right, top and bottom of the bounds, and of both drawings."""
 VIEW = 1.5  # the view reaches down by this many times the size of the best bound; first bounds may be far below
 SMALLEST = 1e-12
@@ -67,7 +68,9 @@ class Bounds:
         said = f"{_number(lower.max())} ≤ J* ≤ {_number(best)}"
         there, closes = np.isfinite(lower), bool(np.isfinite(best))
         shades = closes and there.sum() > 1
-        drawing.frame(axes, f"proven bounds on the cost: {said}{'; the gap is shaded' if shades else ''}", "round")
+        drawing.frame(axes, "", "round")
+        caption = f"proven bounds on the cost: {said}{'; the gap is shaded' if shades else ''}"
+        drawing.text(axes.left + axes.width / 2, axes.top - ABOVE, caption)
         if closes:
             drawing.line("marks", axes.at(np.array(across), np.full(2, best)), ink.VERMILLION, 1.0)
         if shades:

@@ -18,7 +18,9 @@ from sparserob_rerun.exchange.bounds import Bounds
 INSTANTS, PARAMETERS = 97, 15
 FAMILIES = 3  # that are drawn: of four plots above one another the words cover one another
 LATTICE = 27  # points at most for the coordinates that are not drawn
-LEFT, WIDTH, HEIGHT, GAP = 60.0, 640.0, 112.0, 72.0
+LEFT, WIDTH, HEIGHT = 60.0, 640.0, 112.0
+GAP, NUMBERS = 52.0, 24.0  # between two plots, and as much more where each has the numbers of an axis of its own
+ROOM = 1.15  # of words, in a panel that is smaller than its drawing
 SMALLEST = 1e-12
 SERIES = {
     "rounds/bounds": {"lower bound (proven)": ink.GREEN, "upper bound": ink.VERMILLION},
@@ -27,9 +29,15 @@ SERIES = {
 }
 
 
-def extent(families: int) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of the violation plots."""
-    return -30.0, LEFT + WIDTH + 64.0, -40.0, max(1, min(FAMILIES, families)) * (HEIGHT + GAP) + 8.0
+def extent(families: int, shared: bool) -> tuple[float, float, float, float]:
+    """Left, right, top and bottom of the violation plots; ``shared``: over one axis, that of time."""
+    bottom = max(1, min(FAMILIES, families)) * _below(shared) - (GAP if shared else GAP + NUMBERS)
+    return -30.0, LEFT + WIDTH + 64.0, -40.0, bottom + 52.0
+
+
+def _below(shared: bool) -> float:
+    """How far one plot is below the other."""
+    return HEIGHT + GAP + (0.0 if shared else NUMBERS)
 
 
 def shown_families(program: sr.SemiInfiniteProgram) -> list[sr.ConstraintFamily]:
@@ -88,7 +96,7 @@ class Rounds:
             words = self._words(family, told.get(family.name), (across, along, field))
             if last and len(families) > FAMILIES:
                 words += f" ({len(families) - FAMILIES} more constraints are not shown)"
-            self._plot(drawing, place, family, (across, along, field), (cuts, added), words)
+            self._plot(drawing, (place, last), family, (across, along, field), (cuts, added), words)
             if along.size > 1 and across.size > 1:
                 self._map(maps, family, (across, along, field))
                 maps += 1
@@ -113,7 +121,7 @@ class Rounds:
     def _plot(
         self,
         drawing: Drawing,
-        place: int,
+        where: tuple[int, bool],
         family: sr.ConstraintFamily,
         found: tuple[Floats, Floats, Floats],
         marked: tuple[Sequence[sr.Cut], Sequence[sr.Cut]],
@@ -127,10 +135,11 @@ class Rounds:
             ends = (ends[0] - 1.0, ends[1] + 1.0)
         low = float(np.quantile(worst, 0.02))
         reach = max(abs(low), abs(float(worst.max())), 1e-9)
-        axes = Axes(
-            LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, ends, (-reach, max(0.35 * reach, 1.15 * float(worst.max())))
-        )
-        drawing.frame(axes, words, "t" if problem is not None else "index")
+        shared, (place, last) = problem is not None, where
+        limits = (-reach, max(0.35 * reach, 1.15 * float(worst.max())))
+        axes = Axes(LEFT, place * _below(shared), WIDTH, HEIGHT, ends, limits)
+        unit = "" if problem is None or not problem.names.time else f" [{problem.names.time}]"
+        drawing.frame(axes, words, f"t{unit}" if shared else "index", last or not shared, room=ROOM)
         drawing.hatched("hatch", axes, axes.x, (0.0, axes.y[1]), ink.HATCH)
         if across.size > 1:
             drawing.line("curve", axes.at(across, worst), ink.SKY, 2.0)

@@ -75,7 +75,7 @@ def _columns(rrb: Any, shown: Shown) -> list[Any]:
         rrb.Vertical(
             search.landscape(shown.searches, shown.answers),
             *numbers,
-            row_shares=[10, 8, 4 if shown.searches else 5, 4][: 1 + len(numbers)],
+            row_shares=[10, *([8, 4, 4][: len(numbers)] if shown.searches else [_room(shown), 5])],
         )
         if shown.landscape
         else rrb.Vertical(*numbers)
@@ -88,6 +88,11 @@ def _columns(rrb: Any, shown: Shown) -> list[Any]:
     first = pages(shown.problem)[0]
     plots = view(f"/{first.path}", heading(shown.problem), physics.extent(len(first.plots)))
     return [plots, middle, rrb.Vertical(*words, row_shares=[4, 3, 3] if len(words) == 3 else [1, 1])]
+
+
+def _room(shown: Shown) -> int:
+    """The height of the plots of violation, as much for one as for another."""
+    return 2 + 3 * max(1, min(shown.families, rounds.FAMILIES))
 
 
 def _decisions(rrb: Any) -> Any:
@@ -169,7 +174,7 @@ def _violation(rrb: Any, shown: Shown) -> Any:
     return view(
         "/violation/plots",
         "Violation (up) along the indices (across): orange dots are new cuts",
-        rounds.extent(shown.families),
+        rounds.extent(shown.families, shown.problem is not None),
     )
 
 

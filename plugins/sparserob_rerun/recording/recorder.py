@@ -44,7 +44,7 @@ COARSE = 0.3
 """Seconds of processor time that a run which is over leaves to a first, coarse landscape on any machine. Ten times as
 many, and a busy machine ends seconds later; a tenth, and it shows no landscape of a short run."""
 PATIENT = "landscape.patience is too short for the robust programs of a policy"
-KEPT = "a directory does not keep the rows that prove the bound of a policy, through which it would go"
+KEPT = "the directory does not hold the rows that prove the bound of the policy, through which it would go"
 LINES = 24  # of the log that are on the first screen
 PROOFS = 12  # lines about the proof of one family
 SLOTS = 16  # active constraints at most that make the tuple of a method without one

@@ -36,7 +36,12 @@ class Waiting:
             self._write(LANDSCAPE, "landscape/map", views.EXTENT, f"the landscape of g is drawn when {tuples}")
         if shown.searches:
             self._write(CLIMB, "search/stages", climb.EXTENT, "the climb begins with the first evaluations of g")
-        self._write(VIOLATIONS, "violation/plots", rounds.extent(shown.families), f"drawn when {first}")
+        self._write(
+            VIOLATIONS,
+            "violation/plots",
+            rounds.extent(shown.families, shown.problem is not None),
+            f"drawn when {first}",
+        )
         self._write(BOUNDS, "rounds/picture/bounds", bounds.ONE, f"no bound yet: {first} with the first one")
 
     def arrived(self, panel: str) -> None:

@@ -20,7 +20,7 @@ from zlib import error as ZlibError
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.directory.rounds import FORMULATIONS, cuts_of, with_decisions
+from sparserob_core.experiment.directory.rounds import BOUND, CUTS, FORMULATIONS, cuts_of, with_decisions
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 from sparserob_core.sip.evidence import Cut
@@ -69,15 +69,17 @@ class StoredRun:
     def solution(self) -> dict[str, Array]:
         """``solution.npz``; empty where there is none."""
         file, arrays = self.directory / "solution.npz", self.arrays("solution.npz")
-        columns = {name: arrays[name] for name in IMPOSED if name in arrays}
-        for name, column in columns.items():
-            dimensions = 2 if name == "indices" else 1
+        for prefix in ("", BOUND):
+            columns = {prefix + name: arrays[prefix + name] for name in IMPOSED if prefix + name in arrays}
             counts = {other.shape[:1] for other in columns.values()}
-            if column.ndim != dimensions or column.dtype.kind not in IMPOSED[name] or len(counts) > 1:
-                raise InputError(
-                    f"{file}: {name}: expected one entry for each imposed constraint, as in "
-                    f"{', '.join(columns)}, got {column.dtype} of shape {column.shape}"
-                )
+            for name, column in columns.items():
+                plain = name.removeprefix(prefix)
+                dimensions = 2 if plain == "indices" else 1
+                if column.ndim != dimensions or column.dtype.kind not in IMPOSED[plain] or len(counts) > 1:
+                    raise InputError(
+                        f"{file}: {name}: expected one entry for each imposed constraint, as in "
+                        f"{', '.join(columns)}, got {column.dtype} of shape {column.shape}"
+                    )
         return arrays
 
     @cached_property
@@ -107,6 +109,14 @@ class StoredRun:
     def cuts(self) -> tuple[Cut, ...]:
         """The imposed constraints that ``solution.npz`` holds."""
         return cuts_of(self.solution, self._formulation(self.solution)) if "families" in self.solution else ()
+
+    @cached_property
+    def proving(self) -> tuple[tuple[Cut, ...], Array]:
+        """The constraints that prove the lower bound of a policy, each at the deviation behind its index, and the
+        multipliers of the equalities; none where ``solution.npz`` does not hold them."""
+        columns = {name.removeprefix(BOUND): one for name, one in self.solution.items() if name.startswith(BOUND)}
+        cuts = cuts_of(columns, "literal") if {*CUTS} <= {*columns} else ()
+        return cuts, np.ravel(columns.get("equalities", np.zeros(0)))
 
     def _formulation(self, arrays: Mapping[str, Array]) -> Formulation:
         """What the indices of arrays say whose version did not write it down: it follows from the method."""

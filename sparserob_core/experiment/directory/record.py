@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cache
 from importlib import metadata
@@ -16,9 +16,10 @@ from sparserob_core.control.constraints.control import of_control
 from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.experiment.directory.rounds import BOUND
 from sparserob_core.experiment.directory.sparsity import sparsity, verdict
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.evidence import Cut, Proof
 from sparserob_core.sip.program import EQUALITY, TOLERANCE, SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.result import Result
 
@@ -133,21 +134,18 @@ def arrays_of(
     imposed index in ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``,
     ``families``, ``formulations`` (what its index says) and ``multipliers``; ``worst_disturbance (mw, pieces)`` where
     the worst constraint has one; under feedback the ``answers``: ``gains (K, K, m, p)``, and of outputs the
-    ``observer (K, d, p)``."""
-    cuts = list(result.indices)
-    width = max((np.size(cut.index) for cut in cuts), default=0)
-    indices = np.full((len(cuts), width), np.nan)
-    for position, cut in enumerate(cuts):
-        indices[position, : np.size(cut.index)] = cut.index
+    ``observer (K, d, p)``, and as ``bound_indices``, ``bound_rows``, ... the constraints that prove the lower bound,
+    each at the deviation behind its index, and as ``bound_equalities`` the multipliers of the equalities."""
+    told = _told(result.indices)
+    count, width = told["indices"].shape
     arrays = {
         "decision": np.zeros(0) if result.decision is None else result.decision,
-        "times": indices[:, 0] if dictionary is not None and width else np.full(len(cuts), np.nan),
-        "indices": indices,
-        "rows": np.array([cut.row for cut in cuts], dtype=int),
-        "families": np.array([cut.family for cut in cuts], dtype=str),
-        "formulations": np.array([cut.formulation for cut in cuts], dtype=str),
-        "multipliers": np.array([cut.multiplier for cut in cuts], dtype=float),
+        "times": told["indices"][:, 0] if dictionary is not None and width else np.full(count, np.nan),
+        **told,
     }
+    if answers:
+        proving = {**_told(result.dual.cuts), "equalities": result.dual.mu}
+        arrays |= {f"{BOUND}{name}": column for name, column in proving.items()}
     if dictionary is not None:
         arrays["breakpoints"] = dictionary.breakpoints
     if isinstance(result.worst, Witness) and result.worst.disturbance is not None:
@@ -159,6 +157,20 @@ def arrays_of(
             "theta": _nominal(result.decision, program, dictionary),
         }
     return arrays
+
+
+def _told(cuts: Sequence[Cut]) -> dict[str, Array]:
+    """Constraints as arrays, one row each."""
+    indices = np.full((len(cuts), max((np.size(cut.index) for cut in cuts), default=0)), np.nan)
+    for position, cut in enumerate(cuts):
+        indices[position, : np.size(cut.index)] = cut.index
+    return {
+        "indices": indices,
+        "rows": np.array([cut.row for cut in cuts], dtype=int),
+        "families": np.array([cut.family for cut in cuts], dtype=str),
+        "formulations": np.array([cut.formulation for cut in cuts], dtype=str),
+        "multipliers": np.array([cut.multiplier for cut in cuts], dtype=float),
+    }
 
 
 def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:

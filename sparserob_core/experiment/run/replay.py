@@ -18,7 +18,7 @@ from sparserob_core.experiment.run.viewer import recorded, recorder
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import DECIDING, Batch, EvaluationsFinished
-from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.evidence import Dual, Proof
 from sparserob_core.sip.program import WorstConstraint
 from sparserob_core.sip.result import Result, SearchTrace
 from sparserob_core.sip.scenario_bound import ScenarioBound
@@ -117,6 +117,7 @@ def stored_result(run: StoredRun) -> Result:
             if summary.get("scenario_bound") is None
             else ScenarioBound(**summary["scenario_bound"]),
             indices=run.cuts,
+            dual=Dual(-np.inf, *run.proving),
             history=run.history,
             trace=run.evaluations,
             seconds=_number(summary, "seconds", 0.0),
