@@ -54,6 +54,7 @@ class MinimumAttention(sr.LinearKeys):
             disturbance_class=self.disturbance_class,
             disturbances=listed,
             path=[*path, *self._bounds(d, m)],
+            integral=[_integral(f"integral.{i}", entry.build(), d, m) for i, entry in enumerate(self.integral)],
             terminal=[*ends, sr.Equality(np.append(np.full(d, np.nan), np.zeros(m)))],
             names=_names(self.names.build().fitting(d, m, width), d, m),
         )
@@ -160,6 +161,22 @@ def _extended_window(item: sr.PathConstraint | sr.MixedConstraint, m: int) -> sr
         rows = np.asarray(moved, dtype=float)
         moved = np.hstack([rows, np.zeros((len(rows), m))])
     return sr.PathConstraint(sr.cylinder(item.set, item.set.dimension + m), item.start, item.stop, item.name, moved)
+
+
+def _integral(where: str, item: sr.IntegralConstraint, d: int, m: int) -> sr.IntegralConstraint:
+    """An integral of ``x`` and ``u`` as one of the augmented state ``(x, u)``."""
+    given = {"H": (item.H, d, "state"), "G": (item.G, m, "control")}
+    rows = {key: np.atleast_2d(np.asarray(value, dtype=float)) for key, (value, _, _) in given.items() if value}
+    for key, matrix in rows.items():
+        _, width, of = given[key]
+        if matrix.shape[1] != width:
+            expected = f"rows of {width} numbers, one per {of}"
+            raise sr.InputError(path=f"{where}.{key}", expected=expected, got=f"{matrix.shape[1]} in each")
+    if len({len(matrix) for matrix in rows.values()}) > 1:
+        raise sr.InputError(f"{where}: expected as many rows in G as in H")
+    count = max((len(matrix) for matrix in rows.values()), default=0)
+    both = [rows.get(key, np.zeros((count, width))) for key, (_, width, _) in given.items()]
+    return replace(item, H=np.hstack(both) if count else None, G=None)
 
 
 def _extended(end: sr.ConvexSet | sr.Equality, m: int) -> sr.ConvexSet | sr.Equality:

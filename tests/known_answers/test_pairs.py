@@ -101,6 +101,9 @@ FEATURES: dict[str, Callable[[Config], object]] = {
     "sparsest": lambda config: config.update(method={"name": "sparsest", "nodes": 300}),
     "affine": lambda config: config.update(policy={"name": "affine"}),
     "list of disturbances": in_a_list,
+    "integral": in_problem(
+        integral=[{"H": [[1, 0]], "G": [[0, 0.1]], "from": 0, "to": 2.5, "lower": [-0.05], "upper": [0.3]}]
+    ),
 }
 SIGNS = {
     ("proven", "verified"): "●",

@@ -18,12 +18,13 @@ from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.integrals import integrating
 from sparserob_core.checker.reach.varying import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, Return
+from sparserob_core.control.problem.problem import Accumulated, MixedConstraint, OptimalControlProblem, Return
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.sip.convex_set import Array
@@ -39,7 +40,8 @@ INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: t
 @final
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What is checked: a certificate (plain data) against a problem on its two dictionaries. ``counts``: its cost is
+    """What is checked: a certificate (plain data) against a problem on its two dictionaries; what it integrates is
+    made states of it here, once, for every claim. ``counts``: its cost is
     the time that the control acts, which may take the values ``letters`` only where there are any; ``policy``: the
     control answers what it measures."""
 
@@ -51,6 +53,9 @@ class Case:
     counts: bool = False
     letters: tuple[float, ...] | None = None
     policy: Policy | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "problem", integrating(self.problem))
 
     @cached_property
     def of_control(self) -> str:
@@ -76,11 +81,11 @@ class Case:
     def windows(self) -> list[Window]:
         """The state constraints, under the names that the certificate uses."""
         path = [entry for entry in self.problem.path if not isinstance(entry, ConvexSet | Return)]
-        d = self.problem.system.states
+        d, own = self.problem.system.states, sum(not isinstance(entry, Accumulated) for entry in path)
         ends = [end for end in self.problem.terminal if not isinstance(end, Equality)]
         found = [
             Window(
-                entry.name or (f"path[{i}]" if len(path) > 1 else "path"),
+                entry.name or (f"path[{i}]" if own > 1 else "path"),
                 entry.set,
                 entry.start,
                 self.problem.horizon if entry.stop is None else entry.stop,

@@ -109,6 +109,8 @@ class Controller:
         self._before: Array | None = None
         self._last: Array | None = None
         self._reach: tuple[Array, Array] | None = None
+        # of the integrals, which nobody measures, what the applied controls have added up to
+        self._added_up = np.zeros(self._planned.model.problem.system.states - self._states)
 
     def step(self, time: float, state: npt.ArrayLike | None) -> Array:
         """The control ``(m,)`` for the piece that begins at ``time``, a breakpoint, from the ``state (d,)`` measured
@@ -135,6 +137,7 @@ class Controller:
         u = self._control(piece - self._plan.first, measured)
         told = None if self._observer is not None else measured
         self._reach = None if told is None else self._plan.reach(piece - self._plan.first, told, u)
+        self._added_up = self._added_up + self._plan.added(piece - self._plan.first, u)[self._states :]
         self._next, self._covered, self._before, self._last = piece + 1, covered, u, measured
         at = self._begins_at(period, piece)
         taken = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
@@ -182,13 +185,19 @@ class Controller:
         return period, piece
 
     @property
+    def _states(self) -> int:
+        """How many states are measured where all of them are: those of the problem as it was stated."""
+        return self._planned.model.stated.system.states
+
+    @property
     def _observer(self) -> Observer | None:
         """What makes innovations of outputs; ``None`` where the state is measured."""
         feedback = self._plan.known.feedback
         return None if feedback is None else feedback.loop.observer
 
     def _measured(self, state: object) -> Array:
-        observer, count, one = self._observer, self._planned.model.problem.system.states, "state"
+        """The outputs, or the state with the integrals after it."""
+        observer, count, one = self._observer, self._states, "state"
         if observer is not None:
             count, one = observer.C.shape[0], "output"
         try:
@@ -198,7 +207,7 @@ class Controller:
         if measured.shape != (count,) or not np.isfinite(measured).all():
             expected = f"{count} finite numbers, one per {one}, or None where the measurement is missing"
             raise InputError(path="state", expected=expected, got=f"{state!r}")
-        return measured
+        return measured if observer is not None else np.append(measured, self._added_up)
 
     def _within(self, state: Array) -> bool:
         """Whether a state is among those that the last one may lead to, or may begin with; coordinate by coordinate. Of
@@ -215,9 +224,10 @@ class Controller:
             return float(problem.initial_set.violation(deviation)) <= room
         if self._reach is None or self._last is None:
             return True
-        lower, upper = self._reach
+        lower, upper = (bound[: self._states] for bound in self._reach)
         room = SEEN * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
-        return bool((state >= lower - room).all() and (state <= upper + room).all()) and self._caused(state, room)
+        seen = state[: self._states]
+        return bool((seen >= lower - room).all() and (seen <= upper + room).all()) and self._caused(state, room)
 
     def _expected(self, outputs: Array) -> bool:
         feedback = self._plan.known.feedback
@@ -235,6 +245,7 @@ class Controller:
         if told is None or bound is None:
             return True
         block, value, rest, growth = told
+        rest = rest[: self._states]
         near = growth * room + SEEN * float(np.abs(value).max())
         known = self._acting is None or self._acting[0] != block
         same = known or bool((np.abs(value - self._acting[1]) <= 2.0 * near).all())  # type: ignore[index]

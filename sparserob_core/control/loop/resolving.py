@@ -75,6 +75,16 @@ class Plan:
                 upper, lower = upper + problem.disturbance.support(push), lower - problem.disturbance.support(-push)
         return lower, upper
 
+    def added(self, piece: int, control: Array) -> Array:
+        """What a ``control (m,)`` on a piece drives every state by, ``(d,)``, if nothing else did: of an integral of
+        controls alone, what it adds to it."""
+        response, found = self.known.response, np.zeros(self.known.problem.system.states)
+        for number in np.flatnonzero(response.grid.control_piece == piece).tolist():
+            mode = response.system.modes[0 if response.grid.mode is None else int(response.grid.mode[number])]
+            B = mode.matrices(mode.probes[:1])[1][0]
+            found = found + response.grid.lengths[number] * (B[:, : control.size] @ control)
+        return found
+
     def caused(self, piece: int, state: Array, control: Array, after: Array) -> tuple[int, Array, Array, float] | None:
         """What the disturbance was on a piece that led from ``state (d,)`` to ``after (d,)`` under a ``control (m,)``:
         the number of its own piece, its value ``(mw,)``, what of the state that leaves unexplained ``(d,)``, and by how
@@ -85,12 +95,13 @@ class Plan:
             return None
         steps, length = response.steps(KNOWN), int(response.which[numbers[0]])
         Phi, Gamma = steps.Phi[0, length], steps.Gamma[0, length]
-        pushed = Gamma @ steps.E[0]
+        seen = self.known.stated.system.states
+        pushed = (Gamma @ steps.E[0])[:seen]
         sizes = np.linalg.svd(pushed, compute_uv=False)
         if pushed.shape[0] < pushed.shape[1] or not sizes[-1] > DEPENDENT * sizes[0]:
             return None
         driven = steps.B[0] @ np.append(control, np.ones(response.grid.constants))
-        moved = after - Phi @ state - Gamma @ driven
+        moved = (after - Phi @ state - Gamma @ driven)[:seen]
         value = np.linalg.lstsq(pushed, moved, rcond=None)[0]
         block = int(np.searchsorted(signal.starts, numbers[0], side="right")) - 1
         return block, value, moved - pushed @ value, 1.0 / float(sizes[-1])

@@ -9,7 +9,7 @@ enters a system that takes turns, whose ``E`` is 0 outside of the window.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Literal, TypeAlias, final, get_args
@@ -80,7 +80,7 @@ def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tupl
         for i, one in enumerate(every)
     ]
     pieces: list[tuple[float, LinearSystem]] = []
-    for begin, until, mode in _legs(system, windows, horizon):
+    for begin, until, mode in legs(system, {time for window in windows for time in window}, horizon):
         columns = []
         for i, (one, (start, stop)) in enumerate(zip(every, windows, strict=True)):
             E = _columns(one.entering(f"disturbance.{i}", mode))
@@ -107,12 +107,10 @@ def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]
     return start, stop
 
 
-def _legs(
-    system: System, windows: Sequence[tuple[float, float]], horizon: float
-) -> Iterator[tuple[float, float, LinearSystem]]:
-    """Between which times which of the systems acts, cut where a disturbance begins or ends to act."""
+def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[tuple[float, float, LinearSystem]]:
+    """Between which times which of the systems acts, cut at more times than its own, but not at rounding."""
     ends = [*system.switches, horizon]
-    for time in sorted({time for window in windows for time in window}):
+    for time in sorted(cuts):
         if min(abs(time - end) for end in (0.0, *ends)) > SHORTEST * horizon:
             ends.append(time)
     begin = 0.0

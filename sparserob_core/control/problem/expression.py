@@ -262,26 +262,39 @@ Entries: TypeAlias = "Array | Callable[..., object] | ExpressionMatrix"
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
-    """Functions of the parameters, or arrays, that make one matrix side by side."""
+class Joined:
+    """Functions of the parameters, or arrays, that make one matrix: one above another along the ``axis`` 0, side by
+    side along 1."""
 
     parts: tuple[Entries, ...]
+    axis: int
 
     def __call__(self, p: Iterable[Value]) -> Value:
         """The matrix at one parameter vector."""
-        return np.hstack([np.asarray(part(p) if callable(part) else part) for part in self.parts])
+        return np.concatenate([np.asarray(part(p) if callable(part) else part) for part in self.parts], self.axis)
 
 
 def beside(left: Entries, right: Entries) -> Entries:
     """Two matrices with as many rows side by side, each an array, expressions or a function of the parameters."""
-    if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
-        return np.hstack([left, right])
-    of = next((part for part in (left, right) if isinstance(part, ExpressionMatrix)), None)
+    return _joined(left, right, 1)
+
+
+def above(upper: Entries, lower: Entries) -> Entries:
+    """Two matrices with as many columns one above the other, each an array, expressions or a function of the
+    parameters."""
+    return _joined(upper, lower, 0)
+
+
+def _joined(one: Entries, other: Entries, axis: int) -> Entries:
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return np.concatenate([one, other], axis)
+    of = next((part for part in (one, other) if isinstance(part, ExpressionMatrix)), None)
     names, defined = ((), ()) if of is None else (of.names, of.defined)
-    rows = [_written(part) for part in (left, right)]
-    if rows[0] is None or rows[1] is None:
-        return Beside((left, right))
-    return ExpressionMatrix(tuple(a + b for a, b in zip(rows[0], rows[1], strict=True)), names, defined)
+    first, second = _written(one), _written(other)
+    if first is None or second is None:
+        return Joined((one, other), axis)
+    rows = first + second if axis == 0 else tuple(a + b for a, b in zip(first, second, strict=True))
+    return ExpressionMatrix(rows, names, defined)
 
 
 def _written(part: Entries) -> tuple[tuple[Expression, ...], ...] | None:

@@ -77,6 +77,34 @@ class MixedConstraint:
         return Polytope(np.hstack([np.asarray(self.H), np.asarray(self.G)]), np.asarray(self.h))
 
 
+@dataclass(frozen=True, eq=False)
+class IntegralConstraint:
+    """``lower <= int_start^stop (H x(t) + G u(t)) dt <= upper``, row by row: fuel of a channel, energy of a battery, a
+    mean temperature. ``H (r, d)``, ``G (r, m)``, either of them absent: 0; ``lower``, ``upper (r,)``, a number for all
+    rows alike, infinite or ``None`` where there is no bound; ``stop`` is the horizon when ``None``.
+
+    ``u(t)`` is the commanded control, delay or not. The running integral from ``start`` on is one more state for each
+    row, which nothing measures.
+    """
+
+    H: npt.ArrayLike | None = None
+    G: npt.ArrayLike | None = None
+    lower: npt.ArrayLike | Sequence[float | None] | None = None
+    upper: npt.ArrayLike | Sequence[float | None] | None = None
+    start: float = 0.0
+    stop: float | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        sealed(self)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Accumulated(PathConstraint):
+    """An `IntegralConstraint` where its integral is a state: a window of one time."""
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Return(PathConstraint):
@@ -115,6 +143,8 @@ class OptimalControlProblem:
     ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
     anywhere in ``initial_state + initial_set``, and every constraint holds from there.
 
+    ``integral``: bounds of integrals of state and control over windows, `IntegralConstraint`.
+
     ``measurements``: what a policy that answers measurements sees; the whole state, without noise and at once, unless
     given. Of a control that answers nothing it changes nothing.
 
@@ -127,10 +157,10 @@ class OptimalControlProblem:
     ``weights``: a positive number, one for each control, or rows of a time and the weights from then on, which are not
     negative: prices, or a supply that is free for a while. The first time is 0.
 
-    After construction ``weights`` is ``(m,)``, or ``(r, 1 + m)`` of rows, ``path`` and ``terminal`` are tuples, every
-    window has its ``stop``, constraints that restrict nothing are gone, and of a problem that repeats the `Return` is
-    the last of the path, and what is fixed then the last of the terminal equalities. An initial state outside a path
-    set is legal: that problem is infeasible. Raises `InputError`.
+    After construction ``weights`` is ``(m,)``, or ``(r, 1 + m)`` of rows, ``path``, ``terminal`` and ``integral`` are
+    tuples, every window has its ``stop``, constraints that restrict nothing are gone, and of a problem that repeats the
+    `Return` is the last of the path, and what is fixed then the last of the terminal equalities. An initial state
+    outside a path set is legal: that problem is infeasible. Raises `InputError`.
     """
 
     system: System
@@ -143,6 +173,7 @@ class OptimalControlProblem:
     disturbance_class: DisturbanceClass = "piecewise_constant"
     path: Sequence[PathConstraint | MixedConstraint | ConvexSet] = ()
     terminal: Sequence[ConvexSet | Equality] = ()
+    integral: Sequence[IntegralConstraint] = ()
     title: str = ""
     initial_control: npt.ArrayLike | None = None
     control_step: ConvexSet | None = None
@@ -190,6 +221,8 @@ class OptimalControlProblem:
         windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
         self._set("path", tuple(window for window in windows if not _restricts_nothing(window.set)))
         self._set("terminal", tuple(self._terminal()))
+        integrals = enumerate(_listed("integral", self.integral, "IntegralConstraint"))
+        self._set("integral", tuple(self._integrated(f"integral.{i}", entry) for i, entry in integrals))
         if isinstance(self.system, VaryingSystem):
             self._check_varying(self.system)
         if self.repeat is not Repeating.IMPOSED:
@@ -229,6 +262,7 @@ class OptimalControlProblem:
             "initial_state": self.initial_set,
             "measurements": self.measurements,
             "path": self.path,
+            "integral": self.integral,
             "terminal": [end for end in self.terminal if not isinstance(end, Equality)],
             "cost." + (quadratic or ["state"])[0]: quadratic,
         }
@@ -370,6 +404,51 @@ class OptimalControlProblem:
             raise InputError(path=where, expected=expected, got=f"{moved[0, 0]:g} to {moved[-1, 0]:g}")
         return replace(item, start=start, stop=stop, relative_to=moved)
 
+    def _integrated(self, where: str, entry: object) -> IntegralConstraint:
+        """With arrays of the right shapes, and a window in which something can be accumulated."""
+        if not isinstance(entry, IntegralConstraint):
+            raise InputError(path=where, expected="an IntegralConstraint", got=type(entry).__name__)
+        d, m, delay = self.system.states, self.system.controls, self.system.delay
+        given = [
+            (name, _matrix(f"{where}.{name}", rows, f"rows of {columns} finite numbers, one per {of}", columns))
+            for name, rows, columns, of in (("H", entry.H, d, "state"), ("G", entry.G, m, "control"))
+            if rows is not None
+        ]
+        if not given or len({len(rows) for _, rows in given}) > 1:
+            got = " and ".join(f"{len(rows)} in {name}" for name, rows in given) or "neither"
+            raise InputError(path=where, expected="H, or G, or both with as many rows", got=got)
+        count, matrices = len(given[0][1]), dict(given)
+        H, G = (matrices.get(name, np.zeros((count, columns))) for name, columns in (("H", d), ("G", m)))
+        if (empty := np.flatnonzero(~np.hstack([H, G]).any(axis=1))).size:
+            raise InputError(path=where, expected="rows that integrate something", got=f"zeros in row {empty[0] + 1}")
+        lower, upper = _limits(where, entry, count)
+        start, stop = float(entry.start), self.horizon if entry.stop is None else float(entry.stop)
+        if not (0.0 <= start < stop - SHORTEST * self.horizon and stop <= self.horizon):
+            raise InputError(
+                path=where,
+                expected=f"0 <= from < to <= {self.horizon:g} (the horizon), apart by more than rounding",
+                got=f"from {start:g} to {stop:g}",
+            )
+        if delay > 0.0 and G.any() and stop + delay > self.horizon * (1.0 + SHORTEST):
+            raise InputError(
+                path=f"{where}.to",
+                expected=f"at most {self.horizon - delay:g}, the horizon less the delay, where G is not 0: a control"
+                " that is commanded later never acts",
+                got=f"{stop:g}",
+            )
+        if (
+            self.disturbance is not None
+            and self.disturbance_class == "measurable"
+            and (start > 0.0 or (delay > 0.0 and G.any()))
+        ):
+            raise InputError(
+                path=f"{where}.from",
+                expected="0, and a control that acts at once, where disturbances are measurable: a window that begins"
+                " later makes pieces of the system, of which measurable ones are not proven",
+                got=f"from {start:g} with a delay of {delay:g}",
+            )
+        return replace(entry, H=H, G=G, lower=lower, upper=upper, start=start, stop=stop)
+
     def _return(self) -> None:
         """Have every final state among the initial ones, where the plan repeats."""
         if not isinstance(self.repeat, bool | np.bool_):
@@ -387,6 +466,12 @@ class OptimalControlProblem:
                 path="repeat",
                 expected="a control that acts at once: with system.delay the last controls of a period act in the next",
                 got=f"a delay of {self.system.delay:g}",
+            )
+        if self.integral:
+            raise InputError(
+                path="integral",
+                expected="none where the plan repeats, of which integrals over a period are not proven yet",
+                got=f"{len(self.integral)}",
             )
         if any(entry.name == RETURN for entry in self.path if isinstance(entry, PathConstraint | MixedConstraint)):
             raise InputError(path="repeat", expected=f"no path constraint named {RETURN}, which is that of repeat")
@@ -462,11 +547,11 @@ def _unproven(key: str) -> InputError:
     )
 
 
-def _listed(name: str, value: object) -> list[object]:
-    if isinstance(value, ConvexSet | PathConstraint | MixedConstraint | Equality):
+def _listed(name: str, value: object, of: str = "sets") -> list[object]:
+    if isinstance(value, ConvexSet | PathConstraint | MixedConstraint | IntegralConstraint | Equality):
         return [value]
     if not isinstance(value, Sequence):
-        raise InputError(path=name, expected="a list of sets", got=f"{type(value).__name__}")
+        raise InputError(path=name, expected=f"a list of {of}", got=f"{type(value).__name__}")
     return list(value)
 
 
@@ -508,6 +593,21 @@ def _checked_mixed(where: str, entry: MixedConstraint, system: System) -> MixedC
     except InputError as error:
         raise InputError(error.sentence, path=where) from None
     return found
+
+
+def _limits(where: str, entry: IntegralConstraint, count: int) -> tuple[Array, Array]:
+    """The bounds ``(r,)`` of an integral, infinite where there is none."""
+    sides = []
+    for name, given, none in (("lower", entry.lower, -np.inf), ("upper", entry.upper, np.inf)):
+        filled = [none if v is None else v for v in given] if isinstance(given, list | tuple) else given
+        sides.append(as_bound(f"{where}.{name}", none if filled is None else filled, count))
+    lower, upper = sides
+    if not (lower <= upper).all() or np.isposinf(lower).any() or np.isneginf(upper).any():
+        got = f"{lower.tolist()} and {upper.tolist()}"
+        raise InputError(path=where, expected="lower bounds that are no larger than the upper ones", got=got)
+    if (np.isinf(lower) & np.isinf(upper)).any():
+        raise InputError(path=where, expected="a lower or an upper bound of every row", got="a row without one")
+    return lower, upper
 
 
 def _matrix(where: str, rows: object, expected: str, columns: int) -> Array:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import (
     ExpressionMatrix,
+    above,
     beside,
     parse_column,
     parse_definitions,
@@ -110,6 +111,18 @@ class LinearSystem:
     def with_parameters(self, parameters: ConvexSet) -> LinearSystem:
         """The same system with its parameters in another set."""
         return replace(self, parameters=parameters)
+
+    @shaped
+    def accumulating(self, rows: Float[Array, "k d"], inputs: Float[Array, "k m"]) -> LinearSystem:
+        """The same system with ``k`` more states after its own, ``z' = rows x + inputs u(t - delay)``: integrals of
+        what its state and its control do."""
+        k, d = rows.shape
+        below = {"B": inputs, "E": np.zeros((k, self.disturbances)), "c": np.zeros((k, 1))}
+        known = {
+            name: above(self._entry(name), part) for name, part in below.items() if name != "c" or self.c is not None
+        }
+        A = above(beside(self._entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
+        return LinearSystem(A, known["B"], known["E"], self.parameters, self.names, known.get("c"), self.delay)
 
     @property
     def modes(self) -> tuple[LinearSystem, ...]:

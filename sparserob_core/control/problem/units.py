@@ -9,7 +9,12 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.prices import in_units
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import (
+    IntegralConstraint,
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+)
 from sparserob_core.control.problem.system import System
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -55,6 +60,7 @@ class Units:
             disturbance_class=problem.disturbance_class,
             path=[self._window(entry) for entry in problem.path if not isinstance(entry, ConvexSet)],
             terminal=[end.in_units(self.states) for end in problem.terminal],
+            integral=[self._integral(entry) for entry in problem.integral],
             title=problem.title,
             cost=problem.cost.in_units(self.states, self.controls, self.time, self.cost),
             initial_control=(
@@ -76,6 +82,13 @@ class Units:
         moved = entry.relative_to
         moved = None if moved is None else np.asarray(moved) / np.concatenate([[self.time], self.states])
         return replace(entry, set=entry.set.in_units(self.states), start=start, stop=stop, relative_to=moved)
+
+    def _integral(self, entry: IntegralConstraint) -> IntegralConstraint:
+        """What is integrated over these times, in the user's own unit."""
+        assert entry.H is not None and entry.G is not None  # those of a problem
+        H, G = (np.asarray(rows) * of * self.time for rows, of in ((entry.H, self.states), (entry.G, self.controls)))
+        stop = None if entry.stop is None else entry.stop / self.time
+        return replace(entry, H=H, G=G, start=entry.start / self.time, stop=stop)
 
     def of_system(self, system: System) -> System:
         """``x' = A x + B u + E w + c`` with all of it in these units."""

@@ -63,7 +63,8 @@ class Transcription:
     ``constraints`` are the path and terminal constraints, named and ordered as the families of the ``program``;
     terminal equalities are not among them, they are rows of the program. ``functionals`` are what every family is built
     from, ``formulation`` says what the indices of the families are. ``rows``: what rows were divided by, where the
-    problem is in its own units. ``feedback``: how the control answers what it measures; the decision then begins with
+    problem is in its own units. ``given``: the problem as it was stated, with its integrals, which are states of
+    ``problem``. ``feedback``: how the control answers what it measures; the decision then begins with
     the nominal control.
     """
 
@@ -77,6 +78,7 @@ class Transcription:
     formulation: Formulation = "reduced"
     rows: RowUnits | None = None
     feedback: Feedback | None = None
+    given: OptimalControlProblem | None = None
     _explained: dict[tuple[str, Formulation, int, bytes], TimedExplanation | None] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -96,6 +98,11 @@ class Transcription:
             told = None if family is None else family.explanation(cut.index, cut.row)
             self._explained[key] = told if isinstance(told, TimedExplanation) else None
         return [self._explained[key] for key in keys]
+
+    @property
+    def stated(self) -> OptimalControlProblem:
+        """The problem as it was stated; its states come first among those of ``problem``."""
+        return self.given or self.problem
 
     @property
     def response(self) -> Response:

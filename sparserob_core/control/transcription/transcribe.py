@@ -15,7 +15,13 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint, Return
+from sparserob_core.control.problem.problem import (
+    Accumulated,
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+    Return,
+)
 from sparserob_core.control.problem.representable import require_representable
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units, power_of_two
@@ -25,6 +31,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.transcription.accumulated import accumulated
 from sparserob_core.control.transcription.own_units import (
     RESOLVED,
     extent,
@@ -94,6 +101,7 @@ def prepare(
                 f"which is rounding for a horizon of {problem.horizon:g}"
             )
     require_representable(problem)
+    stated, problem = problem, accumulated(problem)
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
     if policy is not None and mask.any() and isinstance(problem.system, VaryingSystem):
@@ -107,9 +115,9 @@ def prepare(
             raise InputError(
                 f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"
             )
-        return _answering(problem, control, disturbance, policy, mask)[0]
+        return replace(_answering(problem, control, disturbance, policy, mask)[0], given=stated)
     model = _assembled(problem, control, disturbance, formulation)
-    return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)))
+    return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)), given=stated)
 
 
 def _answering(
@@ -457,7 +465,7 @@ def _state_constraints(
 def path_names(problem: OptimalControlProblem) -> list[str]:
     """What the families of the path constraints are called: by their own name, or by their place."""
     path = [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
-    own = sum(not isinstance(entry, Return) for entry in path)
+    own = sum(not isinstance(entry, Return | Accumulated) for entry in path)
     return [entry.name or _name("path", i, own) for i, entry in enumerate(path)]
 
 

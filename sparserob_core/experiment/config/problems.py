@@ -44,7 +44,13 @@ from sparserob_core.experiment.config.option_kinds import (
     broadcast,
     one_of,
 )
-from sparserob_core.experiment.config.set_options import InitialStateOptions, PathOptions, SetOptions, TerminalOptions
+from sparserob_core.experiment.config.set_options import (
+    InitialStateOptions,
+    IntegralOptions,
+    PathOptions,
+    SetOptions,
+    TerminalOptions,
+)
 from sparserob_core.options import Options
 
 
@@ -480,6 +486,10 @@ class ProblemKeys(ProblemFactory, Options):
     terminal: list[TerminalOptions] = Field(default_factory=list)
     """Sets that the state ends in, and values that it ends at."""
 
+    integral: list[IntegralOptions] = Field(default_factory=list)
+    """Bounds of integrals of state and control over windows: fuel of a channel, energy of a battery, a mean; as
+    ``[{G: [[1]], to: 5, upper: [2]}]``."""
+
     names: NamesOptions = NamesOptions()
     """Names and units for messages, tables, figures and recordings."""
 
@@ -579,6 +589,7 @@ class ControlKeys(ProblemKeys):
             disturbances=self.disturbances(system),
             path=self.windows(system.states),
             terminal=self.ends(system.states),
+            integral=[entry.build() for entry in self.integral],
             cost=self.cost.build(system.states),
             initial_control=self._control_before(system.controls),
             control_step=(

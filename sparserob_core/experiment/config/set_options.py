@@ -21,10 +21,17 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from sparserob_core.control.problem.problem import MixedConstraint, PathConstraint
+from sparserob_core.control.problem.problem import IntegralConstraint, MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, NormBall, Polytope, SetFactory, intersection
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.config.option_kinds import FreeNumbers, OneOrMore, Sparse, broadcast, count
+from sparserob_core.experiment.config.option_kinds import (
+    FreeNumbers,
+    OneOrMore,
+    OneOrMoreFree,
+    Sparse,
+    broadcast,
+    count,
+)
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.hookspecs import SetPlugin
 from sparserob_core.experiment.plugins.messages import COMPLAINT, Complaint, nearest, shown
@@ -193,6 +200,36 @@ class PathOptions(SetOptions, populate_by_name=True):
                 path=f"{where}.relative_to",
             )
         return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, stop, self.name)]
+
+
+@final
+class IntegralOptions(Options, populate_by_name=True):
+    """``lower <= int (H x(t) + G u(t)) dt <= upper`` over a window of time, row by row."""
+
+    H: list[list[float]] | None = Field(default=None, min_length=1)
+    """One column per state; 0 unless given."""
+
+    G: list[list[float]] | None = Field(default=None, min_length=1)
+    """One column per control; 0 unless given. As many rows as ``H``."""
+
+    start: float = Field(default=0.0, alias="from", ge=0.0)
+    """Beginning of the window."""
+
+    stop: float | None = Field(default=None, alias="to", ge=0.0)
+    """End of the window; the horizon unless given."""
+
+    upper: OneOrMoreFree | None = None
+    """One number per row, null where there is no bound; a number serves every row."""
+
+    lower: OneOrMoreFree | None = None
+    """As ``upper``."""
+
+    name: Annotated[str, Field(min_length=1)] | None = None
+    """What messages, tables and figures call it; integral, or integral[0] and so on, unless given."""
+
+    def build(self) -> IntegralConstraint:
+        """The constraint."""
+        return IntegralConstraint(self.H, self.G, self.lower, self.upper, self.start, self.stop, self.name)
 
 
 @final

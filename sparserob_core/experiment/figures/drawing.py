@@ -273,7 +273,7 @@ def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:
         stop = end if entry.stop is None else entry.stop
         moved = Reference.of(entry.relative_to)
         if moved is None:
-            yield from _sides(entry.set, entry.start, stop)
+            yield from (replace(wall, final=stop >= end) for wall in _sides(entry.set, entry.start, stop))
             continue
         times = np.concatenate([[entry.start], moved.kinks(entry.start, stop), [stop]])
         points = moved.at(times)

@@ -20,7 +20,8 @@ MOST_STATES = 12  # drawn in one figure
 @dataclass(frozen=True, kw_only=True)
 class Wall:
     """One state component must stay in ``[lower, upper]`` for ``start <= t <= end``; ``start == end`` is a terminal
-    constraint. Where the set moves, the bounds go in straight lines to ``lower_end`` and ``upper_end``."""
+    constraint, or one at a time before where it is not ``final``. Where the set moves, the bounds go in straight lines
+    to ``lower_end`` and ``upper_end``."""
 
     state: int
     lower: float = -np.inf
@@ -29,6 +30,7 @@ class Wall:
     end: float
     lower_end: float | None = None
     upper_end: float | None = None
+    final: bool = True
 
     @property
     def sides(self) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -374,7 +374,7 @@ def _terminal(ax: Axes, wall: Wall) -> None:
         solid_capstyle="butt",
         clip_on=False,
         zorder=4,
-        label="terminal set",
+        label="terminal set" if wall.final else "bound at one time",
     )
     for edge in (wall.lower, wall.upper):
         if np.isfinite(edge):

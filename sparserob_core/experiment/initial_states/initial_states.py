@@ -78,8 +78,9 @@ def initial_states(
         expected = "a system that stays the same with time: of another one no set of initial states is proven yet"
         raise InputError(path="problem.system", expected=expected, got="one in t")
     if about is not None:
-        model = from_state(model, _about(about, model.problem))
-    pair = check_states(states, model.problem.system.states)
+        begun = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
+        model = from_state(model, np.append(_about(about, model.stated), begun))
+    pair = check_states(states, model.stated.system.states)
     own, units = in_own_units(model)  # what is looked at and what is told are in other units (docs/decisions/0016)
     x = units.states[list(pair)]
     size = np.full(2, _far(own.problem)) if limit is None else limit / x

@@ -193,7 +193,7 @@ class _Closing:
         """What is measured of a state ``(d,)``."""
         observer = None if self.model.feedback is None else self.model.feedback.loop.observer
         if observer is None:
-            return state
+            return state[: self.model.stated.system.states]
         noise = None if self.noise is None else self.noise[self._asked, :, None]
         return observer.outputs(state[:, None], noise)[:, 0]
 

@@ -215,6 +215,12 @@ def horizon_search(
             "of: horizon is the period of a plan that repeats, of which none excludes another; expected another thing"
             " to vary"
         )
+    if problem.integral:
+        raise InputError(
+            path="integral",
+            expected="none where the horizon is varied, since windows of integrals stay where they are",
+            got=f"{len(problem.integral)}",
+        )
     try:
         return HorizonSearch(title, problem, *dictionaries, method, tools, width, notify)
     except InputError as error:

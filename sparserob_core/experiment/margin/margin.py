@@ -122,6 +122,7 @@ def _between(lower: float, upper: float) -> str:
 
 
 def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> MarginSearch | HorizonSearch:
+    from sparserob_core.control.transcription.accumulated import accumulated
     from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
     tools = tools_of(loaded)
@@ -130,7 +131,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
         raise InputError(
             "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
         )
-    problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
+    problem, control, disturbance = experiment.transcription.stated, experiment.control, experiment.disturbance
     feedback = experiment.transcription.feedback
     policy = None if feedback is None else feedback.policy
     if of == HORIZON:
@@ -143,7 +144,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
     joined: ParametricProgram | None = None
     if chosen.affine and policy is None:  # programs at several factors become one: in the units of the factor 1
         own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
-        joined = ParametricProgram(lambda factor: like(own, units.of_problem(chosen.at(factor))))
+        joined = ParametricProgram(lambda factor: like(own, units.of_problem(accumulated(chosen.at(factor)))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)
     search = MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools, width, notify)
     if policy is None or of != "disturbance":

@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.sets.sets import ConvexSet, Equality
+from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.messages import nearest
 
@@ -64,6 +64,7 @@ def scaling(
         "disturbance": problem.disturbance,
         "parameters": problem.system.parameters,
         "path": problem.path,
+        "integral": problem.integral,
         "control_step": problem.control_step,
         "terminal": problem.terminal,
     }
@@ -84,7 +85,8 @@ def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
         "parameters": "",
         "control": joined(names.control_units),
         "control_step": joined(names.control_units),
-    }.get(chosen.of, of_states if chosen.relative else joined([names.time])).strip()
+        "integral": "",
+    }.get(chosen.of.split(".")[0], of_states if chosen.relative else joined([names.time])).strip()
     label = chosen.label.replace("[unit of time]", f"[{unit}]") if unit else chosen.label
     return replace(chosen, label=label, quantity=f"{chosen.quantity} [{unit}]" if unit else chosen.quantity)
 
@@ -104,6 +106,8 @@ def _choices(
         if positions:
             yield f"path.{i}", lambda i=i, positions=positions: _path(problem, f"path.{i}", positions)  # type: ignore[misc]
             yield f"path.{i}.from", lambda i=i, positions=positions: _window(problem, f"path.{i}", positions)  # type: ignore[misc]
+    for i in range(len(problem.integral)):
+        yield f"integral.{i}", lambda i=i: _integral(problem, i)  # type: ignore[misc]
     for i, positions in enumerate(ends):
         if positions:
             yield f"terminal.{i}", lambda i=i, positions=positions: _terminal(problem, f"terminal.{i}", positions)  # type: ignore[misc]
@@ -239,6 +243,20 @@ def _terminal(problem: OptimalControlProblem, of: str, positions: Sequence[int])
         "largest half-width",
         _times(max(map(_half_width, sets.values()))),
     )
+
+
+def _integral(problem: OptimalControlProblem, number: int) -> Scaling:
+    entry, of = problem.integral[number], f"integral.{number}"
+    bounds = Box(np.asarray(entry.lower), np.asarray(entry.upper))
+    resized = _resizing(of, bounds)
+
+    def at(factor: float) -> OptimalControlProblem:
+        box = resized(factor).bounding_box()
+        listed = list(problem.integral)
+        listed[number] = replace(entry, lower=box.lower, upper=box.upper)
+        return replace(problem, integral=listed)
+
+    return Scaling(of, f"factor on the bounds {of}", "smallest", at, "largest half-width", _times(_half_width(bounds)))
 
 
 def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int]) -> Scaling:

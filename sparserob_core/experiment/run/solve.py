@@ -139,7 +139,7 @@ def solve(
     from sparserob_core.experiment.run.outcome import Asked, SolvedProblem
 
     asked = Asked(
-        problem=model.problem,
+        problem=model.stated,
         choices={
             "method": _with_tolerance(registry, method, tolerance),
             "maximiser": maximiser,

@@ -16,6 +16,7 @@ from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import (
+    IntegralConstraint,
     MixedConstraint,
     OptimalControlProblem,
     PathConstraint,
@@ -32,8 +33,8 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
-    "path", "terminal", "title", "initial_control", "control_step", "names", "cost", "disturbances", "measurements",
-    "repeat",
+    "path", "terminal", "integral", "title", "initial_control", "control_step", "names", "cost", "disturbances",
+    "measurements", "repeat",
 }  # fmt: skip
 """The fields of a problem that are written; one that is added and not named here is refused, not lost."""
 WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
@@ -57,6 +58,7 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         "disturbance_class": problem.disturbance_class,
         "path": [_path_keys(f"path.{i}", entry) for i, entry in enumerate(path)],
         "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
+        "integral": [_integral_keys(entry) for entry in problem.integral],
         **_cost_keys(problem.cost),
         **_names_keys(problem.names),
     }
@@ -175,6 +177,14 @@ def _path_keys(where: str, entry: PathConstraint | MixedConstraint | ConvexSet) 
         return {"mixed": rows, **window}
     moved = {} if entry.relative_to is None else {"relative_to": np.asarray(entry.relative_to).tolist()}
     return {**set_keys(where, entry.set), **window, **moved}
+
+
+def _integral_keys(entry: IntegralConstraint) -> dict[str, Any]:
+    sides = {"lower": np.asarray(entry.lower), "upper": np.asarray(entry.upper)}
+    bounds = {key: [float(v) if np.isfinite(v) else None for v in side] for key, side in sides.items()}
+    named = {} if entry.name is None else {"name": entry.name}
+    rows = {key: np.asarray(getattr(entry, key)).tolist() for key in ("H", "G")}
+    return {**rows, "from": entry.start, "to": entry.stop, **bounds, **named}
 
 
 def _terminal_keys(where: str, entry: ConvexSet | Equality) -> dict[str, Any]:

@@ -1,0 +1,213 @@
+"""Integrals that are bounded, as coordinates of a larger state: derived from the problem's records alone.
+
+After the ``d`` states of the problem comes one for each row of each integral, in their order, whose derivative is
+``h'x + g'u`` while the row is integrated, and 0 else. With a delay ``u`` is what acts, so that a row of both is two
+coordinates, first that of ``h``, and the second is integrated as much later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.policies.measurements import Measurements
+from sparserob_core.control.problem.cost import Cost, Quadratic
+from sparserob_core.control.problem.names import Names
+from sparserob_core.control.problem.problem import (
+    Accumulated,
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+)
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope, Product
+from sparserob_core.sip.convex_set import Array
+
+APART = 1e-12  # of the horizon: times that are nearer are one; ten times more would join what a clock tells apart
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Coordinate:
+    """What is integrated, of the state ``h (d,)`` and of the control that acts ``g (m,)``, and when; ``name`` and
+    ``unit`` are those that files may use."""
+
+    h: Array
+    g: Array
+    begin: float
+    end: float
+    name: str
+    unit: str
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Above:
+    """A matrix of a system with zeros at its right, ``more`` of them, and numbers below, at any parameter."""
+
+    top: object
+    below: Array
+
+    def __call__(self, p: object) -> object:
+        table = np.asarray(self.top(p) if callable(self.top) else self.top)
+        (n, columns), (k, width) = table.shape, self.below.shape
+        whole = np.zeros((n + k, width), dtype=object)
+        whole[:n, :columns], whole[n:] = table, self.below
+        return whole
+
+
+def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem with a coordinate for every integral; it itself where there is none."""
+    if not problem.integral:
+        return problem
+    d, m = problem.system.states, problem.system.controls
+    coordinates, windows = list[Coordinate](), list[tuple[str, float, list[tuple[list[int], float, float]]]]()
+    for number, entry in enumerate(problem.integral):
+        H, G = np.reshape(np.asarray(entry.H), (-1, d)), np.reshape(np.asarray(entry.G), (-1, m))
+        late = problem.system.delay if G.any() else 0.0
+        assert entry.stop is not None
+        judged, sums = min(entry.stop + late, problem.horizon), []
+        called = entry.name or ("integral" if len(problem.integral) == 1 else f"integral[{number}]")
+        bounds = zip(np.asarray(entry.lower).tolist(), np.asarray(entry.upper).tolist(), strict=True)
+        for row, (h, g, (lower, upper)) in enumerate(zip(H, G, bounds, strict=True)):
+            name, unit = called + (f" {row + 1}" if len(H) > 1 else ""), _unit(problem.names, h, g)
+            made = [Coordinate(h, g, entry.start, entry.stop, name, unit)]
+            if g.any() and late:
+                both = [f"{name} of states", f"{name} of controls"] if h.any() else [name]
+                made = [Coordinate(0.0 * h, g, entry.start + late, judged, both[-1], unit)]
+                made = [Coordinate(h, 0.0 * g, entry.start, entry.stop, both[0], unit)] * (len(both) - 1) + made
+            sums.append(([d + len(coordinates) + i for i in range(len(made))], lower, upper))
+            coordinates += made
+        windows.append((called, judged, sums))
+    if not problem.system.switches and not any(one.begin > 0.0 for one in coordinates):
+        coordinates = [replace(one, end=problem.horizon) for one in coordinates]  # a system without pieces stays so
+    size = d + len(coordinates)
+    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
+    return replace(
+        problem,
+        system=_larger(problem.system, coordinates, problem.horizon),
+        initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(size - d)]),
+        initial_set=None if begun is None else _begun(begun, size),
+        path=[
+            *(_freed(entry, size) for entry in problem.path),
+            *(Accumulated(_summed(sums, size), time, time, name) for name, time, sums in windows),
+        ],
+        terminal=[
+            Equality(np.pad(end.values, (0, size - d), constant_values=np.nan))
+            if isinstance(end, Equality)
+            else _free(end, size)
+            for end in problem.terminal
+        ],
+        integral=(),
+        cost=_cost(problem.cost, size - d),
+        names=_named(problem, coordinates),
+        measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, size - d)))),
+    )
+
+
+def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> System:
+    """The system with its coordinates, cut where one of them begins or ends."""
+    turns = [*system.switches, horizon]
+    for time in sorted({t for one in coordinates for t in (one.begin, one.end)}):
+        if all(abs(time - turn) > APART * horizon for turn in (0.0, *turns)):
+            turns.append(time)
+    pieces, begin = [], 0.0
+    for until in sorted(turns):
+        which = sum(switch <= begin for switch in system.switches)
+        pieces.append((until, _with(system.modes[which], list(_acting(coordinates, begin, until)))))
+        begin = until
+    return SwitchedSystem(pieces, system.delay) if len(pieces) > 1 else replace(pieces[0][1], delay=system.delay)
+
+
+def _acting(coordinates: list[Coordinate], begin: float, until: float) -> Iterator[tuple[Array, Array]]:
+    """The rates of the coordinates on a piece of time, which is in the window of each or outside of it."""
+    middle = (begin + until) / 2
+    for one in coordinates:
+        share = float(one.begin < middle < one.end)
+        yield share * one.h, share * one.g
+
+
+def _with(mode: LinearSystem, rates: list[tuple[Array, Array]]) -> LinearSystem:
+    d, k, m = mode.states, len(rates), mode.controls
+    below = {
+        "A": np.array([[*h, *np.zeros(k)] for h, _ in rates]),
+        "B": np.array([g for _, g in rates]).reshape(k, m),
+        "E": np.zeros((k, mode.disturbances)),
+        "c": np.zeros((k, 1)),
+    }
+    given = {name: Above(getattr(mode, name), part) for name, part in below.items() if getattr(mode, name) is not None}
+    if mode.parameters is None:
+        made = {name: np.asarray(entry(()), dtype=float) for name, entry in given.items()}
+        return LinearSystem(made["A"], made["B"], made["E"], c=made.get("c"))
+    assert d > 0
+    return LinearSystem(given["A"], given["B"], given["E"], mode.parameters, mode.names, given.get("c"))
+
+
+def _freed(entry: PathConstraint | MixedConstraint | ConvexSet, size: int) -> PathConstraint | MixedConstraint:
+    assert not isinstance(entry, ConvexSet)
+    if isinstance(entry, MixedConstraint):
+        H = np.asarray(entry.H)
+        return replace(entry, H=np.pad(H, ((0, 0), (0, size - H.shape[1]))))
+    rows = None if entry.relative_to is None else np.asarray(entry.relative_to)
+    moved = None if rows is None else np.pad(rows, ((0, 0), (0, size + 1 - rows.shape[1])))
+    return replace(entry, set=_free(entry.set, size), relative_to=moved)
+
+
+def _free(bound: ConvexSet, size: int) -> ConvexSet:
+    """The set of the first coordinates, whatever the others are."""
+    more = size - bound.dimension
+    if isinstance(bound, Box):
+        ends = ((bound.lower, -np.inf), (bound.upper, np.inf))
+        return Box(*(np.pad(side, (0, more), constant_values=far) for side, far in ends))
+    flat = bound.halfspaces()
+    return Cylinder(bound, size) if flat is None else Polytope(np.pad(flat[0], ((0, 0), (0, more))), flat[1])
+
+
+def _begun(bound: ConvexSet, size: int) -> ConvexSet:
+    """The deviations of the initial state, beside integrals that begin at 0."""
+    zero = np.zeros(size - bound.dimension)
+    if isinstance(bound, Box):
+        return Box(np.append(bound.lower, zero), np.append(bound.upper, zero))
+    return Product((bound, Box(zero, zero)))
+
+
+def _summed(sums: list[tuple[list[int], float, float]], size: int) -> ConvexSet:
+    """Bounds of sums of coordinates."""
+    if all(len(which) == 1 for which, _, _ in sums):
+        lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+        for (place,), low, high in sums:
+            lower[place], upper[place] = low, high
+        return Box(lower, upper)
+    rows = np.array([[float(i in which) for i in range(size)] for which, _, _ in sums])
+    above, below = ([row[side] for row in sums] for side in (2, 1))
+    H, h = np.vstack([rows, -rows]), np.append(above, np.negative(below))
+    return Polytope(H[np.isfinite(h)], h[np.isfinite(h)])
+
+
+def _named(problem: OptimalControlProblem, coordinates: list[Coordinate]) -> Names:
+    given, d = problem.names, problem.system.states
+    units = [*(given.state_units or ("",) * d), *(one.unit for one in coordinates)]
+    called = [*(given.states or [f"x{i + 1}" for i in range(d)]), *(one.name for one in coordinates)]
+    return replace(given, states=called, state_units=units if any(units) else ())
+
+
+def _unit(names: Names, h: Array, g: Array) -> str:
+    """That of what is integrated times that of time, where all of it has one."""
+    given = [(h, names.state_units), (g, names.control_units)]
+    every = {units[i] if units else "" for values, units in given for i in np.flatnonzero(values).tolist()}
+    (unit,) = every if len(every) == 1 else ("",)
+    if not (unit and names.time):
+        return ""
+    head, slash, per = unit.rpartition("/")
+    return head if slash and per == names.time else f"{unit} {names.time}"
+
+
+def _cost(cost: Cost, more: int) -> Cost:
+    state, _, final = (
+        None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
+        for term in cost.terms
+    )
+    return replace(cost, state=state, final=final)

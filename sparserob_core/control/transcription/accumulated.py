@@ -1,0 +1,159 @@
+"""Bounds of integrals as bounds of states: a problem with the running integrals of its `IntegralConstraint`s beside its
+states, so that a row of the state at the end of a window is all that is left of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.policies.measurements import Measurements
+from sparserob_core.control.problem.cost import Cost, Quadratic
+from sparserob_core.control.problem.disturbances import SHORTEST, legs
+from sparserob_core.control.problem.names import Names, measured_in
+from sparserob_core.control.problem.problem import (
+    Accumulated,
+    IntegralConstraint,
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+)
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.sets.sets import Equality, Polytope, cylinder, product
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Running:
+    """A state more: ``z' = h'x + g'u`` with the ``u`` that acts, from ``start`` to ``stop``, and 0 elsewhere;
+    ``h (d,)``, ``g (m,)``. ``name`` and ``unit`` are for people."""
+
+    h: Array
+    g: Array
+    start: float
+    stop: float
+    name: str
+    unit: str
+
+
+def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The same problem without integrals: each row of them is a state more, or the sum of two, known at the beginning
+    and not measured, that is bounded at one time. The system stays a single one where it is one and all windows begin
+    at 0: integrals then go on to the horizon, since nothing looks at them again."""
+    if not problem.integral:
+        return problem
+    running, ends, d = list[Running](), list[Accumulated](), problem.system.states
+    for i, entry in enumerate(problem.integral):
+        name = entry.name or ("integral" if len(problem.integral) == 1 else f"integral[{i}]")
+        rows, end = _running(problem, entry, name)
+        bound = _bounded(entry, rows, d + len(running))
+        ends.append(Accumulated(bound, end, end, name))
+        running += [one for row in rows for one in row]
+    if not problem.system.switches and all(one.start == 0.0 for one in running):
+        running = [replace(one, stop=problem.horizon) for one in running]
+    k = len(running)
+    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
+    return replace(
+        problem,
+        system=_system(problem.system, running, problem.horizon),
+        initial_state=np.append(np.asarray(problem.initial_state), np.zeros(k)),
+        initial_set=None if begun is None else product([begun, Box(np.zeros(k), np.zeros(k))]),
+        path=[_widened(entry, d + k) for entry in (*problem.path, *ends)],
+        terminal=[_ended(end, d + k) for end in problem.terminal],
+        integral=(),
+        cost=_cost(problem.cost, k),
+        names=_names(problem.names, d, running),
+        measurements=replace(measured, C=np.hstack([np.asarray(measured.C), np.zeros((measured.outputs, k))])),
+    )
+
+
+def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: str) -> tuple[list[list[Running]], float]:
+    """The states that the rows of an integral are sums of, and the time at which all of these are complete. Where the
+    control acts later than it is commanded, its part is integrated as much later."""
+    H, G, start, stop, delay = np.asarray(entry.H), np.asarray(entry.G), entry.start, entry.stop, problem.system.delay
+    assert stop is not None
+    end = min(stop + delay, problem.horizon) if G.any() else stop
+    found = []
+    for row, (h, g) in enumerate(zip(H, G, strict=True)):
+        called = name if len(H) == 1 else f"{name} {row + 1}"
+        unit = _unit(measured_in(np.append(h, g), problem.names, h.size).strip(), problem.names.time)
+        if delay == 0.0 or not g.any():
+            found.append([Running(h, g, start, stop, called, unit)])
+            continue
+        late = Running(np.zeros_like(h), g, start + delay, end, called, unit)
+        early = Running(h, np.zeros_like(g), start, stop, f"{called} of states", unit)
+        found.append([early, replace(late, name=f"{called} of controls")] if h.any() else [late])
+    return found, end
+
+
+def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -> ConvexSet:
+    """The bounds of the sums of states, of which the first has the number ``first``."""
+    lower, upper = np.asarray(entry.lower), np.asarray(entry.upper)
+    if all(len(row) == 1 for row in rows):
+        free = np.full(first, np.inf)
+        return Box(np.append(-free, lower), np.append(free, upper))
+    which = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    sums = np.hstack([np.zeros((len(rows), first)), (which == np.arange(len(rows))[:, None]).astype(float)])
+    H, h = np.vstack([sums, -sums]), np.append(upper, -lower)
+    return Polytope(H[np.isfinite(h)], h[np.isfinite(h)])
+
+
+def _system(system: System, running: list[Running], horizon: float) -> LinearSystem | SwitchedSystem:
+    """The system beside what is integrated of it; of pieces where one of the integrals begins later than at 0, or ends
+    before it is looked at."""
+    assert not isinstance(system, VaryingSystem)  # of which integrals are refused
+    slack, pieces = SHORTEST * horizon, list[tuple[float, LinearSystem]]()
+    for begin, until, mode in legs(system, {time for one in running for time in (one.start, one.stop)}, horizon):
+        acts = np.array([[one.start <= begin + slack and until <= one.stop + slack] for one in running])
+        h, g = np.stack([one.h for one in running]), np.stack([one.g for one in running])
+        pieces.append((until, mode.accumulating(acts * h, acts * g)))
+    if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
+        return pieces[0][1]
+    return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay)
+
+
+def _widened(entry: PathConstraint | MixedConstraint | ConvexSet, size: int) -> PathConstraint | MixedConstraint:
+    """A window that leaves the states beyond its own free, ``size`` in all."""
+    assert not isinstance(entry, ConvexSet)  # a problem has made constraints of its sets
+    if isinstance(entry, MixedConstraint):
+        H = np.asarray(entry.H)
+        return replace(entry, H=np.hstack([H, np.zeros((len(H), size - H.shape[1]))]))
+    moved = entry.relative_to
+    if moved is not None:
+        rows = np.asarray(moved)
+        moved = np.hstack([rows, np.zeros((len(rows), 1 + size - rows.shape[1]))])
+    return replace(entry, set=cylinder(entry.set, size), relative_to=moved)
+
+
+def _ended(end: ConvexSet | Equality, size: int) -> ConvexSet | Equality:
+    if isinstance(end, Equality):
+        return Equality(np.append(end.values, np.full(size - end.dimension, np.nan)))
+    return cylinder(end, size)
+
+
+def _cost(cost: Cost, more: int) -> Cost:
+    """The same cost, which the states beyond are no part of."""
+
+    def widened(term: Quadratic | None) -> Quadratic | None:
+        return None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
+
+    state, _, final = cost.terms
+    return replace(cost, state=widened(state), final=widened(final))
+
+
+def _names(names: Names, states: int, running: list[Running]) -> Names:
+    units = [*(names.state_units or [""] * states), *(one.unit for one in running)]
+    return replace(
+        names,
+        states=[*(names.state(i) for i in range(states)), *(one.name for one in running)],
+        state_units=units if any(units) else (),
+    )
+
+
+def _unit(unit: str, time: str) -> str:
+    """The unit of an integral over time of what has a ``unit``; empty where one of them is not known."""
+    if not unit or not time:
+        return ""
+    return unit.removesuffix(f"/{time}") if unit.endswith(f"/{time}") else f"{unit} {time}"
