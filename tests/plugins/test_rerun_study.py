@@ -250,3 +250,40 @@ def test_a_viewer_without_a_display_is_an_error_before_anything_is_run(
     done = command("sweep", "small.yaml", "seed=0,1", "--watch", "--out", "study")
     assert done.returncode == 2 and "there is no display for a viewer" in done.stderr
     assert not (tmp_path / "study").exists()
+
+
+@pytest.mark.parametrize(("sense", "bracket"), [("largest", (1.5, 2.0)), ("smallest", (2.5, 2.0)), ("", None)])
+def test_the_map_of_a_margin_says_between_which_values_the_critical_one_is(
+    sense: Any, bracket: tuple[float, float] | None
+) -> None:
+    from sparserob_rerun.study.board import Board
+
+    signs = {"largest": 1.0, "smallest": -1.0, "": 1.0}
+    values = [2.0 + signs[sense] * one for one in (-2.0, -0.5, 0.0, 1.0, -0.1)]
+    statuses = ["certified", "verified", "infeasible", "infeasible", "undecided"]
+    rows = {
+        place: {"status": status, "cost": 1.0 if place < 2 else None, "lower_bound": 1.0}
+        for place, status in enumerate(statuses)
+    }
+    told: dict[str, Any] = {"title": "", "directory": Path(), "axes": ["factor"], "logarithmic": [False]}
+    begun = sr.SweepStarted(points=[], arrangement="search", sense=sense, **told)
+    assert "hatch" not in Board(begun).draw({}, []).strips  # nothing is known yet
+    board = Board(sr.SweepStarted(points=[(one,) for one in values], arrangement="search", sense=sense, **told))
+    drawing = board.draw(rows, [])
+    words = " ".join(text for _, text, _ in drawing.labels)
+    assert ("critical between" in words) == ("hatch" in drawing.strips) == (bracket is not None)
+    if bracket is not None:
+        assert board.bracket(rows) == bracket
+        edge = board._axes((0.0, 1.0)).at(2.0, 0.0)[0, 0]
+        beyond = np.concatenate([points[:, 0] - edge for points, _, _ in drawing.strips["hatch"]])
+        assert (signs[sense] * beyond >= -1e-9).all()
+
+
+@pytest.mark.slow
+def test_a_margin_is_recorded_with_its_bracket(tmp_path: Path, command: Command) -> None:
+    file = tmp_path / "margin.rrd"
+    more = ["dictionaries.control.pieces=20", "--tolerance", "1e-3", "--curve", "3"]
+    places = ["--save", str(file), "--out", str(tmp_path / "out")]
+    assert command("margin", str(CONFIGS / "double_integrator.yaml"), *more, *places).returncode == 0
+    assert any("critical between" in one for one in labels(file, "map"))
+    assert "the search is over" in pages(file)[-1]

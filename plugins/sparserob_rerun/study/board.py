@@ -28,6 +28,7 @@ MARKED = 14.0  # pixels of a cell from which on it has room for a mark
 COSTED = 68.0  # pixels of a cell's width from which on its cost and gap fit into it
 LINES = 60  # of the table
 EMPTY: ink.Colour = (48, 52, 60, 255)
+FEASIBLE = ("certified", "verified")
 DECADES = 3.0  # between costs from which on their axis is logarithmic
 
 
@@ -39,11 +40,11 @@ class Scale:
     def __init__(self, key: str, values: Sequence[Any], logarithmic: bool, drawn: bool, row: bool) -> None:
         numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
         self.key, self.drawn, self.numeric = key, drawn, numbers and not row
-        self.log = self.numeric and logarithmic and min(values) > 0
+        self.log = self.numeric and logarithmic and min(values, default=0) > 0
         distinct = {repr(one): one for one in values}
         self.values = sorted(distinct.values()) if numbers else list(distinct.values())
         self.places = {repr(one): place for place, one in enumerate(self.values)}
-        at = [self.at(one) for one in self.values]
+        at = [self.at(one) for one in self.values] or [0.0, 1.0]
         rim = (0.06 * (max(at) - min(at)) if self.numeric else 0.5) or 0.5
         self.limits = (min(at) - rim, max(at) + rim)
 
@@ -74,9 +75,10 @@ class Board:
     def __init__(self, event: sr.SweepStarted) -> None:
         self.event, self.drawn = event, event.arrangement in ("random", "sobol")
         count = 1 if event.arrangement == "zip" else len(event.axes)
-        columns = list(zip(*event.points, strict=True)) if event.points else []
+        columns: list[Sequence[Any]] = list(zip(*event.points, strict=True)) or [()] * len(event.axes)
+        anywhere = self.drawn or event.arrangement == "search"  # round numbers on the axes, since values are none
         self.scales = [
-            Scale(key, values, log, self.drawn, row=count == 2 and not self.drawn)
+            Scale(key, values, log, anywhere, row=count == 2 and not self.drawn)
             for key, values, log in zip(event.axes[:count], columns[:count], event.logarithmic[:count], strict=True)
         ]
         self.kind = "table"
@@ -190,6 +192,7 @@ class Board:
         rim = 0.12 * (high - low) or 0.1 * abs(high) or 0.5
         axes = self._axes((low - rim, high + rim))
         what = "cost J, down to its proven lower bound" if costs else "cost J: no point has one yet"
+        what += self._critical(drawing, axes, rows)
         self._along(drawing, axes)
         for value in round_numbers(*axes.y) if costs else ():
             y = float(axes.at(axes.x[0], value)[0, 1])
@@ -214,6 +217,33 @@ class Board:
             else:
                 at = axes.at(x, axes.y[0])[0] - np.array([0.0, 8.0])
             mark(drawing, at, status)
+
+    def bracket(self, rows: Mapping[int, Mapping[str, Any]]) -> tuple[float, float]:
+        """Of a search for a critical value: the last one that is proven feasible, and the first that is proven
+        infeasible; NaN where there is none."""
+        largest = self.event.sense == "largest"
+        at = {place: float(self.event.points[place][0]) for place in rows}
+        good = [value for place, value in at.items() if rows[place]["status"] in FEASIBLE]
+        bad = [value for place, value in at.items() if rows[place]["status"] == "infeasible"]
+        ends = (max, min) if largest else (min, max)
+        return ends[0](good, default=np.nan), ends[1](bad, default=np.nan)
+
+    def _critical(self, drawing: Drawing, axes: Axes, rows: Mapping[int, Mapping[str, Any]]) -> str:
+        """Hatch what is proven infeasible, and say between which values the critical one is."""
+        if not self.event.sense:
+            return ""
+        good, bad = self.bracket(rows)
+        if np.isfinite(bad):
+            low, high = (bad, axes.x[1]) if self.event.sense == "largest" else (axes.x[0], bad)
+            drawing.hatched("hatch", axes, (low, high), axes.y, ink.HATCH)
+            edge = axes.at(np.full(2, bad), np.array(axes.y))
+            drawing.line("frame", edge, ink.VERMILLION, 1.5)
+        if np.isfinite([good, bad]).all():
+            low, high = sorted((good, bad))
+            return f"; critical between {low:.7g} and {high:.7g}; hatched: infeasible"
+        if np.isfinite(bad):
+            return "; hatched: infeasible"
+        return f"; feasible at {good:.7g}" if np.isfinite(good) else ""
 
 
 def shaded(status: str) -> ink.Colour:

@@ -6,7 +6,7 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from textwrap import shorten
 from typing import Any, final
 
@@ -19,7 +19,7 @@ from sparserob_rerun.study import board
 from sparserob_rerun.study.board import Board, number
 from sparserob_rerun.study.statuses import mark, named, plainly, said
 
-LAYERS = ("curve", "frame", "bounds", "marks")
+LAYERS = ("hatch", "curve", "frame", "bounds", "marks")
 PICTURE_EVERY, SHARE, RAREST, SPARE = 0.5, 0.005, 60.0, 20.0
 """Seconds between two pictures; a share of the study's time, and these seconds at most; and how many times the
 processor time of one."""
@@ -54,7 +54,9 @@ class StudyRecorder:
         self.rows: dict[int, Mapping[str, Any]] = dict(self.event.rows)
         self.newest: deque[int] = deque(self.rows, maxlen=board.LINES)
         self.running: dict[int, tuple[int, float, float]] = {}
-        self.text, self.over = f"{len(self.rows)} of {len(self.event.points)} points done", ""
+        searched = self.event.arrangement == "search"
+        self.text = "its points are found on the way" if searched else self._done()
+        self.over = ""
         self.seconds, self.next, self.seen = 0.0, 0.0, dict[str, set[str]]()
         self._tell(f"study: {self.event.title}")
         if self.rows:
@@ -66,6 +68,9 @@ class StudyRecorder:
         match event:
             case sr.SweepProgress():
                 self.text = event.text
+                if event.found:
+                    self.event = replace(self.event, points=[*self.event.points, *event.found])
+                    self.board = Board(self.event)
                 self.running = {place: self.running.get(place, (0, -np.inf, np.inf)) for place in event.now}
                 self._move(event.seconds)
                 if event.row is not None:
@@ -92,6 +97,9 @@ class StudyRecorder:
 
     def finish(self) -> None:
         """Nothing is left to be done after the last event."""
+
+    def _done(self) -> str:
+        return f"{len(self.rows)} of {len(self.event.points)} points done"
 
     def _tell(self, line: str) -> None:
         self._move(self.seconds)
@@ -121,8 +129,9 @@ class StudyRecorder:
         fresh = [place for place in event.rows if place not in self.rows]
         self.rows, self.running = dict(event.rows), {}
         self.newest = deque([*fresh, *(one for one in self.newest if one in self.rows)], maxlen=board.LINES)
-        self.over = f"stopped: {event.stopped}" if event.stopped else "the study is over"
-        self.text = f"{len(self.rows)} of {len(self.event.points)} points have an answer or an error"
+        what = "search" if self.event.arrangement == "search" else "study"
+        self.over = f"stopped: {event.stopped}" if event.stopped else f"the {what} is over"
+        self.text = event.answer or f"{len(self.rows)} of {len(self.event.points)} points have an answer or an error"
         self._move(event.seconds)
         self._picture()
         self.say(f"{self.over}; {self.text}: {self._counts()}", "WARN" if event.stopped else "INFO")
@@ -200,7 +209,7 @@ class StudyRecorder:
         """The range of one point: its name at the left, its status at the right."""
         lower, upper = self._range(place)
         status = "running" if place in self.running else str(self.rows[place]["status"])
-        name = named(self.event.axes, self.event.points[place])
+        name = self._named(place)
         if len(name) > NAME:  # the values tell points apart, the keys do not
             name = ", ".join(map(said, self.event.points[place]))
         drawing.text(LEFT / 2 - 5, y, name if len(name) <= NAME else f"{name[: NAME - 3]}...")
@@ -223,6 +232,12 @@ class StudyRecorder:
         for end, colour, reach in zip(ends, (ink.GREEN, ink.VERMILLION), (9.0, -9.0), strict=True):
             if math.isfinite(end):  # one below the line and one above it, for they meet
                 drawing.line("marks", np.array([[end, y], [end, y + reach]]), colour, 3.0)
+
+    def _named(self, place: int) -> str:
+        """A point in words; of a search with all digits, by which values come close to one another."""
+        if self.event.arrangement == "search":
+            return f"at {float(self.event.points[place][0]):.9g}"
+        return named(self.event.axes, self.event.points[place])
 
     def _range(self, place: int) -> tuple[float, float]:
         """The bounds of a point, infinite where there are none."""
@@ -253,7 +268,7 @@ class StudyRecorder:
 
     def _line(self, place: int) -> str:
         """A point in words."""
-        name = named(self.event.axes, self.event.points[place])
+        name = self._named(place)
         if place in self.running:
             turn, lower, upper = self.running[place]
             if self.event.parallel:

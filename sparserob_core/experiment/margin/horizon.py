@@ -16,9 +16,9 @@ from sparserob_core.control.sets.sets import ConvexSet, Equality
 from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_horizon, stretched
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.margin.search import FEASIBLE, Answer, Margin, Point
-from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.sip.events import Notify
+from sparserob_core.experiment.margin.points import Point, Points
+from sparserob_core.experiment.margin.search import FEASIBLE, Answer, Margin
+from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.own_units import solve_in_own_units
@@ -43,7 +43,7 @@ class HorizonSearch:
     method: Exchange
     tools: Tools
     width: float
-    notify: Notify
+    told: Points
     points: dict[float, Point] = field(default_factory=dict)
     covered: list[tuple[float, float]] = field(default_factory=list)
     _farkas: dict[float, list[Multiplier]] = field(default_factory=dict)
@@ -124,7 +124,7 @@ class HorizonSearch:
                 best = min(best, high)
             elif status == "infeasible" and self._excluded(low, high):
                 self.covered.append((low, high))
-                self._tell(f"no horizon up to {high:.9g} is feasible")
+                self.told.say(f"no horizon up to {high:.9g} is feasible")
                 continue
             short = high - low <= self.width
             if short and status in FEASIBLE:
@@ -170,11 +170,11 @@ class HorizonSearch:
     def _run(self, horizon: float) -> Point:
         """An ordinary run at a horizon, remembered."""
         if horizon not in self.points:
-            model, result = self._solved(self.problem, horizon)
+            model, result = self._solved(self.problem, horizon, self.told.begin(horizon))
             self.points[horizon] = Point(
                 horizon, horizon, result.status, result.message, result.lower_bound, result.upper_bound
             )
-            self._tell(f"horizon {horizon:.9g}: {result.status}")
+            self.told.end(self.points[horizon])
             if result.status == "infeasible" and self.problem.control_step is None:
                 self._farkas[horizon] = _multipliers_of(model, result)
             if result.stopped:
@@ -188,15 +188,14 @@ class HorizonSearch:
             self._farkas[horizon] = _multipliers_of(model, result) if result.status == "infeasible" else []
         return self._farkas.get(horizon, [])
 
-    def _solved(self, problem: OptimalControlProblem, horizon: float) -> tuple[Transcription, Result]:
+    def _solved(
+        self, problem: OptimalControlProblem, horizon: float, notify: Notify = ignore
+    ) -> tuple[Transcription, Result]:
         from sparserob_core.control.transcription.transcribe import prepare
 
         control, disturbance = (stretched(one, horizon) for one in (self.control, self.disturbance))
         model = prepare(at_horizon(problem, horizon), control, disturbance)
-        return model, solve_in_own_units(self.method, model.program, self.tools)
-
-    def _tell(self, text: str) -> None:
-        self.notify(StudyProgress(text=text))
+        return model, solve_in_own_units(self.method, model.program, replace(self.tools, notify=notify))
 
 
 def horizon_search(
@@ -222,7 +221,7 @@ def horizon_search(
             got=f"{len(problem.integral)}",
         )
     try:
-        return HorizonSearch(title, problem, *dictionaries, method, tools, width, notify)
+        return HorizonSearch(title, problem, *dictionaries, method, tools, width, Points(HORIZON, notify))
     except InputError as error:
         raise error if not error.path else error.under("of", HORIZON) from None
 

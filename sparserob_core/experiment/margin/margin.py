@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.causal import Ended
-from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.errors import InputError, SparseRobError, named
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import ProblemKeys
@@ -19,10 +20,12 @@ from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
 from sparserob_core.experiment.margin.causal import causal_upper
 from sparserob_core.experiment.margin.horizon import HORIZON, HorizonSearch, horizon_search
+from sparserob_core.experiment.margin.points import Point, Points
 from sparserob_core.experiment.margin.scaling import Scaling, scaling
-from sparserob_core.experiment.margin.search import Margin, MarginSearch, Point
+from sparserob_core.experiment.margin.search import Margin, MarginSearch
+from sparserob_core.experiment.run.events import Broadcast, Observer, SweepFinished, SweepStarted
 from sparserob_core.experiment.run.given import GivenConfig, as_config
-from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.events import Event, Notify, ignore
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
 from sparserob_core.sip.result import Result
@@ -40,6 +43,7 @@ def margin(
     out: str | Path | None = None,
     write: bool = False,
     notify: Notify = ignore,
+    observers: Iterable[Observer] = (),
 ) -> Margin:
     """The margin of an experiment: what ``sparserob margin CONFIG key=value ... --of OF`` does, of a config, a
     problem, or a run (`as_config`).
@@ -51,8 +55,9 @@ def margin(
     the two sides are to be, relative to the factor, or to 1 if that is larger (for a window to its end, for the horizon
     to the config's). ``curve``: the cost at so many factors on the feasible side, each by a run of its own; at so many
     horizons, feasible or not. ``out``: a new or empty directory for ``margin.json`` and ``margin.png``; with ``write``
-    and none given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives `StudyProgress`. An interrupt, and the
-    limit ``limits.seconds`` of the config, end the search with what it has proven by then, ``undecided``. Raises
+    and none given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives `StudyProgress`. ``observers`` watch it as
+    a study of one axis, whose points are found on the way, from `SweepStarted` to `SweepFinished`. An interrupt, and
+    the limit ``limits.seconds`` of the config, end the search with what it has proven by then, ``undecided``. Raises
     `InputError` when an argument or the config is at fault, and `TimeLimitError` when the limit comes before there is
     anything to solve.
     """
@@ -61,12 +66,48 @@ def margin(
     if not hasattr(curve, "__index__") or curve < 0 or curve == 1:
         raise InputError(f"curve: expected a number of points, 0 for none or at least 2, got {curve!r}")
     loaded = load_config(as_config(config), overrides)
-    search = _search(loaded, str(of), float(tolerance), notify)
-    if out is None and not write:
-        return search.margin(int(curve))
-    with _directory(out, loaded, str(of)) as directory:
-        found = search.margin(int(curve))
-        return _written(directory, found, None if isinstance(search, HorizonSearch) else search.scaling)
+    broadcast = Broadcast([(type(observer).__name__, observer) for observer in observers])
+
+    def heard(event: Event) -> None:
+        notify(event)
+        broadcast(event)
+
+    search = _search(loaded, str(of), float(tolerance), heard if broadcast.heard else notify)
+    answer, stopped, deadline = "", "", search.tools.deadline
+    try:
+        if out is None and not write:
+            broadcast(_opening(search, Path()))
+            found = search.margin(int(curve))
+        else:
+            with _directory(out, loaded, str(of)) as directory:
+                broadcast(_opening(search, directory.path))
+                found = search.margin(int(curve))
+                found = _written(directory, found, None if isinstance(search, HorizonSearch) else search.scaling)
+        answer, stopped = "; ".join(f"{name}: {value}" for name, value in margin_rows(found)[:3]), deadline.reason
+        return found
+    except BaseException as error:
+        stopped = named(error)
+        raise
+    finally:
+        rows, seconds = dict(search.told.rows), search.told.seconds
+        with suppress(KeyboardInterrupt):  # it ends the observers; the search is over, and its directory free
+            broadcast(
+                SweepFinished(rows=rows, seconds=seconds, stopped=stopped, pressed=deadline.pressed, answer=answer)
+            )
+
+
+def _opening(search: MarginSearch | HorizonSearch, directory: Path) -> SweepStarted:
+    """What observers of a margin hear first: a study of one axis that knows no point yet."""
+    scaled = None if isinstance(search, HorizonSearch) else search.scaling
+    return SweepStarted(
+        title=f"{search.title}: margin of {search.told.of}",
+        directory=directory,
+        axes=[HORIZON if scaled is None else scaled.label.replace(".", " ")],
+        logarithmic=[False],
+        points=[],
+        arrangement="search",
+        sense=scaled.sense if scaled is not None and scaled.nested else "",
+    )
 
 
 def summary_of_margin(found: Margin) -> dict[str, Any]:
@@ -146,7 +187,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
         own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
         joined = ParametricProgram(lambda factor: like(own, units.of_problem(accumulated(chosen.at(factor)))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)
-    search = MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools, width, notify)
+    search = MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools, width, Points(of, notify))
     if policy is None or of != "disturbance":
         return search
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias, final
 
@@ -14,9 +14,8 @@ from sparserob_core.brief import brief
 from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.critical import Critical, critical_factor
+from sparserob_core.experiment.margin.points import Point, Points
 from sparserob_core.experiment.margin.scaling import Scaling, Sense
-from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.own_units import solve_in_own_units
@@ -33,19 +32,6 @@ STEPS = (
     16.0,
     64.0,
 )
-
-
-@final
-@dataclass(frozen=True)
-class Point:
-    """An ordinary run at one factor: what was proven of it, and the bounds of the cost (infinite where infeasible)."""
-
-    factor: float
-    amount: float
-    status: Status
-    message: str
-    lower_bound: float
-    upper_bound: float
 
 
 Sides: TypeAlias = tuple[Answer, str, Point | None, Point | None]
@@ -112,7 +98,7 @@ class MarginSearch:
     method: Exchange
     tools: Tools
     width: float
-    notify: Notify
+    told: Points
     points: list[Point] = field(default_factory=list)
     seen: dict[float, str] = field(default_factory=dict)
     results: dict[float, Result] = field(default_factory=dict)
@@ -123,7 +109,7 @@ class MarginSearch:
         started, curve = time.perf_counter(), tuple[Point, ...]()
         sides: Sides | None = None
         try:
-            self._tell(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
+            self.told.say(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
             sides = self._sides(self._found())
             feasible = sides[2]
             curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
@@ -166,10 +152,8 @@ class MarginSearch:
         whether anything is feasible."""
         if self.scaling.sense == "largest" and self.scaling.nested and self.run(0.0).status == "infeasible":
             return Critical("never")
-        return critical_factor(self.programs, self.joined, self.scaling, self.tools, self.width, self.notify, self.seen)
-
-    def _tell(self, text: str) -> None:
-        self.notify(StudyProgress(text=text))
+        asked = self.programs, self.joined, self.scaling, self.tools, self.width
+        return critical_factor(*asked, self.told.notify, self.seen)
 
     def _known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[Point, ...]]:
         """What an interrupted search knows: both sides where they were proven before, else the runs nearest to each
@@ -239,15 +223,17 @@ class MarginSearch:
         for point in self.points:
             if point.factor == factor:
                 return point
+        amount, tools = self.scaling.amount(factor), replace(self.tools, notify=self.told.begin(factor))
         try:
-            result = solve_in_own_units(self.method, self.programs.program(factor), self.tools)
+            result = solve_in_own_units(self.method, self.programs.program(factor), tools)
         except InputError as error:
-            return Point(factor, self.scaling.amount(factor), "failed", str(error), -np.inf, np.inf)
+            point = Point(factor, amount, "failed", str(error), -np.inf, np.inf)
+            self.told.end(point)
+            return point
         self.results[factor] = result
-        self._tell(f"{self.scaling.of} at {factor:.9g}: {result.status}")
-        amount = self.scaling.amount(factor)
         point = Point(factor, amount, result.status, result.message, result.lower_bound, result.upper_bound)
         self.points.append(point)
+        self.told.end(point)
         if result.stopped:
             self.tools.deadline.check()
         return point

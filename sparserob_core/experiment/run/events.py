@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, Literal, final
 
 from sparserob_core.sip.events import EvaluationsFinished, Event, ProofProgress, RoundFinished
 
@@ -85,7 +85,8 @@ class SweepProgress(StudyProgress):
     """A sweep goes on: ``done`` of ``total`` points, of them ``failed`` without an answer; ``running`` now; about
     ``left`` seconds to go (``None``: not known yet), ``seconds`` since it began. ``row``: the row of the table that has
     just come, if any; ``axes``: its keys that are axes. Points by their place in `SweepStarted.points`: ``places`` are
-    those of the row (several where configs are equal), ``now`` those that run."""
+    those of the row (several where configs are equal), ``now`` those that run. ``found``: points that come after those
+    that were known, where a study finds its points on the way (``search``)."""
 
     running: int = 0
     failed: int = 0
@@ -94,6 +95,7 @@ class SweepProgress(StudyProgress):
     axes: Sequence[str] = ()
     places: Sequence[int] = ()
     now: Sequence[int] = ()
+    found: Sequence[Sequence[Any]] = ()
     seconds: float = 0.0
 
 
@@ -103,8 +105,11 @@ class SweepStarted(Event):
     values of all ``points`` on them, in the order of the table.
 
     The first event for an observer of a study. ``rows``: what was finished before, by the place of the point.
-    ``arrangement``: how the points were chosen (``grid``, ``zip``, ``random``, ``sobol``). ``parallel``: the runs are
-    made elsewhere, and nothing is heard of them (`PointProgress`) before they end."""
+    ``arrangement``: how the points were chosen (``grid``, ``zip``, ``random``, ``sobol``; ``search``: a margin, whose
+    points are told as they are found, `SweepProgress`). ``parallel``: the runs are
+    made elsewhere, and nothing is heard of them (`PointProgress`) before they end. ``sense``: the *largest* or the
+    *smallest* value of the only axis is sought at which something is feasible, and what is proven infeasible at one
+    value is so beyond it; empty where nothing is."""
 
     title: str
     directory: Path
@@ -114,6 +119,7 @@ class SweepStarted(Event):
     arrangement: str
     rows: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     parallel: bool = False
+    sense: Literal["", "largest", "smallest"] = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,12 +137,14 @@ class PointProgress(Event):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SweepFinished(Event):
     """A sweep is over; the last event for an observer of a study. ``rows``: all rows of the table by the place of the
-    point; ``stopped``: what ended the study early, if anything did; ``pressed``: it was a key or a signal."""
+    point; ``stopped``: what ended the study early, if anything did; ``pressed``: it was a key or a signal. ``answer``:
+    what a search found, in words."""
 
     rows: Mapping[int, Mapping[str, Any]]
     seconds: float
     stopped: str = ""
     pressed: bool = False
+    answer: str = ""
 
 
 FIRST, LAST = (RunStarted, SweepStarted), (RunFinished, SweepFinished)

@@ -277,3 +277,44 @@ def test_a_scaling_says_what_its_factor_is(of: str, label: str, relative: bool) 
     problem = assemble(load_config(config(disturbance={"box": 0.1}, path=[{"box": 4.0}]))).problem
     varied = scaling(problem, of, [[0]], [])
     assert (varied.of, varied.label, varied.relative) == (of, label, relative)
+
+
+class Heard(sr.Observer):
+    """Keeps what it hears."""
+
+    def __init__(self) -> None:
+        self.events: list[sr.Event] = []
+
+    def receive(self, event: sr.Event) -> None:
+        self.events.append(event)
+
+
+@pytest.mark.parametrize("of", ["disturbance", "terminal.0", "horizon"])
+def test_an_observer_hears_every_run_of_a_margin_as_a_point_of_a_study(of: str, tmp_path: Path) -> None:
+    heard = Heard()
+    stated = config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [None, 0.5]}])
+    found = sr.margin(stated, of, tolerance=1e-2, curve=2, out=tmp_path / "out", observers=[heard])
+    first, *between, last = heard.events
+    assert isinstance(first, sr.SweepStarted) and isinstance(last, sr.SweepFinished)
+    assert first.arrangement == "search" and first.directory == tmp_path / "out" and not first.points
+    assert first.sense == {"horizon": "", "disturbance": "largest", "terminal.0": "smallest"}[of]
+    progress = [event for event in between if isinstance(event, sr.SweepProgress)]
+    points = [value for event in progress for (value,) in event.found]
+    rows = {place: event.row for event in progress if event.row is not None for place in event.places}
+    assert rows == last.rows and set(rows) == set(range(len(points)))
+    for point in (*found.curve, found.feasible, found.infeasible):
+        assert point is None or rows[points.index(point.factor)]["status"] == point.status
+    moved = [event for event in between if isinstance(event, sr.PointProgress)]
+    assert {event.point for event in moved} <= set(rows)
+    assert max(event.lower_bound for event in moved) == pytest.approx(
+        max(row["lower_bound"] for row in rows.values() if row["status"] == "certified"), rel=1e-6
+    )
+    assert found.status in last.answer and not last.stopped
+
+
+def test_an_observer_of_a_margin_that_is_stopped_hears_the_end() -> None:
+    heard = Heard()
+    stated = {**config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [None, 0.5]}]), "limits": {"seconds": 1e-9}}
+    assert sr.margin(stated, observers=[heard]).status == "undecided"
+    last = heard.events[-1]
+    assert isinstance(last, sr.SweepFinished) and "limit" in last.stopped

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import json_option
+from sparserob_core.experiment.cli.shell.options import json_option, watching_options
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.terminal.printing import print_json, printable, say
 
@@ -42,8 +43,19 @@ EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
         "A new or empty directory for the config, margin.json and margin.png; runs/NAME-margin/STAMP-HASH unless given."
     ),
 )
+@watching_options("the search")
 def margin(
-    config: Path, overrides: tuple[str, ...], of: str, tolerance: float, curve: int, as_json: bool, out: Path | None
+    config: Path,
+    overrides: tuple[str, ...],
+    of: str,
+    tolerance: float,
+    curve: int,
+    as_json: bool,
+    out: Path | None,
+    watch: bool,
+    save: Path | None,
+    serve: bool,
+    connect: str | None,
 ) -> int:
     """Find how far something of the experiment that CONFIG describes can be changed before nothing is feasible any
     more.
@@ -56,16 +68,21 @@ def margin(
     Of the horizon: the shortest that is feasible, up to the config's, with the number of pieces as it is. Feasibility
     is not monotone in it, so that every shorter horizon is proven infeasible, and the curve has both kinds.
 
+    With --watch, or --save, --serve or --connect, it is shown as it goes on: an optional extra (pip install rerun-sdk).
+
     Exit status: 0 both sides are proven, or no end was found as far as was looked; 2 the input is at fault, 3 nothing
     is feasible at any factor, 4 a side could not be proven, 130 interrupted.
     """
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
     from sparserob_core.experiment.margin.margin import curve_rows, margin_rows, summary_of_margin
     from sparserob_core.experiment.margin.margin import margin as find
+    from sparserob_core.experiment.run.viewer import recorded, recorder
     from sparserob_core.experiment.terminal.table import print_table
 
+    watching = [recorder(save, serve, connect)] if watch or serve or save is not None or connect is not None else []
+    asked: dict[str, Any] = {"tolerance": tolerance, "curve": curve, "out": out, "write": True, "observers": watching}
     with LiveLine() as line:
-        found = find(config, of, overrides, tolerance=tolerance, curve=curve, out=out, write=True, notify=line.receive)
+        found = find(config, of, overrides, notify=line.receive, **asked)
     if as_json:
         print_json(summary_of_margin(found))
     else:
@@ -73,6 +90,9 @@ def margin(
         if found.of == "horizon" and found.curve:
             columns = ("horizon", "status", "lower bound", "upper bound")
             print_table("Cost against the horizon", columns, curve_rows(found))
-        for remark in (*found.remarks, f"written to {found.directory}"):
+        recordings = (one for observer in watching for one in recorded(observer, save))
+        for remark in (*found.remarks, f"written to {found.directory}", *recordings):
             say(printable(remark))
+    if serve and found.status != "undecided":  # the Ctrl-C that ends a page has cut nothing short
+        return EXIT[found.status]
     return status_unless_interrupted(EXIT[found.status])

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.cli.shell.options import watching_options
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.terminal.printing import print_json, printable, say
 
@@ -42,12 +43,7 @@ if TYPE_CHECKING:
 )
 @click.option("--resume", type=click.Path(path_type=Path), metavar="DIR", help="Go on with the study in DIR.")
 @click.option("--figures/--no-figures", default=False, help="Whether to draw every run too.", show_default=True)
-@click.option("--watch", is_flag=True, help="Show the study in the viewer of Rerun while it goes on.")
-@click.option(
-    "--save", type=click.Path(path_type=Path), help="Watch: record into this new file, for a machine without a display."
-)
-@click.option("--serve", is_flag=True, help="Watch: show it in a browser of this machine, until Ctrl-C.")
-@click.option("--connect", metavar="ADDRESS", help="Watch: send it to a viewer that listens there.")
+@watching_options("the study")
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON instead.")
 def sweep(

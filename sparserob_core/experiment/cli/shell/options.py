@@ -14,6 +14,25 @@ figures_option = click.option(
     "--figures/--no-figures", default=True, help="Whether to draw the figures.", show_default=True
 )
 
+
+def watching_options(of: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """``--watch``, ``--save``, ``--serve``, ``--connect``: the viewer of a study, or of what ``of`` says."""
+    path = click.Path(path_type=Path)
+    options = (
+        click.option("--watch", is_flag=True, help=f"Show {of} in the viewer of Rerun while it goes on."),
+        click.option("--save", type=path, help="Watch: record into this new file, for a machine without a display."),
+        click.option("--serve", is_flag=True, help="Watch: show it in a browser of this machine, until Ctrl-C."),
+        click.option("--connect", metavar="ADDRESS", help="Watch: send it to a viewer that listens there."),
+    )
+
+    def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorated
+
+
 plugins_option = click.option(
     "--plugins",
     multiple=True,

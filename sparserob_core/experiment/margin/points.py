@@ -1,0 +1,79 @@
+"""The runs of a margin, told as the points of a study that is found on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from sparserob_core.experiment.directory.artefacts import finite
+from sparserob_core.experiment.run.events import PointProgress, StudyProgress, SweepProgress
+from sparserob_core.experiment.sweep.point import Bounds
+from sparserob_core.sip.events import Notify
+from sparserob_core.sip.result import Status, relative_gap
+
+
+@final
+@dataclass(frozen=True)
+class Point:
+    """An ordinary run at one factor: what was proven of it, and the bounds of the cost (infinite where infeasible)."""
+
+    factor: float
+    amount: float
+    status: Status
+    message: str
+    lower_bound: float
+    upper_bound: float
+
+
+@final
+class Points:
+    """Tells ``notify`` of every run of a search over factors of something: that it begins, how its bounds move, and its
+    answer. ``rows``: what was told, by the number of the run."""
+
+    def __init__(self, of: str, notify: Notify) -> None:
+        self.of, self.notify = of, notify
+        self.rows: dict[int, Mapping[str, Any]] = {}
+        self.began, self.count = time.monotonic(), 0
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the search began."""
+        return time.monotonic() - self.began
+
+    def say(self, text: str) -> None:
+        """Words of what is looked for."""
+        self.notify(StudyProgress(text=text))
+
+    def begin(self, factor: float) -> Notify:
+        """A run at a factor begins: what is to receive its events."""
+        place, self.count = self.count, self.count + 1
+        text = f"{self.of} at {factor:.9g} is run"
+        self._tell(text, found=[(float(factor),)], now=[place], running=1)
+
+        def moved(number: int, lower: float, upper: float) -> None:
+            self.notify(
+                PointProgress(point=place, round=number, lower_bound=lower, upper_bound=upper, seconds=self.seconds)
+            )
+
+        return Bounds(moved).receive
+
+    def end(self, point: Point) -> None:
+        """The answer of the run that has begun last."""
+        place, proven = self.count - 1, np.isfinite(point.upper_bound)
+        gap = relative_gap(point.lower_bound, point.upper_bound)
+        told = {"status": point.status, "message": point.message, "cost": point.upper_bound if proven else None}
+        self.rows[place] = finite(
+            {**told, "lower_bound": point.lower_bound, "upper_bound": point.upper_bound, "gap": gap}
+        )
+        self._tell(f"{self.of} at {point.factor:.9g}: {point.status}", row=self.rows[place], places=[place])
+
+    def _tell(self, text: str, **more: Any) -> None:
+        self.notify(
+            SweepProgress(
+                text=text, done=len(self.rows), total=self.count, seconds=self.seconds, axes=[self.of], **more
+            )
+        )
