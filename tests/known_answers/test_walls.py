@@ -147,6 +147,41 @@ class Clock(Deadline):
         return "the limit of 60 s is reached" if self.looked > self.looks else super().reason
 
 
+def thin(width: float, uncertain: bool) -> dict[str, Any]:
+    """The wall that moves, and another one ``2 width`` above it."""
+    given = ridden("moving", 16, uncertain)
+    (path,) = given["problem"]["path"]
+    del path["polytope"]
+    path["relative_to"] = [[time, level + width] for time, level in path["relative_to"]]
+    return {**given, "problem": {**given["problem"], "path": [{**path, "box": [width], "from": 0.5}]}}
+
+
+@pytest.mark.parametrize(("uncertain", "looks"), [(False, 12), pytest.param(True, 16, marks=pytest.mark.slow)])
+def test_where_nothing_is_as_far_from_the_walls_as_twice_what_was_missed_there_is_a_proven_control_soon(
+    uncertain: bool, looks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "Deadline", Clock)
+    monkeypatch.setattr(Clock, "looks", looks)
+    result = sr.run(thin(0.2 if uncertain else 0.1, uncertain), quiet=True, figures=False).result
+    assert result.stopped == "the limit of 60 s is reached"
+    assert result.status == "verified"
+    assert result.lower_bound < result.upper_bound < 1.1 * result.lower_bound
+
+
+@pytest.mark.parametrize("feedback", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_under_a_limit_what_little_would_pay_for_is_proven_at_once(
+    feedback: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "Deadline", Clock)
+    monkeypatch.setattr(Clock, "looks", 10_000)  # no share of the limit is over
+    given = ridden("moving", 8, feedback=True) if feedback else thin(0.1, False)
+    result = sr.run(given, quiet=True, figures=False).result
+    assert result.status == "certified"
+    near = next(i for i, event in enumerate(result.history) if event.violation <= 1e-4)
+    assert all(event.proven < np.inf for event in result.history[near + 1 :])
+    assert near + 1 < len(result.history)
+
+
 @pytest.mark.parametrize(
     ("wall", "uncertain", "feedback", "method", "looks"),
     [

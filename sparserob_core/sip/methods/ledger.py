@@ -423,20 +423,21 @@ def proofs_of(
 def secure_in_time(
     tightening: Tightening, ledger: Ledger, prover: Prover, answer: Answer, found: Found, number: int
 ) -> bool:
-    """Secure a decision when time is due, though that of round ``number`` violates what was ``found``: at certain
-    shares of a limit, and when no more is left of it than that may take; without a limit after some rounds. Whether
-    constraints were imposed."""
+    """Secure a decision when time is due, though that of round ``number`` violates what was ``found``: where there is a
+    limit, as soon as little would pay for that, at certain shares of it, and when no more is left of it than that may
+    take; without a limit after some rounds. Whether constraints were imposed."""
     deadline, began = ledger.tools.deadline, [event.seconds for event in ledger.history]
+    missed, violated = [_peak(family, one) for family, one in _rows(found)], [above(*one) for one in _rows(found)]
     if deadline.left is None:
         due = number >= PATIENT and number & (number - 1) == 0
     else:
-        due = tightening.secured < len(DUE) and deadline.used >= DUE[tightening.secured]
+        near = tightening.secured == 0 and _is_near(tightening, ledger.program, answer, missed)
+        due = near or (tightening.secured < len(DUE) and deadline.used >= DUE[tightening.secured])
         tightening.secured += due
         longest = max(np.diff(began, prepend=0.0), default=0.0)
         due = due or (ledger.proven is None and deadline.left <= RESERVED * longest)
     if not due or _is_secured(ledger):
         return False
-    missed, violated = [_peak(family, one) for family, one in _rows(found)], [above(*one) for one in _rows(found)]
     if not any(rows.size for _, rows, _ in violated):  # it may be proven as it is, and solving takes longer
         ledger.prove(answer, found, prover(answer.solution.x, GLANCE // 4))
         if ledger.proven is not None:
@@ -480,7 +481,8 @@ def _secure(
     """Prove a decision that keeps away from the constraints, so that there is an upper bound while the proof of a
     better one goes on: the optimum of the imposed rows and of those that are ``violated``, all of them tightened by as
     much as `SPARED` of the cost of ``answer`` pays for and by more than what it ``missed``, and again by what that
-    proof leaves open. Nothing is claimed where nothing is that far from the constraints. Whether anything was imposed.
+    proof leaves open. What it missed is kept away from only as long as something is that far away, and what is imposed
+    for it not for ever. Nothing is claimed where nothing keeps away at all. Whether anything was imposed.
     """
     program, margin, imposed = ledger.program, tightening.margin, 0
     for _ in range(SECURED):
@@ -489,10 +491,13 @@ def _secure(
         imposed += fresh
         more = PAID * max((tightening.distance(one) for one in missed), default=0.0)
         margin = max(margin, tightening.margin + (SPARED * cost / price if price > 0.0 else 0.0))
-        margin += more if not fresh or more * price <= DEAR * cost else 0.0
-        if not np.isfinite(PAID * float(margin) * tightening.longest):  # in Python's numbers, which overflow in silence
+        margin += 0.0 if fresh else more
+        more = more if fresh and more * price < DEAR * cost else 0.0
+        if not np.isfinite(PAID * float(margin + more) * tightening.longest):  # in Python's numbers, which overflow
             break
-        farther = tightening.tightened(ledger, answer, margin)
+        farther = tightening.tightened(ledger, answer, margin + more)
+        if farther is None and more:  # nothing is that far away, but what was imposed may do
+            farther = tightening.tightened(ledger, answer, margin)
         if farther is None:
             break
         answer = farther
@@ -511,6 +516,13 @@ def _secure(
         if not missed:
             break
     return imposed > 0
+
+
+def _is_near(tightening: Tightening, program: SemiInfiniteProgram, answer: Answer, missed: Sequence[Missed]) -> bool:
+    """Whether to keep away from the constraints by more than an answer ``missed`` costs no more than what a decision is
+    secured for in any case. A round may take longer than all before it, so such an answer is not let go."""
+    distance = max((tightening.distance(one) for one in missed), default=0.0)
+    return PAID * distance * tightening.priced(answer) <= SPARED * abs(program.cost(answer.solution.x))
 
 
 def _is_secured(ledger: Ledger) -> bool:
