@@ -22,8 +22,9 @@ class Status:
         self.searched: sr.EvaluationsFinished | None = None
         self.proving: sr.ProofProgress | None = None
         self.study: sr.StudyProgress | None = None
-        self.lower, self.upper, self.gap = -math.inf, math.inf, math.inf
+        self.lower, self.upper, self.gap, self.proven = -math.inf, math.inf, math.inf, math.inf
         self.phase = ""
+        self.result: sr.Result | None = None
 
     @property
     def elapsed(self) -> float:
@@ -36,8 +37,8 @@ class Status:
             case sr.RoundFinished():
                 self.round, self.proving, self.study, self.phase = event, None, None, "relax"
                 self.lower = max(self.lower, event.lower_bound)
-                self.upper = min(self.upper, math.inf if event.simplified else event.upper_bound)
-                self.gap = math.inf if event.simplified else event.gap
+                self.upper = min(self.upper, math.inf if event.simplified else event.upper_bound, event.proven)
+                self.gap, self.proven = math.inf if event.simplified else event.gap, event.proven
             case sr.EvaluationsFinished():
                 self.searched, self.proving, self.phase = event, None, "search"
                 self.lower = max(self.lower, event.lower_bound)
@@ -46,15 +47,24 @@ class Status:
             case sr.StudyProgress():
                 self.searched, self.proving, self.study = None, None, event
                 self.phase = event.text.partition(":")[0] if event.phase else ""
+                if event.result is not None:
+                    self._ended(event.result)
+
+    def _ended(self, result: sr.Result) -> None:
+        """Take note of what the method has returned: from now on its bounds are those of the run."""
+        self.result = result
+        self.lower, self.upper, self.gap = result.lower_bound, result.upper_bound, result.gap
+        self.proven = result.upper_bound
 
     def parts(self) -> list[tuple[str, str]]:
         """What is known, as labels and texts of less than 70 characters."""
         parts = [("phase", self.phase)] if self.phase else []
-        parts += [("bounds", _bounds(self.lower, self.upper, self.gap))] if self.round or self.searched else []
+        if self.round or self.searched or self.result:
+            parts.append(("bounds", _bounds(self.lower, self.upper, self.gap, self.proven)))
         if self.round is not None:
             parts += [("round", _round(self.round)), ("", _work(self.round))]
-            if math.isfinite(self.round.proven):
-                parts.append(("proven", f"a control of cost {_number(self.round.proven)}; a better one is sought"))
+            if self.result is None and math.isfinite(self.proven):
+                parts.append(("proven", f"a control of cost {_number(self.proven)}; a better one is sought"))
         if self.searched is not None:
             parts.append(("search", _search(self.searched)))
             notes = _notes(self.searched)
@@ -70,7 +80,7 @@ class Status:
         """One event in one line."""
         match event:
             case sr.RoundFinished():
-                bounds = _bounds(event.lower_bound, event.upper_bound, event.gap)
+                bounds = _bounds(event.lower_bound, event.upper_bound, event.gap, event.proven)
                 proven = f"  proven {_number(event.proven)}" if math.isfinite(event.proven) else ""
                 return f"round {_round(event)}  {bounds}{proven}  {_work(event)}"
             case sr.EvaluationsFinished():
@@ -96,11 +106,12 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def _bounds(lower: float, upper: float, gap: float) -> str:
+def _bounds(lower: float, upper: float, gap: float, proven: float) -> str:
     if not (math.isfinite(lower) and math.isfinite(upper)):
         return f"lower {_number(lower)}  upper {_number(upper)}"
     closing = f"  gap {gap:.1e}" if math.isfinite(gap) else ""
-    return f"lower {_number(lower)}  upper {_number(upper)} (to be proven){closing}"
+    standing = "proven" if proven <= upper else "to be proven"
+    return f"lower {_number(lower)}  upper {_number(upper)} ({standing}){closing}"
 
 
 def _round(event: sr.RoundFinished) -> str:

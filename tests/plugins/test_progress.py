@@ -127,6 +127,33 @@ def test_the_phase_is_named_and_what_is_proven(monkeypatch: pytest.MonkeyPatch) 
     assert status.last(figures) == "figures: the worst cases"
 
 
+def test_the_upper_bound_is_said_to_be_proven_once_it_is() -> None:
+    from sparserob_progress.status import Status
+
+    status = Status("a title")
+    suggested = replace(finished_round(2, gap=0.5), upper_bound=0.5)
+    status.receive(suggested)
+    assert "upper 0.5 (to be proven)" in status.line()
+    status.receive(replace(suggested, proven=0.75))
+    assert "upper 0.5 (to be proven)" in status.line()
+    assert "proven a control of cost 0.75; a better one is sought" in status.line()
+    status.receive(replace(suggested, proven=0.5))
+    assert "upper 0.5 (proven)" in status.line()
+
+
+@pytest.mark.parametrize(("upper", "said"), [(0.75, "upper 0.75 (proven)"), (np.inf, "upper unknown")])
+def test_after_the_method_the_bounds_are_those_of_its_result(upper: float, said: str) -> None:
+    from sparserob_progress.status import Status
+
+    status = Status("a title")
+    status.receive(replace(finished_round(2, proven=0.8), upper_bound=0.5))
+    ended = sr.Result(status="verified", message="", lower_bound=0.25, upper_bound=upper)
+    status.receive(sr.StudyProgress(text="certificate: what the multipliers prove", phase=True, result=ended))
+    assert said in status.line()
+    assert "to be proven" not in status.line()
+    assert "is sought" not in status.line()
+
+
 def test_a_short_run_and_a_quiet_run_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     for stream in (io.StringIO(), Terminal()):
         assert watch(stream, monkeypatch, [started(), ROUND, SEARCH, ENDING]) == ""

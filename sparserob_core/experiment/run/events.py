@@ -72,12 +72,13 @@ class RunFinished(Event):
 class StudyProgress(Event):
     """A study of many programs or trajectories goes on (a margin, a set of initial states, a simulation): in words, and
     as ``done`` of ``total`` steps (0: unknown). ``phase``: a run goes on with what comes after its method, which the
-    words name up to a colon."""
+    words name up to a colon; ``result``: what its method has returned, where the phase begins with it."""
 
     text: str
     done: int = 0
     total: int = 0
     phase: bool = False
+    result: Result | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -181,7 +181,7 @@ def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Noti
     what is known of the time of action, and of causal policies. ``notify`` receives `StudyProgress`, one a phase."""
     if not isinstance(experiment, ControlExperiment):
         return result
-    notify(StudyProgress(text="certificate: what the multipliers prove without rounding", phase=True))
+    notify(StudyProgress(text="certificate: what the multipliers prove without rounding", phase=True, result=result))
     known = bounded(experiment, result) if result.sparsest is None else result
     notify(StudyProgress(text="fewest active: how little any admissible control must act", phase=True))
     known = with_activity(experiment, known, tools).accounted(tools.solver)

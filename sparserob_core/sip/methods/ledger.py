@@ -231,7 +231,7 @@ class Ledger:
         if self.best is None:
             return Result(
                 status="undecided",
-                message=f"{reason}, before there was a decision",
+                message=f"{reason}, before there was a decision; more seconds (limits.seconds) would help",
                 lower_bound=self.lower,
                 counts=self._counts(0),
                 solved_by=dict(self.relaxed.solved_by),
@@ -521,8 +521,10 @@ def _secure(
 def _is_near(tightening: Tightening, program: SemiInfiniteProgram, answer: Answer, missed: Sequence[Missed]) -> bool:
     """Whether to keep away from the constraints by more than an answer ``missed`` costs no more than what a decision is
     secured for in any case. A round may take longer than all before it, so such an answer is not let go."""
-    distance = max((tightening.distance(one) for one in missed), default=0.0)
-    return PAID * distance * tightening.priced(answer) <= SPARED * abs(program.cost(answer.solution.x))
+    distance, price = max((tightening.distance(one) for one in missed), default=0.0), tightening.priced(answer)
+    if distance > 0.0 and not price > 0.0:  # no row has a multiplier, which says nothing of those that are missed
+        return False
+    return PAID * distance * price <= SPARED * abs(program.cost(answer.solution.x))
 
 
 def _is_secured(ledger: Ledger) -> bool:

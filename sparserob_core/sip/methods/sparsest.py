@@ -288,6 +288,7 @@ class _Search:
             cost=self.least / unit,
             decision=self.told.decision if decision is None else decision,
             gap=relative_gap(self.lower, self.least),
+            proven=self.least / unit,
             relaxed_programs=self.relaxed.solves + sum(one.counts["relaxed_programs"] for one in self.spent),
         )
         self.rounds.append(self.told)
@@ -328,6 +329,15 @@ class _Search:
 
         self.tree.grow(lambda: self.least, self.look, go_on)
 
+    def _hindrance(self) -> str:
+        """Why there is no control, though none is excluded, and what would help."""
+        if self.plain is not None:
+            return f"no control was proven: {self.plain.message}"
+        more = "more seconds (limits.seconds)" if self.tools.deadline.passed else "more nodes (method.nodes)"
+        return (
+            f"no control of letters was found, and none is excluded; {more} or letters nearer to one another would help"
+        )
+
     def result(self, started: float) -> Result:
         """What is known, told as a result whose cost is the count."""
         assert self.tree is not None
@@ -340,8 +350,9 @@ class _Search:
             none = self.tree.lower == np.inf
             said = f"no control with values in {list(letters or ())} meets the constraints, by branch and bound"
             return Result(
-                status="infeasible" if none else "failed",
-                message=said if none else "; ".join(part for part in ("no control was found", ending) if part),
+                status="infeasible" if none else "undecided",
+                message=said if none else "; ".join(part for part in (self._hindrance(), ending) if part),
+                stopped="" if none else self.tools.deadline.reason,
                 lower_bound=np.inf if none else self.lower / unit,
                 counts=counts,
                 solved_by=dict(self.relaxed.solved_by),

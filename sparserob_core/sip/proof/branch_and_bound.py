@@ -31,6 +31,7 @@ CLIMBED = (
 FIRST_BATCH, QUICK = 16, 0.25  # cells bounded first, and the seconds that a batch may take, where time is limited
 OFTEN = 1.0  # seconds after which a batch that is not over is told of
 STALLED, ADVANCED = 30.0, 0.99  # a worst bound that has not fallen below this share within so many seconds is stuck
+MORE = "more seconds (limits.seconds) would help"
 ADVICE = "a larger method.tolerance would help, as it keeps decisions farther away, or narrower index sets"
 REST, TINY = 8, 1e-5  # halvings without progress after which a bound below `TINY` of its unit is taken for rounding
 MOVES = 24  # steps of such a climb at most
@@ -81,7 +82,7 @@ def prove_family(
             return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
     except KeyboardInterrupt as error:
         time_left.interrupt(error)
-        return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: its proof had begun only")
+        return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: its proof had begun only; {MORE}")
 
 
 @dataclass(eq=False)
@@ -139,9 +140,7 @@ class Course:
         """What hinders the proof, and what would help: at the worst cell, in the user's units."""
         advice = "" if self.family.hindrance is None else self.family.hindrance(lower, upper)
         if self.deadline.passed:
-            advice = (
-                "there was no time to halve it; more seconds (limits.seconds) would help, or a larger method.tolerance"
-            )
+            advice = f"there was no time to halve it; {MORE}, or a larger method.tolerance"
         known = self.family.index_units
         lower, upper = (lower, upper) if known is None or known.size != lower.size else (lower * known, upper * known)
         allowed = bound * (1.0 if self.family.row_units is None else float(self.family.row_units.max()))

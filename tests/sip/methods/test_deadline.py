@@ -77,6 +77,41 @@ def test_a_decision_away_from_the_constraints_is_proven_where_the_optimum_cannot
     assert result.cost == result.upper_bound == result.decision[0]
 
 
+def hidden_program(upper):
+    """The least ``x >= 1 + 4e-4 t`` for t in [0, 1], at most ``upper``; only t = 0 is seen as long as that is
+    violated."""
+
+    def worst(x):
+        at = np.array([[0.0 if x[0] < 0.9999 else 1.0]])
+        violation = 1.0 + 4e-4 * at[:, 0] - x[0]
+        return sr.Separation(at, np.zeros(1, dtype=int), violation)
+
+    family = sr.ConstraintFamily(
+        name="hidden",
+        index_set=sr.Box([0.0], [1.0]),
+        rows=lambda t: (-np.ones((len(t), 1, 1)), -1.0 - 4e-4 * t),
+        worst=worst,
+        enclosure=lambda x, lower, upper: Enclosure(1.0 + 4e-4 * upper[:, 0] - x[0], np.zeros(len(lower), dtype=int)),
+    )
+    return sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=upper, families=[family])
+
+
+@pytest.mark.parametrize(("upper", "least"), [(9.0, 1.0022), (1.0018, 1.0014)])
+def test_under_a_limit_what_little_would_pay_for_is_proven_at_once(upper, least):
+    """A thousandth away, and twice what was missed where there is room for that."""
+    result = sr.solve(hidden_program(upper), method="exchange", solver="piqp", seconds=600.0)
+    assert result.status == "certified"
+    assert result.cost == pytest.approx(1.0004, abs=1e-6)
+    assert [event.proven for event in result.history][:2] == [np.inf, np.inf]
+    assert result.history[2].proven == pytest.approx(least, abs=2e-5)
+
+
+def test_without_a_limit_nothing_is_proven_before_the_optimum():
+    result = sr.solve(hidden_program(9.0), method="exchange", solver="piqp")
+    assert result.status == "certified"
+    assert all(event.proven == np.inf for event in result.history)
+
+
 def test_an_interrupt_returns_the_decision_that_was_proven_before():
     looked = []
 
