@@ -81,6 +81,11 @@ def in_a_list(config: Config) -> None:
         ]
 
 
+def changing_with_time(config: Config) -> None:
+    for one in systems(config):
+        one["A"][1][1] = "-0.4 - 0.1*sin(t)"
+
+
 FEATURES: dict[str, Callable[[Config], object]] = {
     "pieces of the system": in_turns,
     "parameters": with_parameters,
@@ -104,6 +109,7 @@ FEATURES: dict[str, Callable[[Config], object]] = {
     "integral": in_problem(
         integral=[{"H": [[1, 0]], "G": [[0, 0.1]], "from": 0, "to": 2.5, "lower": [-0.05], "upper": [0.3]}]
     ),
+    "entries in t": changing_with_time,
 }
 SIGNS = {
     ("proven", "verified"): "●",

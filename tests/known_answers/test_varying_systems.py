@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
@@ -108,12 +109,15 @@ def test_a_system_that_is_changed_afterwards_is_found(change: tampering.Change, 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"disturbance": {"box": 0.1}}, "disturbance: expected none where the system changes with time"),
-        ({"disturbance": [{"set": {"box": 0.1}}]}, "disturbance: expected none where the system changes with time"),
+        (
+            {"disturbance": {"box": 0.1}, "disturbance_class": "measurable"},
+            "disturbance_class: expected piecewise_constant where the system changes with time",
+        ),
+        (
+            {"disturbance": [{"set": {"box": 0.1}}, {"set": {"box": 0.1}, "from": 1}]},
+            r"disturbance\.1: expected one that acts all the time",
+        ),
         ({"measurements": {"C": [[1]]}}, "measurements: expected none where the system changes with time"),
-        ({"path": [{"box": 5.0}]}, "path: expected none where the system changes with time"),
-        ({"terminal": [{"box": 0.1}]}, "terminal: expected none where the system changes with time"),
-        ({"initial_state": {"centre": [2.5], "box": 0.1}}, "initial_state: expected none where"),
         ({"cost": {"final": {"Q": [[1]]}}}, r"cost\.final: expected none where"),
         ({"system": {"A": [["t + p"]], "B": [[1]], "parameters": {"p": [0, 1]}}}, r"system\.parameters: expected none"),
         ({"system": {"A": [["t"]], "B": [[1]], "delay": 0.1}}, r"system\.delay: expected none"),
@@ -145,3 +149,86 @@ def test_definitions_serve_uncertain_systems_too(tmp_path: Path) -> None:
     plain = {**problem, "system": {"A": [["-(0.5 + 0.1*p)"]], "B": [[1]], "parameters": {"p": [0, 1]}}}
     costs = [verified(tmp_path / name, one, pieces(8))["cost"] for name, one in (("a", problem), ("b", plain))]
     assert costs[0] == pytest.approx(costs[1], rel=1e-12)
+
+
+UNCERTAIN: dict[str, Any] = {
+    **FADING,
+    "disturbance": {"box": 0.1},
+    "initial_state": {"centre": [2.5], "box": 0.2},
+    "terminal": [{"box": 0.2}],
+}
+
+
+def test_a_fading_plant_ends_in_a_box_whatever_pushes_it(tmp_path: Path) -> None:
+    # (1 + t) x is the integral of (1 + t) (u + w): of 2.5 + 0.2 and at most 0.4 by w, all but 3 * 0.2 has to go
+    assert verified(tmp_path / "run", UNCERTAIN, pieces(20))["cost"] == pytest.approx(1.0, rel=1e-7)
+
+
+def dense(window: tuple[float, float], height: float, count: int = 20, samples: int = 4001) -> float:
+    """The least cost of the fading plant with ``x <= height`` at many times of a window, for every disturbance and
+    initial state of ``UNCERTAIN``: a linear program in closed forms."""
+    breaks, t = np.linspace(0.0, 2.0, count + 1), np.linspace(*window, samples)[:, None]
+    ends = np.minimum(breaks[1:], np.maximum(t, breaks[:-1]))
+    rows = ((1 + ends) ** 2 - (1 + breaks[:-1]) ** 2) / 2 / (1 + t)
+    pushed = (2.7 + 0.1 * ((1 + t[:, 0]) ** 2 - 1) / 2) / (1 + t[:, 0])
+    found = linprog(
+        np.full(2 * count, 2.0 / count), np.hstack([rows, -rows]), height - pushed, bounds=[(0.0, 1.0)] * (2 * count)
+    )
+    return float(found.fun)
+
+
+def test_a_fading_plant_stays_below_a_bound_between_the_breakpoints(tmp_path: Path) -> None:
+    wall = {"polytope": {"H": [[1]], "h": [0.9]}, "from": 0.93, "to": 1.91}
+    config = {**UNCERTAIN, "terminal": [], "path": [wall]}
+    found = verified(tmp_path / "run", config, pieces(20))["cost"]
+    assert found == pytest.approx(dense((0.93, 1.91), 0.9), rel=2e-6)
+
+
+def test_a_curved_set_of_two_fading_plants_is_the_radius_of_one(tmp_path: Path) -> None:
+    # the second state is 0 and stays so
+    config = {
+        **UNCERTAIN,
+        "system": {"A": [["-1/(1 + t)", 0], [0, "-t"]], "B": [[1], [0]], "E": [[1], [0]]},
+        "initial_state": {"centre": [2.5, 0], "box": [0.2, 0]},
+        "terminal": [{"ellipsoid": {"centre": [0, 0], "shape": [[0.04, 0], [0, 1]]}}],
+    }
+    assert verified(tmp_path / "run", config, pieces(20))["cost"] == pytest.approx(1.0, rel=1e-7)
+
+
+def moving(middle: float) -> dict[str, Any]:
+    """A wall that turns at ``middle``, where it is felt."""
+    return {"polytope": {"H": [[1]], "h": [0.5]}, "from": 0.3, "relative_to": [[0, 2.2], [1.03, middle], [2, 0.4]]}
+
+
+@pytest.fixture(scope="module")
+def uncertain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the fading plant with all that may be uncertain, and a set that moves."""
+    directory = tmp_path_factory.mktemp("uncertain") / "run"
+    config = {"problem": {**UNCERTAIN, "path": [moving(0.8)]}, "dictionaries": {"control": pieces(20)}, "observers": []}
+    sr.run(config, out=directory, figures=False)
+    assert check(directory).status == "verified"
+    return directory
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        tampering.problem(disturbance={"box": 0.10001}),
+        tampering.system(E=[["1 + 1e-5*t"]]),
+        tampering.problem(initial_state={"centre": [2.5], "box": 0.20001}),
+        tampering.problem(terminal=[{"box": 0.19999}]),
+        tampering.problem(path=[moving(0.79999)]),
+    ],
+    ids=["disturbance", "E", "initial set", "terminal", "path"],
+)
+def test_an_uncertainty_that_is_changed_afterwards_is_found(
+    change: tampering.Change, uncertain: Path, tmp_path: Path
+) -> None:
+    assert check(tampering.forged(uncertain, tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
+def test_a_terminal_box_that_a_disturbance_fills_is_proven_to_be_unreachable(tmp_path: Path) -> None:
+    config = {**UNCERTAIN, "terminal": [{"box": 0.19}]}  # the width that 0.2 + 0.4 make of it at the end is 0.2
+    sr.run({"problem": config, "dictionaries": {"control": pieces(8)}, "observers": []}, out=tmp_path / "run")
+    found = check(tmp_path / "run")
+    assert found.status == "verified" and {claim.name for claim in found.claims} >= {"infeasibility"}

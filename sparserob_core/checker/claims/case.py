@@ -194,6 +194,11 @@ class Case:
             raise Unchecked("the system does not change with time")
         return VaryingFlow(system, max(self.grid[-1], self.problem.horizon))
 
+    @property
+    def changing(self) -> VaryingFlow | None:
+        """`varying`; ``None`` where the system does not change with time."""
+        return self.varying if isinstance(self.problem.system, VaryingSystem) else None
+
     @cached_property
     def acting(self) -> list[float]:
         """When every piece of the control begins to act; from 0 on."""
@@ -280,7 +285,6 @@ class Case:
     def units(self, window: Window) -> RowUnits:
         """What violations of a constraint are judged by."""
         if window not in self._units:
-            varying = self.varying if isinstance(self.problem.system, VaryingSystem) else None
             self._units[window] = RowUnits(
                 self.problem,
                 self.scene,
@@ -289,7 +293,7 @@ class Case:
                 window.stop,
                 window.reference,
                 self._acting,
-                varying,
+                self.changing,
             )
         return self._units[window]
 
@@ -315,8 +319,7 @@ class Case:
 
     @cached_property
     def duality(self) -> Duality:
-        varying = self.varying if isinstance(self.problem.system, VaryingSystem) else None
-        return Duality(self.problem, self.control, self.changes, varying)
+        return Duality(self.problem, self.control, self.changes, self.changing)
 
 
 def numbers(data: object, name: str) -> Array:

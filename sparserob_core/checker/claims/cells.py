@@ -13,6 +13,7 @@ from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.claims.window import Beside
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.tube import Polynomial, Tube
+from sparserob_core.checker.reach.varying_tube import VaryingTube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.sides import Bounded, Sides
@@ -26,6 +27,7 @@ TIMES = 4
 MOST_BOXES = 8_000  # boxes of parameters and cells of directions
 BLAME = 0.2  # share of the error from which the box of parameters is to blame for it
 
+Reached: TypeAlias = Tube | VaryingTube
 Interval: TypeAlias = tuple[int, float, float]
 """A piece of the grid, and a part of it from one time to another (which may be the same)."""
 
@@ -47,7 +49,7 @@ Work: TypeAlias = tuple[Corners, Sides, list[Interval]]
 
 
 def prove(
-    tubes: Callable[[Corners], Tube],
+    tubes: Callable[[Corners], Reached],
     parameters: Parameters,
     work: Sequence[Work],
     clock: Clock,
@@ -86,7 +88,7 @@ def prove(
 class Place:
     """One box of parameters."""
 
-    tube: Tube
+    tube: Reached
     parameters: Parameters
     box: Corners
     clock: Clock
@@ -195,7 +197,7 @@ def _batch(
         yield interval, found, tops[number * len(rows) : (number + 1) * len(rows)].tolist()
 
 
-def _tops(tube: Tube, flat: Sequence[tuple[Polynomial, float]]) -> Array:
+def _tops(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
     """Upper bounds of polynomials less what they may reach; sharp only where they are positive."""
     tops, monomials = np.empty(len(flat)), tube.flow.monomials
     for orders in {poly.coefficients.shape[0] for poly, _ in flat}:
@@ -243,7 +245,7 @@ def _to_blame(poly: Polynomial, top: float, interval: Interval) -> bool:
     return bool(np.abs(poly.coefficients[0, 1:]).sum() > np.abs(poly.coefficients[1:]).sum())
 
 
-def _influence(tube: Tube, poly: Polynomial) -> Array:
+def _influence(tube: Reached, poly: Polynomial) -> Array:
     """How much each parameter has to do with what is left open: by the coefficients of the system where the expansion
     is to blame, else by those of the polynomial."""
     expansion = poly.expansion > BLAME * poly.error

@@ -19,21 +19,20 @@ from sparserob_core.checker.claims.cells import Interval, Work, prove
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.flow import flows, stacked
+from sparserob_core.checker.reach.flow import flows
 from sparserob_core.checker.reach.tube import Tube
-from sparserob_core.checker.reach.varying import VaryingFlow
+from sparserob_core.checker.reach.varying_tube import VaryingTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.control.problem.names import joined, measured_in
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from flint import arb, arb_mat
+    from flint import arb
 
 DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of the expansion in the parameters, by their number; 2 beyond
 TUBES_KEPT = 8
@@ -140,7 +139,8 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
     those with the same parameters and directions together, their times cut wherever anything turns or jumps."""
     nu, units = case.problem.system.parameter_count, case.units(window)
     basis, gains, flat = _facets(window, units)
-    cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist())})
+    ends = [] if case.changing is None else case.changing.ends[:-1]
+    cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist()), *ends})
     grid, every = np.array(case.grid), np.array(cuts)
     curved = None if flat is not None else Curved(window.seen, normals, units.sums)
     pairs = case.clock.each(zip(lower, upper, strict=True))
@@ -178,7 +178,10 @@ def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
     return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), parts, strict=True)]
 
 
-def _tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Corners], Tube]:
+def _tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Corners], Tube | VaryingTube]:
+    if case.changing is not None:
+        known_tube = VaryingTube(case.changing, case.scene, basis)
+        return lambda _: known_tube
     nu = case.problem.system.parameter_count
     widened = nu and not _parameters(case).is_box
     extra = WIDER * (upper[:, 1 : 1 + nu].max(axis=0) - lower[:, 1 : 1 + nu].min(axis=0)) if widened else np.zeros(nu)
@@ -205,13 +208,12 @@ def equalities(case: Case) -> str:
     """Show that the fixed states are met at every parameter and disturbance; a sentence with the figures."""
     middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
-    varying = case.varying if isinstance(case.problem.system, VaryingSystem) else None
-    if varying is not None:
-        last = _last(case, varying)
+    if case.changing is not None:
+        last = VaryingTube(case.changing, scene, np.eye(d)).nodes[-1]
     else:
         last = Tube(flows(case.problem.system, middle), scene, np.eye(d)).nodes[-1].parts[0]
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
-    sums = RowUnits(case.problem, scene, everything, horizon, horizon, varying=varying).sums
+    sums = RowUnits(case.problem, scene, everything, horizon, horizon, varying=case.changing).sums
     worst = 0.0
     for state, value in case.equalities:
         if _reached(case, state):
@@ -231,23 +233,16 @@ def of_fixed(case: Case) -> str:
     return joined(units[state] if units else "" for state, _ in case.equalities)
 
 
-def _last(case: Case, flow: VaryingFlow) -> arb_mat:
-    """The state at the end, ``(d, 1)``, of a system that changes with time."""
-    weights, scene = flow.weights(case.grid), case.scene
-    parts = [weights.free * stacked([[v] for v in balls(scene.initial_state)])]
-    parts += [part * u for part, u in zip(weights.control, scene.control, strict=True)]
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
-
-
 def _reached(case: Case, state: int) -> bool:
     """Whether an uncertain entry, a disturbance or the choice of an initial state may reach a state: follow the entries
     of ``A`` that are not 0 at every parameter."""
     system = case.problem.system
     wide = _hull(case)
-    every = [expanded(mode, Monomials(len(wide), 1), wide, [1.0] * len(wide)) for mode in system.modes]
+    every = (
+        [case.changing.links]
+        if case.changing is not None
+        else [expanded(mode, Monomials(len(wide), 1), wide, [1.0] * len(wide)) for mode in system.modes]
+    )
     d, reaching = system.states, {state}
     for _ in range(d):
         reaching |= {j for i in reaching for j in range(d) if any(not one["A"][0][i, j].is_zero() for one in every)}

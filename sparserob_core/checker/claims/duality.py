@@ -8,7 +8,7 @@ the controls' set alone, piece by piece. With ``J`` left out, a positive number 
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -88,7 +88,7 @@ class Duality:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
         it."""
         if self.varying is not None:
-            return self._varying_row(self.varying, direction, time, limit)
+            return self._varying_row(self.varying, direction, time, limit, disturbed)
         every, delay = flows(self.problem.system, parameter), self.problem.system.delay
         parts = every[0].parts
         d, m, columns = parts["A"][0].nrows(), self.problem.system.controls, parts["B"][0].ncols()
@@ -113,18 +113,29 @@ class Duality:
                     constant = constant + known(self.problem.disturbance).support(weights)
         return Row(constant, slope)
 
-    def _varying_row(self, flow: VaryingFlow, direction: Array, time: float, limit: arb) -> Row:
-        """`row` of a system that changes with time, which is known, and undisturbed."""
-        m = self.problem.system.controls
-        breaks = [float(s) for s in self.control.breakpoints[:-1]]
-        weights = flow.weights([*(s for s in breaks if s < time), time])
-        row, start = stacked([[_exact(c) for c in direction]]), np.asarray(self.problem.initial_state)
+    def _varying_row(self, flow: VaryingFlow, direction: Array, time: float, limit: arb, disturbed: bool) -> Row:
+        """`row` of a system that changes with time, which is known."""
+        m, problem = self.problem.system.controls, self.problem
+        breaks, jumps = [float(s) for s in self.control.breakpoints[:-1]], self.changes or []
+        begins = sorted({0.0, *(s for s in (*breaks, *jumps) if s < time)})
+        weights = flow.weights([*begins, time])
+        row, start = stacked([[_exact(c) for c in direction]]), np.asarray(problem.initial_state)
         free = (row * weights.free).entries()
         constant = sum((w * _exact(x) for w, x in zip(free, start, strict=True)), _exact(0.0)) - limit
         slope = [[_exact(0.0)] * m for _ in range(self.control.pieces)]
-        for k, part in enumerate(weights.control):
-            every = (row * part).entries()
-            slope[k], constant = every[:m], sum(every[m:], constant)  # a drift, whose input is 1
+        pushes = [[_exact(0.0)] * problem.system.disturbances for _ in jumps]
+        for begin, part, pushed in zip(begins, weights.control, weights.disturbance, strict=True):
+            every, k = (row * part).entries(), bisect_right(breaks, begin) - 1
+            slope[k] = [a + b for a, b in zip(slope[k], every[:m], strict=True)]
+            constant = sum(every[m:], constant)  # a drift, whose input is 1
+            if jumps:
+                block = bisect_right(jumps, begin) - 1
+                pushes[block] = [a + b for a, b in zip(pushes[block], (row * pushed).entries(), strict=True)]
+        if disturbed and problem.initial_set is not None:
+            constant = constant + known(problem.initial_set).support(free)
+        if disturbed and problem.disturbance is not None:
+            for one in pushes:
+                constant = constant + known(problem.disturbance).support(one)
         return Row(constant, slope)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:

@@ -14,12 +14,13 @@ from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import flows, held, stacked
 from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.reach.varying import VaryingFlow
+from sparserob_core.checker.reach.varying_tube import VaryingTube
 from sparserob_core.checker.sets.known import known
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb
+    from flint import arb, arb_mat
 
 
 def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
@@ -27,8 +28,8 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     (``None``: no disturbance), from the centre of the initial states and a ``deviation (d,)`` in their set."""
     from flint import arb, arb_mat
 
-    if isinstance(case.problem.system, VaryingSystem):
-        raise Unchecked("trajectories of a system that changes with time are not replayed")
+    if case.changing is not None:
+        return _changed(case, case.changing, time, signal, deviation)
     every = [flow.parts for flow in flows(case.problem.system, parameter.tolist())]
     wanted = case.problem.disturbance is not None
     w = _admissible(case, signal) if wanted else None
@@ -36,10 +37,7 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
         stacked([left + right for left, right in zip(parts["B"][0].tolist(), parts["E"][0].tolist(), strict=True)])
         for parts in every
     ]
-    begin = balls(np.asarray(case.problem.initial_state))
-    if case.problem.initial_set is not None:
-        begin = [v + off for v, off in zip(begin, balls(_begun(case, deviation)), strict=True)]
-    x = stacked([[v] for v in begin])
+    x = _start(case, deviation)
     for k, start in enumerate(case.grid[:-1]):
         if start >= time:
             break
@@ -49,6 +47,27 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
         x = Phi * x + Gamma * arb_mat([[v] for v in case.scene.control[k].entries() + pushed])
     state: list[arb] = x.entries()
     return state
+
+
+def _changed(case: Case, flow: VaryingFlow, time: float, signal: object, deviation: object) -> list[arb]:
+    """`reached` of a system that changes with time."""
+    w = _admissible(case, signal) if case.problem.disturbance is not None else None
+    weights = flow.weights([0.0, *(t for t in case.grid[1:-1] if t < time), time])
+    x = weights.free * _start(case, deviation)
+    for k, (acts, pushes) in enumerate(zip(weights.control, weights.disturbance, strict=True)):
+        x = x + acts * case.scene.control[k]
+        if w is not None:
+            x = x + pushes * stacked([[v] for v in balls(w[:, k])])
+    state: list[arb] = x.entries()
+    return state
+
+
+def _start(case: Case, deviation: object) -> arb_mat:
+    """The initial state ``(d, 1)`` that a deviation leads to."""
+    begin = balls(np.asarray(case.problem.initial_state))
+    if case.problem.initial_set is not None:
+        begin = [v + off for v, off in zip(begin, balls(_begun(case, deviation)), strict=True)]
+    return stacked([[v] for v in begin])
 
 
 def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None) -> tuple[list[float], float]:
@@ -71,7 +90,11 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         raise Unchecked("the worst direction of a curved set is not told")
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
-    tube = Tube(flows(case.problem.system, parameter.tolist()), scene, basis)
+    tube = (
+        Tube(flows(case.problem.system, parameter.tolist()), scene, basis)
+        if case.changing is None
+        else VaryingTube(case.changing, scene, basis)
+    )
     piece = min(bisect_right(case.grid, time) - 1, len(case.grid) - 2 if time < case.grid[-1] else len(case.grid) - 1)
     polynomials, beside = tube.cells(piece, time, time, z), case.beside(window, basis, gains)
     breaks: list[int | None] = [None]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.bernstein import bernstein
+from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.reach.flow import Flow, in_time, stacked, up_to
 from sparserob_core.checker.sets.known import known
@@ -180,13 +181,14 @@ class DisturbanceSupports:
                 return found
         if self._latest is None or self._latest[0] != (start, ticks):
             self._latest = ((start, ticks), *self.every(start, ticks))
-        return self._bounded(shape, *self._latest[1:], z, sharp)
+        return bounded(shape, self.flow.monomials, *self._latest[1:], z, sharp)
 
     def begun(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array, Array]:
         """`bounds` of what the worst initial state adds to that of the centre: the support function of the set of
         deviations at the rows themselves."""
         assert self.scene.initial_set is not None
-        return self._bounded(known(self.scene.initial_set), *self.initial(start, ticks), z, sharp)
+        bound = known(self.scene.initial_set)
+        return bounded(bound, self.flow.monomials, *self.initial(start, ticks), z, sharp)
 
     def initial(self, start: float, ticks: int) -> tuple[Array, Array]:
         """The rows on the deviation of the initial state, ``(1, J + 1, M, d, b)``, with errors of the same shape."""
@@ -255,30 +257,6 @@ class DisturbanceSupports:
         assert self.before is not None
         mid, rad = self.before.every(self._begins, 0)
         return Enclosed(*(np.moveaxis(part[:, 0], 3, 2) for part in (mid, rad)))
-
-    def _bounded(
-        self, shape: Shape, every: Array, errors: Array, z: Array, sharp: bool
-    ) -> tuple[Array, Array, Array, Array]:
-        """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at
-        most ``errors``, for combinations ``z (k, b)`` of them: as in `bounds`."""
-        pieces = every.shape[0]
-        mid, w, lost, error, kinks, share = _linear(shape, every, errors, z, pieces)
-        k, mw = mid.shape[0], mid.shape[-1]
-        if not sharp or shape.round is None:
-            moved = np.einsum("ilw,iljkw->ijk", w, mid)
-            return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
-        # of every piece the better of this linear bound and of a polynomial above the length of L'f
-        m, L = shape.round
-        parts = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
-        above, off, over = (part.reshape(k, pieces, *part.shape[1:]) for part in lengths(self.flow.monomials, parts))
-        spare = (lost + rounding(mw) * np.abs(mid).sum(axis=(2, 3))) @ np.abs(L)
-        off = off + np.linalg.norm(spare, axis=2) + lost @ np.abs(m)
-        off = (off + rounding(pieces) * np.abs(above).sum(axis=(2, 3))) * OUTWARD
-        better = off < error
-        linear = np.einsum("ilw,iljkw->iljk", w, mid)
-        moved = np.where(better[:, :, None, None], above + mid @ m, linear).sum(axis=1)
-        error, kinks = np.where(better, off, error), np.where(better, over, kinks)
-        return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
 
     def _weights(self, start: float, ticks: int) -> tuple[Array, Array]:
         """What every piece of the disturbance before the cell adds per unit, ``(pieces, J + 1, M, mw, b)``, with errors
@@ -463,6 +441,31 @@ class DisturbanceSupports:
         size, d = self.flow.rows.parts[0].nrows(), self.basis.shape[1]
         columns = [[arb(float(c[i])) if i < d else arb(0) for c in self.basis] for i in range(size)]
         return Series.constant(self.flow.monomials, stacked(columns))
+
+
+def bounded(
+    shape: Shape, monomials: Monomials, every: Array, errors: Array, z: Array, sharp: bool
+) -> tuple[Array, Array, Array, Array]:
+    """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at
+    most ``errors``, for combinations ``z (k, b)`` of them: as in `DisturbanceSupports.bounds`."""
+    pieces = every.shape[0]
+    mid, w, lost, error, kinks, share = _linear(shape, every, errors, z, pieces)
+    k, mw = mid.shape[0], mid.shape[-1]
+    if not sharp or shape.round is None:
+        moved = np.einsum("ilw,iljkw->ijk", w, mid)
+        return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
+    # of every piece the better of this linear bound and of a polynomial above the length of L'f
+    m, L = shape.round
+    parts = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
+    above, off, over = (part.reshape(k, pieces, *part.shape[1:]) for part in lengths(monomials, parts))
+    spare = (lost + rounding(mw) * np.abs(mid).sum(axis=(2, 3))) @ np.abs(L)
+    off = off + np.linalg.norm(spare, axis=2) + lost @ np.abs(m)
+    off = (off + rounding(pieces) * np.abs(above).sum(axis=(2, 3))) * OUTWARD
+    better = off < error
+    linear = np.einsum("ilw,iljkw->iljk", w, mid)
+    moved = np.where(better[:, :, None, None], above + mid @ m, linear).sum(axis=1)
+    error, kinks = np.where(better, off, error), np.where(better, over, kinks)
+    return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
 
 
 def _linear(

@@ -185,12 +185,69 @@ class VaryingFlow:
 
     def _within(self, segment: Segment, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         """``Y(1)`` of ``Y' = h A Y + [0, h B, h E]`` in the share of the interval, ``Y(0) = [I, 0, 0]``."""
+        terms, rest = self._series(segment, start, stop)
+        total = terms[0]
+        for term in terms[1:]:
+            total = total + term
+        table = (total + rest).tolist()
+        d = self.system.states
+        return stacked([row[:d] for row in table]), stacked([row[d:] for row in table])
+
+    def within(self, start: float, stop: float, order: int) -> tuple[list[arb_mat], arb_mat]:
+        """What an interval within one segment makes of states and of inputs that stay the same, ``(d, d + m + mw)``:
+        coefficients of powers of the share of the interval, up to ``order``, and balls that hold the rest."""
+        if not 0.0 <= start <= stop <= self.until:
+            raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
+        begins = [one.start for one in self.segments]
+        number = max(0, bisect_right(begins, start) - 1)
+        if stop > self.segments[number].stop:
+            raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
+        terms, rest = self._series(self.segments[number], start, stop)
+        for term in terms[order + 1 :]:
+            rest = rest + stacked([[_wider(zero, abs(x)) for zero, x in zip(*pair, strict=True)] for pair in
+                                   zip((term * 0).tolist(), term.tolist(), strict=True)])  # fmt: skip
+        return terms[: order + 1], rest
+
+    @cached_property
+    def ends(self) -> list[float]:
+        """Where the segments end."""
+        return [one.stop for one in self.segments]
+
+    @cached_property
+    def links(self) -> dict[str, list[arb_mat]]:
+        """Which entries of ``A``, ``B`` and ``E`` are other than 0 at any time: 1 for those."""
+        d, m = self.system.states, self.system.controls + (self.system.c is not None)
+        table = [
+            [int(any(not entry.is_zero() for entry in found)) for found in zip(*rows, strict=True)]
+            for rows in zip(*self._tables, strict=True)
+        ]
+        from flint import arb
+
+        parts = {"A": slice(0, d), "B": slice(d, d + m), "E": slice(d + m, None)}
+        return {name: [stacked([[arb(x) for x in row[part]] for row in table])] for name, part in parts.items()}
+
+    @property
+    def _tables(self) -> list[list[list[arb]]]:
+        """What the entries of ``[A B E]`` are at most, segment by segment."""
+        from flint import arb
+
+        return [
+            [
+                [sum(map(abs, entry.coeffs()), arb(0)) + abs(left) for entry, left in zip(*rows, strict=True)]
+                for rows in zip(one.law, one.left, strict=True)
+            ]
+            for one in self.segments
+        ]
+
+    def _series(self, segment: Segment, start: float, stop: float) -> tuple[list[arb_mat], arb_mat]:
+        """The terms of the solution of ``Y' = h A Y + [0, h B, h E]``, ``Y(0) = [I, 0, 0]``, in powers of the share of
+        the interval, and balls around 0 that hold the rest."""
         from flint import arb, arb_mat, arb_poly
 
         d, h = self.system.states, arb(stop) - arb(start)
         shifted = arb_poly([arb(start) - arb(segment.centre), h])
         table = [[(entry(shifted) * h).coeffs() for entry in row] for row in segment.law]
-        order = max(len(entry) for row in table for entry in row)
+        order = max(1, *(len(entry) for row in table for entry in row))  # none in no time, or where all is 0
         columns, none = len(table[0]), arb(0)
         A, driven = [], []
         for k in range(order):
@@ -199,7 +256,7 @@ class VaryingFlow:
             driven.append(arb_mat([[none] * d + row[d:] for row in rows]))
         first = [[arb(int(i == j)) for j in range(columns)] for i in range(d)]
         terms = [arb_mat(first)]
-        total, tails = terms[0], _Tails(self._norms(table))
+        tails = _Tails(self._norms(table))
         count = next((one for one in TERMS if tails.of(one, None) <= arb(SHARP)), TERMS[-1])
         for n in range(count):
             nexts = A[0] * terms[n]
@@ -208,8 +265,7 @@ class VaryingFlow:
             if n < order:
                 nexts = nexts + driven[n]
             terms.append(nexts / (n + 1))
-            total = total + terms[-1]
-        return self._widened(total.tolist(), segment, table, h, tails, count)
+        return terms, self._left_out([[none] * columns for _ in range(d)], segment, table, h, tails, count)
 
     def _norms(self, table: list[list[list[arb]]]) -> list[arb]:
         """The norms of largest row sums, in own units, of the coefficients of ``A``."""
@@ -225,7 +281,7 @@ class VaryingFlow:
             found.append(upper(_largest(sums)))
         return found
 
-    def _widened(
+    def _left_out(
         self,
         total: list[list[arb]],
         segment: Segment,
@@ -233,7 +289,7 @@ class VaryingFlow:
         h: arb,
         tails: _Tails,
         count: int,
-    ) -> tuple[arb_mat, arb_mat]:
+    ) -> arb_mat:
         """The sum of a series with what it leaves out: its tail by Cauchy's bound on circles, for the coefficients are
         at most those of ``y' = a(s) y + b(s)`` with the norms ``a_k`` and ``b_k``; and what stands before the next
         power of the time, by the formula of variation of constants."""
@@ -248,8 +304,7 @@ class VaryingFlow:
         spread = (a + r).exp() * a.exp()
 
         state = tails.of(count, None) + r * spread
-        Phi = [[_wider(total[i][j], state * u[i] / u[j]) for j in range(d)] for i in range(d)]
-        columns = []
+        columns = [[_wider(total[i][j], state * u[i] / u[j]) for i in range(d)] for j in range(d)]
         for j in range(d, len(table[0])):
             forced = [
                 _largest([upper(abs(row[j][k])) / u[i] if k < len(row[j]) else arb(0) for i, row in enumerate(table)])
@@ -258,7 +313,7 @@ class VaryingFlow:
             missing = _largest([row[j] / u[i] for i, row in enumerate(rest)])
             error = tails.of(count, forced) + spread * (r * sum(forced, arb(0)) + missing)
             columns.append([_wider(total[i][j], error * u[i]) for i in range(d)])
-        return stacked(Phi), stacked([list(row) for row in zip(*columns, strict=True)])
+        return stacked([list(row) for row in zip(*columns, strict=True)])
 
     def weights(self, grid: Sequence[float]) -> Weights:
         """What the state at the end of a grid, which begins at 0, is made of."""
@@ -321,6 +376,19 @@ def _products(steps: Sequence[arb_mat]) -> list[arb_mat]:
         else:
             found.append(coarse[place + 1] * steps[k])
     return found
+
+
+def prefixes(steps: Sequence[arb_mat]) -> list[arb_mat]:
+    """``Phi_k ... Phi_1`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``, as `_products`."""
+    from flint import arb_mat
+
+    d = steps[0].nrows()
+    unit = arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
+    if len(steps) == 1:
+        return [unit, steps[0]]
+    pairs = [second * first for first, second in zip(steps[:-1:2], steps[1::2], strict=False)]
+    coarse = prefixes([*pairs, *([steps[-1]] if len(steps) % 2 else [])])
+    return [coarse[k // 2] if k % 2 == 0 else steps[k - 1] * coarse[k // 2] for k in range(len(steps))] + [coarse[-1]]
 
 
 def _wider(ball: arb, radius: arb) -> arb:

@@ -23,8 +23,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.combination import Combination, combination
 from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
-from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.lifted import LiftedSystem
+from sparserob_core.control.response.functional import Leg, WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Moving, Reference
 from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit
@@ -258,7 +257,7 @@ class CurvedConstraint(StateConstraint):
             cuts = self.parameters.cuts(low[:nu], high[:nu])
             moving = None if self.reference is None else Moving(self.reference, H)
 
-            def cell(leg: LiftedSystem) -> CellEnclosure:
+            def cell(leg: Leg) -> CellEnclosure:
                 sigma = self.functionals.support_over(leg, H, joined)
                 return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, cuts, moving)
 
@@ -285,7 +284,7 @@ class CurvedConstraint(StateConstraint):
         ]
         return rhs, np.concatenate([np.zeros(nu), np.maximum(*ends)])
 
-    def _combination(self, lifted: LiftedSystem, free: int) -> Combination:
+    def _combination(self, lifted: Leg, free: int) -> Combination:
         if free not in self._combinations:
             self._combinations[free] = combination(lifted.space, free)
         return self._combinations[free]

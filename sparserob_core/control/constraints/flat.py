@@ -24,9 +24,8 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.problem import MixedConstraint
 from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
-from sparserob_core.control.response.functional import LEGS_KEPT, WorstCase
+from sparserob_core.control.response.functional import LEGS_KEPT, Leg, WorstCase
 from sparserob_core.control.response.initial_support import Supports
-from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Direct, Moving, Reference
 from sparserob_core.control.response.response import LONG, Outputs, Response, distinct_times
@@ -84,10 +83,11 @@ class Samples:
 
     @cached_property
     def cuts(self) -> Array:
-        """Times inside the window at which anything turns or jumps: breakpoints of the grid, kinks of a reference, and
-        where the commanded control of a mixed constraint changes."""
+        """Times inside the window at which anything turns or jumps: breakpoints of the grid, kinks of a reference,
+        where the commanded control of a mixed constraint changes, and where a system that changes with time is another
+        polynomial of it."""
         start, stop = self.window
-        found = [self._response.grid.breakpoints]
+        found = [self._response.propagator.marks]
         found += [] if self.reference is None else [self.reference.times]
         found += [] if self.gains is None else [self.functionals.dictionary.breakpoints]
         every = np.concatenate(found)
@@ -143,7 +143,7 @@ class Samples:
 
     @shaped
     def support_over(
-        self, legs: Sequence[LiftedSystem], low: Float[Array, " nu"], high: Float[Array, " nu"]
+        self, legs: Sequence[Leg], low: Float[Array, " nu"], high: Float[Array, " nu"]
     ) -> list[Supports | None]:
         """What the uncertainty adds over a cell of parameters, for every leg; remembered."""
         key = low.tobytes() + high.tobytes()

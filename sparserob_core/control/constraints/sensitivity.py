@@ -16,6 +16,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.functional import CHUNK
 from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.control.response.sensitivity_system import tangent
+from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.relaxed.index_gradient import differences
 
@@ -145,6 +146,8 @@ class Sensitivity:
             signals = model.worst(self._entered(weights, at))
         force = at.force(self.constraint.functionals.on_grid(x), signals)
         in_time, in_parameters, states = at.in_time(force), at.in_parameters(force), at.states(force)
+        if self._response.propagator.expansion is not None:
+            in_time = self._changing(self._response.propagator.expansion, times[:, 0], at, x, signals)
         if closed:
             sigma = self._sigma_slopes(times[:, 0], parameters, at)
             in_time, in_parameters, states = in_time + sigma[0], in_parameters + sigma[1], states + sigma[2]
@@ -189,6 +192,8 @@ class Sensitivity:
         """The weights of ``c'A x(t)``: those of ``c'x(t)`` times ``A``, which commutes with ``e^{As}``; of a system
         that changes those of the direction ``A'c``, with the ``A`` of the time of the index."""
         response, mode = self._response, self._response.grid.mode
+        if response.grid.varying:  # whose derivative in time is made otherwise
+            return np.zeros(known[0][:, 0, 0].shape), np.zeros(known[1][:, 0, :, 0].shape)
         every = [one.matrices(parameters)[0] for one in response.system.modes]
         if mode is None:
             along, gains, shares = known
@@ -196,6 +201,19 @@ class Sensitivity:
             return (free[:, None] @ every[0])[:, 0], driven @ every[0]
         A = np.stack(every, axis=1)[np.arange(times.size), mode[pieces]]
         return response.adjoint(times, (c[:, None] @ A)[:, 0], parameters)[:2]
+
+    def _changing(self, expansion: Expansion, times: Array, at: Functional, x: Array, signals: Array | None) -> Array:
+        """`Functional.in_time` of a system that changes with time, ``c'(A(t) x(t) + B(t) u + E(t) w)``."""
+        A, inputs = expansion.at(times)
+        along, pushes = (at.direction[:, None] @ A)[:, 0], (at.direction[:, None] @ inputs)[:, 0]
+        known = self._response.weights(times, along, np.zeros((times.size, 0)))
+        control = self.constraint.functionals.on_grid(x)
+        acting = control[:, at.now].T
+        found = (known.free * at.start).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)
+        if signals is not None:
+            found = found + np.einsum("klw,kwl->k", known.disturbance, signals)
+            acting = np.hstack([acting, signals[np.arange(times.size), :, at.now]])
+        return np.asarray(found + (pushes[:, : acting.shape[1]] * acting).sum(axis=1))[:, None]
 
     def _pieces(self, times: Array) -> np.ndarray:
         """The pieces on which the times are approached: from the left, but from the right at the start of the

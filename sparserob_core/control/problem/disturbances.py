@@ -17,7 +17,7 @@ from typing import Literal, TypeAlias, final, get_args
 import numpy as np
 
 from sparserob_core.control.problem.expression import Entries, beside
-from sparserob_core.control.problem.system import LinearSystem, Matrix, SwitchedSystem, System
+from sparserob_core.control.problem.system import LinearSystem, Matrix, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import product
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import ConvexSet
@@ -54,6 +54,8 @@ class Disturbance:
 def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tuple[System, ConvexSet, DisturbanceClass]:
     """The system under all of these disturbances side by side until the ``horizon``, the set of them together, and
     their class; raises `InputError` that begins with ``disturbance`` and the number of the one at fault."""
+    if isinstance(system, VaryingSystem):
+        return _joined_in_time(system, every, horizon)
     kind = every[0].kind
     for i, one in enumerate(every):
         if one.kind not in get_args(DisturbanceClass):
@@ -94,6 +96,18 @@ def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tupl
         product(sets),
         kind,
     )
+
+
+def _joined_in_time(
+    system: VaryingSystem, every: Sequence[Disturbance], horizon: float
+) -> tuple[VaryingSystem, ConvexSet, DisturbanceClass]:
+    """`joined` of a system that changes with time: that of its law."""
+    law, bound, kind = joined(system.law, every, horizon)
+    if not isinstance(law, LinearSystem):
+        place = next(i for i, one in enumerate(every) if one.start > 0.0 or one.stop not in (None, horizon))
+        expected = "one that acts all the time where the system changes with time"
+        raise InputError(path=f"disturbance.{place}", expected=expected, got="one in a window")
+    return VaryingSystem(law, system.horizon), bound, kind
 
 
 def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:

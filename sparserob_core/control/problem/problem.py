@@ -200,10 +200,11 @@ class OptimalControlProblem:
             self._check_pieces(self.system)
         self._join_disturbances()
         measurable = self.disturbance is not None and self.disturbance_class == "measurable"
-        if measurable and isinstance(self.system, SwitchedSystem):
+        if measurable and isinstance(self.system, SwitchedSystem | VaryingSystem):
+            which = "has pieces" if isinstance(self.system, SwitchedSystem) else "changes with time"
             raise InputError(
                 path="disturbance_class",
-                expected="piecewise_constant where the system has pieces, of which measurable ones are not proven",
+                expected=f"piecewise_constant where the system {which}, of which measurable ones are not proven",
                 got="measurable",
             )
         self._set("initial_state", self._state())
@@ -258,12 +259,8 @@ class OptimalControlProblem:
             )
         quadratic = [name for name, term in zip(("state", "control", "final"), self.cost.terms, strict=True) if term]
         refused: dict[str, object] = {
-            "disturbance": self.disturbance,
-            "initial_state": self.initial_set,
             "measurements": self.measurements,
-            "path": self.path,
             "integral": self.integral,
-            "terminal": [end for end in self.terminal if not isinstance(end, Equality)],
             "cost." + (quadratic or ["state"])[0]: quadratic,
         }
         for key, given in refused.items():
@@ -357,8 +354,6 @@ class OptimalControlProblem:
             raise InputError(path="disturbance", expected="a list of Disturbance", got=f"{type(every).__name__}")
         if not every:
             return
-        if isinstance(self.system, VaryingSystem):
-            raise _unproven("disturbance")
         if self.disturbance is not None or self.disturbance_class not in ("piecewise_constant", every[0].kind):
             raise InputError(
                 path="disturbance_class" if self.disturbance is None else "disturbance",
@@ -541,8 +536,7 @@ class ProblemFactory(ABC):
 def _unproven(key: str) -> InputError:
     return InputError(
         path=key,
-        expected="none where the system changes with time, of which fixed final states, bounds and steps of the control"
-        " and its L1 cost are proven so far",
+        expected="none where the system changes with time, of which it is not proven yet",
         got="one",
     )
 

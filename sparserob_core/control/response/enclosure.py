@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -23,13 +23,12 @@ from sparserob_core.control.enclosures.polynomial import distinct_patterns, face
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.response.initial_support import Supports
-from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.reference import Direct, Moving
+from sparserob_core.control.response.response import TimeGrid
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Enclosure
 
-LONG_STEP = 1.0  # in norm times duration: longer steps are taken by matrix exponentials
 WILD = 1e3  # times the numbers of a constraint, a distance from the chord that no halving of a short time explains
 SMALL_SHARE = 1e-6  # so that no coordinate is ever entirely blameless
 CELLS_KEPT, CELLS_SIZE = 256, 2_000_000  # enclosures that are kept, and numbers in their decisions
@@ -38,7 +37,57 @@ TIME_FIRST = (
 )
 TINY = 1e-4  # of a cell of parameters: a cell on which a system that can be enclosed at all will be
 FEW_CELLS = 64  # of which only neighbours are asked whether they share an end
-TAYLOR_TERMS = 1e-17  # relative size below which further terms of the exponential series are left out
+
+
+class Motion(Protocol):
+    """A system over a cell of parameters, as bounds over cells of time see it: the Taylor models of a state in
+    coordinates ``z`` with ``x = T z``, ``transform`` ``T (d, d)``, whose blocks begin at ``starts (q,)``, on a
+    ``grid`` between whose breakpoints nothing jumps."""
+
+    @property
+    def grid(self) -> TimeGrid:
+        """The pieces, in times from where the leg begins."""
+
+    @property
+    def space(self) -> TaylorSpace:
+        """The polynomials in the parameters, ``M`` coefficients."""
+
+    @property
+    def transform(self) -> Array:
+        """``T (d, d)``."""
+
+    @property
+    def starts(self) -> np.ndarray:
+        """Where the blocks of the coordinates begin, ``(q,)``."""
+
+    @property
+    def states(self) -> int:
+        """``d``."""
+
+    @property
+    def norm(self) -> float:
+        """About how fast it moves: cells of a time shorter than its reciprocal are short."""
+
+    @property
+    def influence(self) -> Array:
+        """How much every parameter has to do with what is left out, ``(nu,)``; it only guides the halving."""
+
+    def nodes(self, control: Array) -> Array:
+        """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
+
+    def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
+        """The coefficients ``(k, M, d)`` at times ``within (k,)`` the ``pieces (k,)``, from those at their beginning,
+        ``begun (k, M, d)``, under ``inputs (k, m)``."""
+
+    def deviation(
+        self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
+    ) -> Array:
+        """How far ``rows (r, d)`` of the state are from their chords on ``[start, start + width]``, each on one piece,
+        from its ``states (k, M, d)`` at ``start``, summed over the coefficients, ``(k, r)``."""
+
+    def along(self, control: Array, rows: Array, others: Array) -> Array:
+        """What the models leave out of the state, block by block, by the product with ``rows (r, q)``, and how large
+        they are by that with ``others (r, q)``, added up: ``(r, L)``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +102,7 @@ class CellEnclosure:
     ``direct``: what is added to the rows, linear in time or constant on every cell of times.
     """
 
-    lifted: LiftedSystem
+    lifted: Motion
     sigma: Supports | None
     H: Array
     rhs: Array
@@ -142,51 +191,18 @@ class CellEnclosure:
 
     def _states(self, times: Array, pieces: np.ndarray) -> Array:
         """Taylor coefficients ``(k, M, d)`` of the state under the control alone, from the last breakpoint."""
+        start: Array = self._nodes[pieces]
         within = times - self.lifted.grid.breakpoints[pieces]
-        start = self._nodes.reshape(self._nodes.shape[0], -1)[pieces]
         if not within.any():
-            return np.asarray(start.reshape(times.size, self.lifted.space.size, -1))
+            return start
         pieces = np.minimum(pieces, self.lifted.grid.pieces - 1)  # beyond the last there is no time to be driven in
-        size = self.lifted.norm * float(within.max(initial=0.0))
-        moved = (
-            self._by_series(start, start @ self.lifted.matrix.T + self._drive(pieces), within[:, None], size)
-            if size < LONG_STEP
-            else self._by_exponential(start, pieces, within)
-        )
-        return moved.reshape(times.size, self.lifted.space.size, -1)
-
-    def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
-        """The exponential series, for short steps: no matrix is built."""
-        total, term, order, bound = start + within * slopes, slopes, 1, size
-        while bound > TAYLOR_TERMS:
-            order += 1
-            term = term @ self.lifted.matrix.T * (within / order)
-            total = total + within * term
-            bound *= size / order
-        return total
-
-    def _by_exponential(self, start: Array, pieces: np.ndarray, within: Array) -> Array:
-        distinct, which = self.lifted.grid.distinct(within)
-        flow, driven = self.lifted.forward.flows(distinct)
-        return np.asarray(
-            np.einsum("kij,kj->ki", flow[which], start) + np.einsum("kij,kj->ki", driven[which], self._drive(pieces))
-        )
+        return self.lifted.moved(within, pieces, start, self._inputs[pieces])
 
     def _deviation(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
         """How far the state and the support function are from their chords on the cells, summed over the Taylor
-        coefficients, ``(k, r)``: by the second time derivative, or mode by mode by twice what it can move (as in
-        `DisturbanceSupport.deviation`)."""
-        lifted, width = self.lifted, stop - start
-        shape = (start.size, lifted.space.size, lifted.states)
-        states = self._states(start, pieces).reshape(start.size, -1)
-        slopes = states @ lifted.matrix.T + self._drive(pieces)
-        bent = (slopes @ lifted.matrix.T).reshape(shape)
-        along = np.abs(np.einsum("ri,kai->kra", self._rows, bent)).sum(axis=2)
-        once, twice = (block_norms(part.reshape(shape), lifted.starts).sum(axis=1) for part in (slopes, bent))
-        reach, square, rows = lifted.comparison.over(width), (width**2 / 8)[:, None], self._row_norms
-        exact = square * (along + product(rows, reach.departure.on(twice).T).T)
-        by_mode = np.minimum(square * reach.peak.on(twice), 2.0 * reach.integral.on(once))
-        total = np.minimum(exact, product(rows, by_mode.T).T)
+        coefficients, ``(k, r)``."""
+        width, states = stop - start, self._states(start, pieces)
+        total = self.lifted.deviation(self._rows, start, width, pieces, states, self._inputs[pieces])
         return np.asarray(total if self.sigma is None else total + self.sigma.deviation(start, width))
 
     @cached_property
@@ -201,29 +217,15 @@ class CellEnclosure:
     def _nodes(self) -> Array:
         return self.lifted.nodes(self.control)
 
-    def _drive(self, pieces: np.ndarray) -> Array:
-        """What drives the Taylor coefficients on some pieces, ``(k, M d)``."""
-        return np.asarray(self._inputs[pieces] @ self.lifted.B.reshape(-1, self.lifted.B.shape[2]).T)
-
     @cached_property
     def _inputs(self) -> Array:
         return self.lifted.grid.inputs(self.control).T
 
     @cached_property
     def _shares(self) -> Array:
-        """How what the models neglect is blamed on the parameters (and directions): by their first-order part in the
-        system, ``(nu,)``."""
-        space, lifted = self.lifted.space, self.lifted
-        sizes = (
-            [
-                sum(float(np.linalg.norm(part[space.index[tuple(unit)]])) for part in (lifted.A, lifted.B, lifted.W))
-                for unit in np.eye(space.nu, dtype=int).tolist()
-            ]
-            if space.degree
-            else [1.0] * space.nu
-        )
-        directions = (self.combination.space.nu - space.nu) if self.combination is not None else 0
-        total = np.array(sizes + [0.0] * directions) + SMALL_SHARE
+        """How what the models neglect is blamed on the parameters (and directions), ``(nu,)``."""
+        directions = (self.combination.space.nu - self.lifted.space.nu) if self.combination is not None else 0
+        total = np.append(self.lifted.influence, np.zeros(directions)) + SMALL_SHARE
         return np.asarray(total / total.sum())
 
     @cached_property
@@ -261,6 +263,7 @@ class LegsEnclosure:
         return bounds, bend, spread
 
 
+AnyMotion = TypeVar("AnyMotion", bound=Motion)
 Bounded: TypeAlias = CellEnclosure | LegsEnclosure
 
 
@@ -269,8 +272,8 @@ def kept(control: Array) -> int:
     return max(2, min(CELLS_KEPT, CELLS_SIZE // control.size))
 
 
-def over_legs(legs: Sequence[LiftedSystem], cell: Callable[[LiftedSystem], CellEnclosure]) -> Bounded:
-    """The enclosure that ``cell`` makes of a lifted system, for every leg of it."""
+def over_legs(legs: Sequence[AnyMotion], cell: Callable[[AnyMotion], CellEnclosure]) -> Bounded:
+    """The enclosure that ``cell`` makes of a motion, for every leg of it."""
     if len(legs) == 1:
         return cell(legs[0])
     return LegsEnclosure([cell(leg) for leg in legs], np.array([leg.grid.elapsed for leg in legs]))

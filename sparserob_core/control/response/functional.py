@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from sparserob_core.control.response.disturbance_support import DisturbanceSuppo
 from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
 from sparserob_core.control.response.lifted import LiftedSystem, frozen, lift_legs
 from sparserob_core.control.response.response import Response, TimeGrid, Weights
+from sparserob_core.control.response.varying.motion import VaryingMotion
+from sparserob_core.control.response.varying.support import VaryingSupport
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
 LEGS_KEPT = 256  # cells of parameters whose lifted systems are kept
+Leg: TypeAlias = LiftedSystem | VaryingMotion
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
 
 
@@ -111,15 +114,15 @@ class WorstCase:
     @cached_property
     def _nominal(self) -> WorstCase:
         system, model = self.response.system, self.disturbance
-        if isinstance(system, VaryingSystem):  # which is known, and undisturbed
-            return self
+        if model is not None:
+            zero = np.zeros(model.channels)
+            model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
+        if isinstance(system, VaryingSystem):  # which is known
+            return replace(self, disturbance=model, initial=None, shared=None)
         middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
         modes = [LinearSystem(*(part[0] for part in mode.matrices(middle))) for mode in system.modes]
         ends = (*system.switches, float(self.response.grid.breakpoints[-1]))
         known = modes[0] if len(modes) == 1 else SwitchedSystem(list(zip(ends, modes, strict=True)))
-        if model is not None:
-            zero = np.zeros(model.channels)
-            model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
         response = Response(known, self.response.grid, self.response.initial_state)
         return WorstCase(response, self.dictionary, model, names=self.names)
 
@@ -272,14 +275,16 @@ class WorstCase:
         return sigma
 
     @shaped
-    def support_over(
-        self, lifted: LiftedSystem, H: Float[Array, "r d"], joined: Combination | None = None
-    ) -> Supports | None:
+    def support_over(self, lifted: Leg, H: Float[Array, "r d"], joined: Combination | None = None) -> Supports | None:
         """What the worst disturbance and the worst initial state add to functionals ``H (r, d)`` over a cell, ``None``
         where there is neither; raises `NotEnclosable` where no bound of it is proven."""
         rows = H @ lifted.transform
         found: list[Support] = []
         model = self.disturbance
+        if isinstance(lifted, VaryingMotion):
+            found += [] if model is None else [VaryingSupport.of_disturbance(lifted, model, rows, joined)]
+            found += [] if self.initial is None else [VaryingSupport.of_initial(lifted, self.initial, rows, joined)]
+            return Supports(tuple(found)) if found else None
         if model is not None and model.kind != "measurable":
             found.append(DisturbanceSupport(lifted, model, rows, joined))
         elif model is not None:
@@ -378,12 +383,17 @@ class WorstCase:
         return acting[starts], starts
 
     @shaped
-    def legs(self, low: Float[Array, " nu"], high: Float[Array, " nu"]) -> tuple[LiftedSystem, ...]:
-        """The lifted system over a cell of parameters, leg by leg; remembered, for all constraints."""
+    def legs(self, low: Float[Array, " nu"], high: Float[Array, " nu"]) -> tuple[Leg, ...]:
+        """The lifted system over a cell of parameters, leg by leg, or the motion of one that changes with time;
+        remembered, for all constraints."""
         key, response = low.tobytes() + high.tobytes(), self.response
         if key not in self._legs:
             cell = (low + high) / 2, (high - low) / 2
-            legs = lift_legs(response.system, response.grid, response.initial_state, *cell)
+            legs: tuple[Leg, ...] = (
+                (VaryingMotion(response.propagator, response.initial_state),)
+                if response.grid.varying
+                else lift_legs(response.system, response.grid, response.initial_state, *cell)
+            )
             remember(self._legs, key, legs, LEGS_KEPT)
         return self._legs[key]
 
@@ -392,7 +402,7 @@ class WorstCase:
         return {}
 
     @cached_property
-    def _legs(self) -> dict[bytes, tuple[LiftedSystem, ...]]:
+    def _legs(self) -> dict[bytes, tuple[Leg, ...]]:
         return {}
 
     @shaped

@@ -51,6 +51,8 @@ KNOWN = np.zeros((1, 0))
 # growth of the comparison system times length of the parts that pieces are cut into for what is neglected, and how
 # many of a piece at most
 SHORT, MOST_CUTS = 0.5, 64
+LONG_STEP = 1.0  # in norm times duration: longer steps are taken by matrix exponentials
+TAYLOR_TERMS = 1e-17  # relative size below which further terms of the exponential series are left out
 PATHS_KEPT, PATHS_SIZE = 4, 20_000_000  # paths that are remembered, and the numbers in all of them beyond the first
 SPANS = 256  # of several pieces each, for which what is left out is bounded, where there are four times as many pieces
 
@@ -255,6 +257,55 @@ class LiftedSystem:
         rounding included; and of the Taylor models themselves, summed over their coefficients."""
         left_out, sizes, _ = self._left_out(control)
         return left_out[self.shared], sizes[self.shared]
+
+    def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
+        """`Motion.moved`."""
+        start = begun.reshape(within.size, -1)
+        size = self.norm * float(within.max(initial=0.0))
+        if size < LONG_STEP:
+            found = self._by_series(start, start @ self.matrix.T + self._drive(inputs), within[:, None], size)
+        else:
+            distinct, which = self.grid.distinct(within)
+            flow, driven = self.forward.flows(distinct)
+            found = np.einsum("kij,kj->ki", flow[which], start)
+            found = found + np.einsum("kij,kj->ki", driven[which], self._drive(inputs))
+        return np.asarray(found.reshape(within.size, self.space.size, -1))
+
+    def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
+        """The exponential series, for short steps: no matrix is built."""
+        total, term, order, bound = start + within * slopes, slopes, 1, size
+        while bound > TAYLOR_TERMS:
+            order += 1
+            term = term @ self.matrix.T * (within / order)
+            total = total + within * term
+            bound *= size / order
+        return total
+
+    def _drive(self, inputs: Array) -> Array:
+        """What drives the Taylor coefficients under inputs ``(k, m)``, ``(k, M d)``."""
+        return np.asarray(inputs @ self.B.reshape(-1, self.B.shape[2]).T)
+
+    def deviation(
+        self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
+    ) -> Array:
+        """`Motion.deviation`: by the second time derivative, or mode by mode by twice what it can move (as in
+        `DisturbanceSupport.deviation`)."""
+        slopes = states.reshape(start.size, -1) @ self.matrix.T + self._drive(inputs)
+        bent = (slopes @ self.matrix.T).reshape(states.shape)
+        along = np.abs(np.einsum("ri,kai->kra", rows, bent)).sum(axis=2)
+        once, twice = (block_norms(part.reshape(states.shape), self.starts).sum(axis=1) for part in (slopes, bent))
+        reach, square, norms = self.comparison.over(width), (width**2 / 8)[:, None], block_norms(rows, self.starts)
+        exact = square * (along + product(norms, reach.departure.on(twice).T).T)
+        by_mode = np.minimum(square * reach.peak.on(twice), 2.0 * reach.integral.on(once))
+        return np.asarray(np.minimum(exact, product(norms, by_mode.T).T))
+
+    @property
+    def influence(self) -> Array:
+        """`Motion.influence`: the parameters' first-order part in the system."""
+        if not self.space.degree:
+            return np.ones(self.space.nu)
+        places = [self.space.index[tuple(unit)] for unit in np.eye(self.space.nu, dtype=int).tolist()]
+        return np.array([sum(float(np.linalg.norm(part[i])) for part in (self.A, self.B, self.W)) for i in places])
 
     @property
     def shared(self) -> np.ndarray | slice:

@@ -340,6 +340,37 @@ class Propagator:
             remember(self._steps, key, Steps(A, B, E, Phi, Gamma), STEPS_KEPT)
         return self._steps[key]
 
+    def _varying_weights(self, expansion: Expansion, times: Array, directions: Array) -> Weights:
+        """`weights` of a system that changes with time, without an input matrix for every index."""
+        steps, pieces = self.steps(np.zeros((1, 0))), self.grid.locate(times)
+        order = np.argsort(-pieces, kind="stable")
+        rows, at = np.array(directions, dtype=float)[order], pieces[order]
+        begun = self.grid.breakpoints[at]
+        distinct, which = np.unique(np.stack([begun, np.maximum(times[order], begun)]), axis=1, return_inverse=True)
+        over, which = expansion.flow(distinct[0], distinct[1]), which.reshape(-1)
+        both = np.concatenate([over.control, over.disturbance], axis=2)
+        found = np.zeros((times.size, self.grid.pieces, both.shape[2]))
+        found[np.arange(times.size), at] = (rows[:, None] @ both[which])[:, 0]
+        rows = (rows[:, None] @ over.state[which])[:, 0]
+        pushes = np.concatenate([self.grid.of_modes(part[0]) for part in (steps.B, steps.E)], axis=2)
+        last = int(at[0]) if at.size else 0
+        reaching = np.searchsorted(-at, -np.arange(last)).tolist()
+        for piece in range(last - 1, -1, -1):
+            part = rows[: reaching[piece]]
+            found[: reaching[piece], piece] = part @ (pushes[piece] * self.grid.lengths[piece])
+            rows[: reaching[piece]] = part @ steps.Phi[0, piece]
+        back = np.empty_like(order)
+        back[order] = np.arange(order.size)
+        channels = over.control.shape[2]
+        return Weights(rows[back], found[back, :, :channels], found[back, :, channels:])
+
+    @cached_property
+    def marks(self) -> Array:
+        """The breakpoints, and the times between which a system that changes with time is one polynomial of it; one of
+        these that is a breakpoint but for rounding counts as that."""
+        breaks = self.grid.breakpoints
+        return breaks if self.expansion is None else _joined(breaks, self.expansion.ends[1:-1])
+
     @cached_property
     def expansion(self) -> Expansion | None:
         """The system as polynomials in time, where it changes with time."""
@@ -424,6 +455,8 @@ class Propagator:
     ) -> Weights:
         """The functional ``c'x(t)`` of each index as weights on what is given and on inputs: `adjoint` and
         `TimeGrid.through`, without ``(k, L, d)`` numbers where the system is known and the pieces are equal."""
+        if self.expansion is not None:
+            return self._varying_weights(self.expansion, times, directions)
         if self.aged(parameters.shape[1]):
             return self._weights_by_age(times, directions)
         free, gains, B, E = self.adjoint(times, directions, parameters)
@@ -672,11 +705,28 @@ class Outputs:
             found = transitions(steps.A[:, grid.mode[pieces]], durations[which][None])
         return self.H @ found[0], self.H @ found[1]
 
+    @cached_property
+    def _over_pieces(self) -> tuple[Array, Array] | None:
+        """Of a system that changes with time, what the beginning of its piece makes of every time: of the state,
+        ``(T, r, d)``, and of what acts, ``(T, r, m)``."""
+        expansion = self.propagator.expansion
+        if expansion is None:
+            return None
+        begun = self.propagator.grid.breakpoints[self.within[0]]
+        flow = expansion.flow(begun, np.maximum(self.times, begun))
+        return self.H @ flow.state, self.H @ flow.control
+
     def at(self, response: Response, control: Array) -> Array:
         """``(v, r, T)`` from the initial state of a response, under a control ``(m, K)`` on its own pieces."""
         if self.propagator.aged(self.points.shape[1]) and self.propagator.grid.pieces >= LONG:
             return self._in_blocks(response.initial_state, self.propagator.grid.inputs(control))[None]
         steps, grid = self.propagator.steps(self.points), self.propagator.grid
+        if self._over_pieces is not None:
+            flow, driven = self._over_pieces
+            nodes, inputs = response.nodes(control, self.points)[0], grid.inputs(control).T
+            pieces = self.within[0]
+            held = np.einsum("trm,tm->rt", driven, inputs[pieces])
+            return np.asarray(np.einsum("tri,ti->rt", flow, nodes[pieces]) + held)[None]
         nodes, drive = response.nodes(control, self.points), grid.driven(steps.B, grid.inputs(control))
         pieces, _, which = self.within
         which = which if grid.mode is None else np.arange(which.size)

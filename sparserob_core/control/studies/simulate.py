@@ -53,7 +53,7 @@ def walk(
     """
     grid = response.grid
     if grid.varying:
-        yield from _walk_varying(response, control, parameters.shape[0], initial_states)
+        yield from _walk_varying(response, control, parameters.shape[0], disturbances, initial_states)
         return
     modes = [
         [np.moveaxis(matrix, 0, -1) if parameters.shape[1] else matrix[0] for matrix in mode.matrices(points)]
@@ -89,17 +89,23 @@ def walk(
 
 
 def _walk_varying(
-    response: Response, control: Array | Callable[[int, Array], Array], count: int, initial_states: Array | None
+    response: Response,
+    control: Array | Callable[[int, Array], Array],
+    count: int,
+    disturbances: Array | None,
+    initial_states: Array | None,
 ) -> Iterator[Array]:
-    """`walk` of a system that changes with time, which is known and undisturbed."""
+    """`walk` of a system that changes with time, which is known."""
     grid, steps = response.grid, response.steps(np.zeros((1, 0)))
     state = np.repeat(response.initial_state[:, None], count, axis=1)
     state = state if initial_states is None else np.ascontiguousarray(initial_states.T)
     yield state
-    for piece, B in enumerate(np.split(steps.B[0], grid.pieces, axis=1)):
+    for piece, (B, E) in enumerate(zip(grid.of_modes(steps.B[0]), grid.of_modes(steps.E[0]), strict=True)):
         acting = int(grid.control_piece[piece])
-        driven = control(acting, state) if callable(control) else control[:, acting, None]
-        state = steps.Phi[0, piece] @ state + steps.Gamma[0, piece] @ (B @ driven)
+        drive = B @ (control(acting, state) if callable(control) else control[:, acting, None])
+        if disturbances is not None:
+            drive = drive + E @ disturbances[:, :, grid.disturbance_piece[piece]].T
+        state = steps.Phi[0, piece] @ state + steps.Gamma[0, piece] @ drive
         yield state
 
 

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sparserob_core.control.enclosures.matrix_exponential import rounding
+from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.system import LinearSystem, SystemInUnits, VaryingSystem
 from sparserob_core.errors import InputError, NotEnclosable
@@ -25,7 +25,10 @@ from sparserob_core.sip.convex_set import Array
 
 DEGREE = 14  # of the system in time; with a tenth segments are a hundred times shorter
 TERMS = 40  # of the solution on an interval; ten times fewer leave more than rounding, more of them cost time
-CIRCLES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # shares of an interval on which Cauchy's bound is looked at
+FEWER = (8, 12, 16, 24)  # terms that are enough where what they leave out is below `IDLE`, as on short intervals
+IDLE = 2.0**-58  # of what is added up, what does not show; ten times more would be a digit, ten times less cost terms
+CIRCLES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 24.0, 48.0, 96.0)
+"""Shares of an interval on which Cauchy's bound is looked at; short intervals need the wide ones."""
 LONG = 2.0  # norm of A times the length of a segment; ten times more needs three times the terms
 SHARPEST = 1e-13  # remainder on a segment, as a share of the numbers: ten times less is below what is rounded
 BLUNTEST = 1e-10  # from which on a segment is halved even where that did not help: else what a state misses shows
@@ -37,13 +40,28 @@ SWEEPS = 20  # of balancing
 
 class Flow(NamedTuple):
     """What ``k`` intervals make of the state at their beginning, ``state (k, d, d)``, and of inputs that stay the same,
-    ``control (k, d, m)`` and ``disturbance (k, d, mw)``; ``error (k,)``: bound of what all three are off by, as a
-    share of the norms of the majorant, in the coordinates of `Expansion.units`."""
+    ``control (k, d, m)`` and ``disturbance (k, d, mw)``.
+
+    ``error (k,)``: bound of what they are off by, in the norm of largest row sums in the coordinates of
+    `Expansion.units`; of the columns of inputs times ``sizes (k, m + mw)``, what drives them at most.
+    """
 
     state: Array
     control: Array
     disturbance: Array
     error: Array
+    sizes: Array
+
+
+class Majorant(NamedTuple):
+    """How far the series of a flow is summed, ``terms`` of it with ``degree`` of the system's; what it is off by then,
+    ``error (k,)``; what drives inputs, ``sizes (k, m + mw)``; and the factor by which states grow, ``growth (k,)``."""
+
+    terms: int
+    degree: int
+    error: Array
+    sizes: Array
+    growth: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,32 +147,44 @@ class Expansion:
         d, (m, mw) = self.units.size, self.channels
         state = np.tile(np.eye(d), (starts.size, 1, 1))
         inputs, error = np.zeros((starts.size, d, m + mw)), np.zeros(starts.size)
-        segments = np.clip(np.searchsorted(self.ends, starts, side="right") - 1, 0, self.ends.size - 2)
+        sizes, grown = np.zeros((starts.size, m + mw)), np.ones(starts.size)
+        segments = self.segment_of(starts)
         active, at = np.flatnonzero(stops > starts), starts.copy()
         while active.size:
             mine = segments[active]
             last = mine == self.ends.size - 2  # which holds whatever rounding puts behind the horizon
             until = np.where(last, stops[active], np.minimum(stops[active], self.ends[mine + 1]))
-            step, driven, off = self._within(mine, at[active], until)
+            step, driven, off, pushed, growth = self._within(mine, at[active], until)
             state[active], inputs[active] = step @ state[active], step @ inputs[active] + driven
-            error[active] += off
+            error[active] = error[active] * growth + off * grown[active]
+            sizes[active] += pushed
+            grown[active] *= growth
             at[active] = until
             segments[active] += 1
             active = active[until < stops[active]]
-        return Flow(state, inputs[..., :m], inputs[..., m:], error)
+        return Flow(state, inputs[..., :m], inputs[..., m:], error, sizes)
+
+    def segment_of(self, times: Array) -> np.ndarray:
+        """The segment that each time is in, or begins, ``(k,)``."""
+        return np.clip(np.searchsorted(self.ends, times, side="right") - 1, 0, self.ends.size - 2)
+
+    @shaped
+    def at(self, times: Float[Array, " k"]) -> tuple[Float[Array, "k d d"], Float[Array, "k d n"]]:
+        """``A`` and ``[B E]`` at times ``(k,)``, for what asks which way the state goes; nothing is proven by them."""
+        segments, d = self.segment_of(times), self.units.size
+        begin, end = self.ends[segments], self.ends[segments + 1]
+        powers = ((2.0 * times - begin - end) / (end - begin))[:, None] ** np.arange(DEGREE + 1)
+        law = np.einsum("kn,knij->kij", powers, self.coefficients[segments])
+        return law[..., :d], law[..., d:]
 
     @shaped
     def average(self, times: Float[Array, " T"]) -> Float[Array, "k d d"]:
         """About what ``A`` is between ``times (k + 1,)``: at the middles, for what asks how fast the system is."""
-        middles, d = (times[:-1] + times[1:]) / 2, self.units.size
-        mine = np.clip(np.searchsorted(self.ends, middles) - 1, 0, self.ends.size - 2)
-        begin, end = self.ends[mine], self.ends[mine + 1]
-        powers = ((2.0 * middles - begin - end) / (end - begin))[:, None] ** np.arange(DEGREE + 1)
-        answer: Array = np.einsum("kn,knij->kij", powers, self.coefficients[mine][..., :d])
-        return answer
+        return self.at((times[:-1] + times[1:]) / 2)[0]
 
-    def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, Array, Array]:
-        """`flow` of intervals within one segment each, with control and disturbance side by side."""
+    def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
+        """`flow` of intervals within one segment each, with control and disturbance side by side, and by what factor
+        states grow at most."""
         d = self.units.size
         centre = (self.ends[segments] + self.ends[segments + 1]) / 2
         radius = (self.ends[segments + 1] - self.ends[segments]) / 2
@@ -165,49 +195,66 @@ class Expansion:
         for n in range(DEGREE + 1):
             for k in range(n, DEGREE + 1):
                 moved[:, n, k] = comb(k, n) * powers[:, k - n] * share**n
-        every = self.coefficients[segments]
-        shape = every.shape[2:]
-        law = (moved @ every.reshape(starts.size, DEGREE + 1, -1)).reshape(starts.size, DEGREE + 1, *shape)
-        law = law * length[:, None, None, None]
+        every = self.coefficients[segments].reshape(starts.size, DEGREE + 1, -1)
+        shape = (starts.size, DEGREE + 1, d, sum(self.channels) + d)
+        law = (moved @ every).reshape(shape) * length[:, None, None, None]
+        bulk = (np.abs(moved) @ np.abs(every)).reshape(shape) * length[:, None, None, None]
+        majorant = self._majorant(segments, law, bulk, length)
         A, driven = law[..., :d], law[..., d:]
-        total, terms = np.zeros((starts.size, *shape)), []
-        first = np.zeros((starts.size, *shape))
+        total, terms = np.zeros((starts.size, *shape[2:])), []
+        first = np.zeros((starts.size, *shape[2:]))
         first[:, :, :d] = np.eye(d)
         terms.append(first)
-        for n in range(TERMS):
-            nexts = np.zeros((starts.size, *shape))
-            for k in range(min(n, DEGREE) + 1):
+        for n in range(majorant.terms):
+            nexts = np.zeros((starts.size, *shape[2:]))
+            for k in range(min(n, majorant.degree) + 1):
                 nexts += A[:, k] @ terms[n - k]
-            if n <= DEGREE:
+            if n <= majorant.degree:
                 nexts[..., d:] += driven[:, n]
             terms.append(nexts / (n + 1))
         for term in reversed(terms):
             total += term
-        return total[..., :d], total[..., d:], self._error(segments, law, length)
+        return total[..., :d], total[..., d:], majorant.error, majorant.sizes, majorant.growth
 
-    def _error(self, segments: np.ndarray, law: Array, length: Array) -> Array:
-        """Of a series whose coefficients are at most those of ``y`` in the norm of largest row sums in own units, where
-        ``y' = a(s) y + b(s)`` with the norms ``a_k`` and ``b_k`` of the coefficients of the system: Cauchy's tail
-        ``y(R) R^-N / (R - 1)`` for the best ``R``, the remainder's part ``r e^(a + r)`` (variation of constants), and
-        rounding; each as a share of the norms of the states, or of the inputs."""
+    def _majorant(self, segments: np.ndarray, law: Array, bulk: Array, length: Array) -> Majorant:
+        """Of a series whose coefficients are at most those of ``y' = a(s) y + b(s)`` in the norm of largest row sums in
+        own units, with the norms ``a_k`` and ``b_k`` of the coefficients of the system: how many of its terms are
+        needed, and of the system's coefficients, which are then left out like the ``remainder``.
+
+        What is missed is Cauchy's tail ``y(R) R^-N / (R - 1)`` for the best ``R``; what is left out of the system, by
+        variation of constants ``r e^(a + r)``; and rounding, of the coefficients ``bulk`` before anything cancels in
+        them, of every term, and of the sum, whose first term is exact.
+        """
         d = self.units.size
         scale = self.units / self.units[:, None]
         sizes = (np.abs(law[..., :d]) * scale).sum(axis=3).max(axis=2)
+        pushes = (np.abs(law[..., d:]) / self.units[:, None]).max(axis=2)
+        inputs = pushes.sum(axis=1)
+        most = np.where(inputs > 0.0, inputs, np.inf)
+        shares = (pushes / most[:, None]).max(axis=2, initial=0.0)
+        seen = (np.maximum(sizes, shares) > IDLE * np.maximum(sizes.sum(axis=1), 1e-300)[:, None]).any(axis=0)
+        degree = int(np.flatnonzero(seen).max(initial=0))
+        a, rest = sizes.sum(axis=1), self.remainder[segments] * length[:, None, None]
+        r = (rest[..., :d] * scale).sum(axis=2).max(axis=1) + sizes[:, degree + 1 :].sum(axis=1)
+        lost = (rest[..., d:] / self.units[:, None]).max(axis=1)
+        share = (lost / most).max(axis=1, initial=0.0) + shares[:, degree + 1 :].sum(axis=1)
         orders = np.arange(1.0, DEGREE + 2)
-        tail = np.full(length.size, np.inf)
-        for R in CIRCLES:
-            grown = (sizes * R**orders / orders).sum(axis=1)
-            forced = R ** (DEGREE + 1)  # no input has more of its coefficients in the last power
-            with np.errstate(over="ignore"):
-                tail = np.minimum(tail, np.exp(grown) * forced * R ** -float(TERMS) / (R - 1.0))
-        a = sizes.sum(axis=1)
-        rest = self.remainder[segments] * length[:, None, None]
-        r = (rest[..., :d] * scale).sum(axis=2).max(axis=1)
-        inputs, lost = np.abs(law[..., d:]).sum(axis=1), rest[..., d:]
-        most = (inputs / self.units[:, None]).max(axis=1)
-        share = ((lost / self.units[:, None]).max(axis=1) / np.where(most > 0.0, most, np.inf)).max(axis=1, initial=0.0)
-        rounded = rounding(DEGREE * d + TERMS) * (1.0 + a)
-        return np.asarray((tail + (r + share) * np.exp(a + r) + rounded * np.exp(a)) * (1.0 + 1e-9))
+        terms, tail = TERMS, np.zeros(length.size)
+        for terms in (*(one for one in FEWER if one < TERMS), TERMS):
+            tail = np.full(length.size, np.inf)
+            for R in CIRCLES:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    y = np.exp((sizes * R**orders / orders).sum(axis=1))
+                    forced = np.maximum(1.0, (shares * R**orders / orders).sum(axis=1))
+                    tail = np.fmin(tail, y * forced * R ** -float(terms) / (R - 1.0))
+            if (tail <= IDLE).all():
+                break
+        fuller = (bulk[..., :d] * scale).sum(axis=(1, 3)).max(axis=1)
+        fuller += ((bulk[..., d:] / self.units[:, None]).max(axis=2).sum(axis=1) / most).max(axis=1, initial=0.0)
+        growth = np.exp(a + r)
+        rounded = rounding((degree + 1) * d + terms) * np.minimum(a, 1.0) + rounding(DEGREE) * fuller
+        error = tail + (r + share) * growth + (rounded * (1.0 + a) + EPSILON) * growth
+        return Majorant(terms, degree, error * (1.0 + 1e-9), inputs, growth * (1.0 + 1e-9))
 
     @cached_property
     def slack(self) -> float:

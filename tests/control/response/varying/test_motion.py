@@ -1,0 +1,151 @@
+"""Guards control/response/varying/motion and support: bounds of the violation on cells of time of systems that change
+with time: never below a dense maximum, close to it on small cells, and holding what transitions are off by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sparserob_core.control.response.varying.expansion as expansion
+from sparserob_core.control.constraints.curved import CurvedConstraint
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.constraints.sensitivity import Sensitivity
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.response.disturbance import disturbance_model
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.reference import Reference
+from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.varying.expansion import Expansion
+from sparserob_core.control.sets.sets import Ellipsoid
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from tests.support.plants import indicators, uniform, walsh
+
+HORIZON = 3.0
+PLANTS = {
+    "mathieu": VaryingSystem.of([[0, 1], ["-(1.5 - 0.8*cos(2*t))", -0.1]], [[0], [1]], HORIZON, [[1, 0], ["t", 1]]),
+    "rocket": VaryingSystem.of([[0, 1], [0, 0]], [[0], ["1/(4 - t)"]], HORIZON, [[0, 0], [1, "sin(t)"]], c=[0, -1]),
+    "turning": VaryingSystem.of([[0, "1 + t"], ["-(1 + t)", 0]], [["cos(t)"], [1]], HORIZON, [[1, 0], [0, "exp(-t)"]]),
+    "fading": VaryingSystem.of([["-4/(0.5 + t)", 1], [0, "-1/(1 + t)"]], [["t"], [1]], HORIZON),
+}
+SETS: dict[str, ConvexSet | None] = {
+    "none": None,
+    "box": Box([-0.1, -0.3], [0.2, 0.1]),
+    "ellipsoid": Ellipsoid([0.0, 0.1], [[0.04, 0.01], [0.01, 0.02]]),
+}
+GRIDS = {"uniform": uniform(6, HORIZON), "uneven": indicators([0.0, 0.4, 0.5, 1.6, HORIZON])}
+NOISES = {"own": None, "others": uniform(5, HORIZON), "walsh": walsh(4, HORIZON, 2)}
+
+
+def functionals(plant: str, dictionary: Dictionary, noise: Dictionary | None, bound: str, begun: str) -> WorstCase:
+    system = PLANTS[plant].forced
+    noise, w, x0 = dictionary if noise is None else noise, SETS[bound], SETS[begun]
+    constants = system.controls - 1
+    grid = merge_grids(dictionary.breakpoints, noise.breakpoints, constants=constants, varying=True)
+    model = None if w is None else disturbance_model("piecewise_constant", w, noise, grid)
+    return WorstCase(Response(system, grid, np.array([1.0, -0.5])), dictionary, model, initial=x0)
+
+
+def sampled(constraint: FlatConstraint | CurvedConstraint, x: Array, low: Array, high: Array, count: int) -> Array:
+    """The largest violation at some indices of every cell, ``(k,)``."""
+    shares = np.random.default_rng(1).uniform(size=(count, *low.shape))
+    shares[:, :, 0] = np.linspace(0.0, 1.0, count)[:, None]
+    found = constraint.at(x, (low + shares * (high - low)).reshape(-1, low.shape[1])).max(axis=1)
+    return np.asarray(found.reshape(count, -1).max(axis=0))
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    plant=st.sampled_from(sorted(PLANTS)),
+    bound=st.sampled_from(sorted(SETS)),
+    begun=st.sampled_from(sorted(SETS)),
+    grid=st.sampled_from(sorted(GRIDS)),
+    noise=st.sampled_from(sorted(NOISES)),
+)
+def test_no_violation_in_a_cell_is_above_its_bound(seed, plant, bound, begun, grid, noise):
+    bound = "box" if noise == "walsh" and bound == "ellipsoid" else bound
+    rng = np.random.default_rng(seed)
+    worst = functionals(plant, GRIDS[grid], NOISES[noise], bound, begun)
+    moved = Reference(np.array([0.0, 1.1, HORIZON]), rng.normal(size=(3, 2))) if seed % 2 else None
+    sides = rng.normal(size=(3, 2)), rng.normal(size=3)
+    constraint = FlatConstraint("path", worst, *sides, 0.2, HORIZON, ParameterIndex(None), reference=moved)
+    x = rng.normal(size=worst.variables)
+    lower, upper = constraint.cells
+    inner = np.sort(rng.uniform(size=(2, *lower.shape)), axis=0)
+    for low, high in ((lower, upper), (lower + inner[0] * (upper - lower), lower + inner[1] * (upper - lower))):
+        bounds = constraint.enclosure(x, low, high).bounds
+        truths = sampled(constraint, x, low, high, 30)
+        assert (truths <= bounds + 1e-12).all()
+    short = lower + 1e-3 * (upper - lower)
+    truths = sampled(constraint, x, lower, short, 5)
+    np.testing.assert_allclose(constraint.enclosure(x, lower, short).bounds, truths, atol=1e-5)
+
+
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 10**6), plant=st.sampled_from(sorted(PLANTS)), bound=st.sampled_from(sorted(SETS)))
+def test_a_curved_set_is_enclosed_over_cells_of_directions(seed, plant, bound):
+    rng = np.random.default_rng(seed)
+    worst = functionals(plant, GRIDS["uniform"], None, bound, "box")
+    shape = Ellipsoid([0.1, 0.0], [[1.5, 0.2], [0.2, 0.8]])
+    constraint = CurvedConstraint("path", worst, shape, 0.2, HORIZON, ParameterIndex(None))
+    lower, upper = constraint.cells
+    x = rng.normal(size=worst.variables)
+    bounds = constraint.enclosure(x, lower, upper).bounds
+    truths = sampled(constraint, x, lower, upper, 10)
+    # where nothing is violated, bounds are in the length of the directions, so that only their sign is told
+    assert (truths <= np.maximum(bounds, 0.0) + 1e-12).all()
+    assert (bounds < 0.0).any() or truths.max() > 0.0
+
+
+@pytest.mark.parametrize("name", ["TERMS", "DEGREE"])
+@pytest.mark.parametrize("part", ["control", "disturbance", "initial"])
+def test_bounds_hold_what_coarse_transitions_are_off_by(name, part, monkeypatch):
+    # the system is cut short on purpose: bounds must be above the violation of the sharp one
+    x = np.array([1.0, -1.0, 0.5, 1.0, -0.5, 1.0])
+    sharp = functionals("mathieu", GRIDS["uniform"], None, "box" if part == "disturbance" else "none",
+                        "box" if part == "initial" else "none")  # fmt: skip
+    if part != "control":
+        x, sharp = 0.0 * x, replace(sharp, response=sharp.response.from_state(np.zeros(2)))
+    H = np.array([[1.0, 0.3], [-1.0, -0.3], [-0.2, 1.0], [0.2, -1.0]])
+
+    def path(worst: WorstCase) -> FlatConstraint:
+        return FlatConstraint("path", worst, H, np.zeros(4), 0.0, HORIZON, ParameterIndex(None))
+
+    times = np.linspace(0.0, HORIZON, 301)[:, None]
+    truths = path(sharp).at(x, times).max(axis=1)
+    for rough in ("SHARPEST", "BLUNTEST"):
+        monkeypatch.setattr(expansion, rough, 1.0)
+    monkeypatch.setattr(expansion, name, 3)
+    rough = VaryingSystem.of([[0, 1], ["-(1.5 - 0.8*cos(2*t))", -0.1]], [[0], [1]], HORIZON, [[1, 0], ["t", 1]])
+    coarse = path(replace(sharp, response=Response(rough, sharp.response.grid, sharp.response.initial_state)))
+    off = np.abs(coarse.at(x, times).max(axis=1) - truths).max()
+    assert off > 1e-6, "nothing was left out"
+    assert (truths <= coarse.enclosure(x, times, times).bounds).all()
+
+
+def test_transitions_that_are_not_resolved_give_no_bound(monkeypatch):
+    worst = functionals("mathieu", GRIDS["uniform"], None, "none", "none")
+    constraint = FlatConstraint("path", worst, np.eye(2), np.ones(2), 0.0, HORIZON, ParameterIndex(None))
+    flow = Expansion.flow
+    monkeypatch.setattr(Expansion, "flow", lambda self, *ends: (f := flow(self, *ends))._replace(error=f.error + 1.0))
+    lower, upper = constraint.cells
+    assert not np.isfinite(constraint.enclosure(np.zeros(6), lower, upper).bounds[-1])
+
+
+@pytest.mark.parametrize("plant", sorted(PLANTS))
+def test_derivatives_in_time_are_differences(plant):
+    worst = functionals(plant, GRIDS["uneven"], None, "box", "ellipsoid")
+    moved = Reference(np.array([0.0, 1.1, HORIZON]), np.random.default_rng(3).normal(size=(3, 2)))
+    sides = np.array([[1.0, 0.3], [-0.2, 1.0]]), np.zeros(2)
+    constraint = FlatConstraint("path", worst, *sides, 0.0, HORIZON, ParameterIndex(None), reference=moved)
+    x, times = np.array([1.0, -1.0, 0.5, 2.0]), np.array([0.21, 0.45, 1.3, 2.1, 2.9])[:, None]
+    rows, h = np.array([0, 1, 0, 1, 0]), 1e-5
+    found = Sensitivity(constraint).gradient(x, times, rows)[:, 0]
+    ahead, behind = (constraint.violations(x, times + step, rows) for step in (h, -h))
+    np.testing.assert_allclose(found, (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-7)
