@@ -1,7 +1,9 @@
-"""Guards checker/reach/varying_tube: polynomials on cells of time of systems that change with time are above closed forms of
-the worst case, close to them on short cells, and where series are cut short."""
+"""Guards checker/reach/varying_tube: polynomials on cells of time of systems that change with time are above closed
+forms of the worst case, close to them on short cells, and where series are cut short."""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -71,7 +73,7 @@ def test_the_worst_case_is_below_its_polynomials_and_near_them(noise: ConvexSet,
     shares = np.linspace(0.0, 1.0, 9)
     with ctx.workprec(192):
         seen = tube(noise)
-        for piece, (begin, end) in enumerate(zip(GRID[:-1], GRID[1:], strict=True)):
+        for piece, (begin, end) in enumerate(pairwise(GRID)):
             for start, stop in ((begin, end), (begin + 0.1, begin + 0.101), (end, end)):
                 stop = until(seen, start, stop)
                 found, truths = seen.cells(piece, start, stop, Z, sharp), worst(start + shares * (stop - start), noise)

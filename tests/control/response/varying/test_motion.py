@@ -150,3 +150,25 @@ def test_derivatives_in_time_are_differences(plant):
     found = Sensitivity(constraint).gradient(x, times, rows)[:, 0]
     ahead, behind = (constraint.violations(x, times + step, rows) for step in (h, -h))
     np.testing.assert_allclose(found, (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("start", "width"), [(1.0, 0.2), (2.0, 0.01)], ids=["third", "second"])
+@pytest.mark.parametrize("part", ["state", "disturbance", "initial"])
+def test_what_bends_within_a_cell_is_counted(part, start, width):
+    # the second derivative is 1 - t times what bends: 0 where a cell begins, or all that there is on a short one
+    A = [[0, 1], ["1 - t" if part == "initial" else 0, 0]]
+    drift = [0, "1 - t"] if part == "state" else None
+    system = VaryingSystem.of(A, [[0], [0]], HORIZON, [[0], ["1 - t"]], drift).forced
+    whole = uniform(1, HORIZON)
+    grid = merge_grids(whole.breakpoints, whole.breakpoints, constants=system.controls - 1, varying=True)
+    noise = disturbance_model("piecewise_constant", Box([-1.0], [1.0]), whole, grid) if part == "disturbance" else None
+    begun = Box([-1.0, 0.0], [1.0, 0.0]) if part == "initial" else None
+    worst = WorstCase(Response(system, grid, np.zeros(2)), whole, noise, initial=begun)
+    constraint = FlatConstraint("path", worst, np.eye(2)[:1], np.zeros(1), 0.0, HORIZON, ParameterIndex(None))
+    times, x = np.array([[start], [start + width]]), np.zeros(worst.variables)
+    inside = sampled(constraint, x, times[:1], times[1:], 9)
+    chord = np.interp(np.linspace(0.0, 1.0, 9), [0.0, 1.0], constraint.at(x, times)[:, 0])
+    above = constraint.at(x, np.linspace(start, start + width, 9)[:, None])[:, 0] - chord
+    bounds = constraint.enclosure(x, times[:1], times[1:]).bounds
+    assert above.max() > 1e-6 and (inside <= bounds).all()
+    assert bounds[0] - chord.max() >= above.max()
