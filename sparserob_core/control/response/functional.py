@@ -22,8 +22,7 @@ from sparserob_core.control.response.disturbance_support import DisturbanceSuppo
 from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
 from sparserob_core.control.response.lifted import LiftedSystem, frozen, lift_legs
 from sparserob_core.control.response.response import Response, TimeGrid, Weights
-from sparserob_core.control.response.varying.motion import VaryingMotion
-from sparserob_core.control.response.varying.support import VaryingSupport
+from sparserob_core.control.response.varying_motion import VaryingMotion, VaryingSupport
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet

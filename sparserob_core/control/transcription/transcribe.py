@@ -537,7 +537,7 @@ def _quadratic(problem: OptimalControlProblem, dictionary: Dictionary) -> Quadra
     largest of the quadratic terms at a control that stays 0, or stays at one end of one channel."""
     if not problem.cost.is_quadratic:
         return {}
-    from sparserob_core.control.response.quadratic import quadratic_cost
+    from sparserob_core.control.transcription.quadratic import quadratic_cost
 
     on_pieces = quadratic_cost(problem, dictionary.breakpoints)
     terms, axes = on_pieces.on(dictionary), np.eye(problem.system.controls)

@@ -1,4 +1,4 @@
-"""Guards control/response/quadratic: the cost of the nominal trajectory is the integral along it."""
+"""Guards control/transcription/quadratic: the cost of the nominal trajectory is the integral along it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import sparserob_core as sr
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
-from sparserob_core.control.response import quadratic
-from sparserob_core.control.response.quadratic import quadratic_cost
+from sparserob_core.control.transcription import quadratic
+from sparserob_core.control.transcription.quadratic import quadratic_cost
 from sparserob_core.sip.convex_set import Array, Box
 from tests.support.plants import walsh
 

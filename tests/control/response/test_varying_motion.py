@@ -1,4 +1,4 @@
-"""Guards control/response/varying/motion and support: bounds of the violation on cells of time of systems that change
+"""Guards control/response/varying_motion: bounds of the violation on cells of time of systems that change
 with time: never below a dense maximum, close to it on small cells, and holding what transitions are off by."""
 
 from __future__ import annotations
