@@ -80,7 +80,9 @@ def test_the_worst_case_is_below_its_polynomials_and_near_them(noise: ConvexSet,
                 for poly, truth in zip(found, truths, strict=True):
                     tops = above(poly, shares)
                     assert (truth <= tops + 1e-14).all()
-                    assert (tops <= truth + 2.0 * poly.error + poly.kinks + 1e-13).all()
+                    assert (
+                        tops <= truth + 2.0 * poly.error + poly.kinks + 1e-12
+                    ).all()  # a root of the shape is widened
                     if stop - start < 0.01:
                         assert poly.error + poly.kinks < 1e-5
         (last, _) = seen.cells(len(GRID) - 1, 3.0, 3.0, Z)
