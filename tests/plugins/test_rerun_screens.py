@@ -247,3 +247,16 @@ def test_a_low_plot_has_two_ticks_at_least() -> None:
         drawing = Drawing()
         drawing.frame(Axes(0.0, 0.0, 100.0, 100.0, (0.0, 1.0), (-high, high)), "", ticks_below=False)
         assert sum(text != "" for _, text, _ in drawing.labels) >= 2
+
+
+def test_decades_are_whole_and_a_search_that_gains_nothing_more_has_numbers_that_can_be_told_apart() -> None:
+    from sparserob_rerun.drawing.canvas import _apart, ticks
+    from sparserob_rerun.search.climb import _limits
+
+    for low, high in ((-1.0, 0.0), (-2.0, 0.0), (-9.0, 1.0)):
+        found = _apart(Axes(0.0, 0.0, 100.0, 136.0, (0.0, 1.0), (low, high)), 34.0, True)
+        assert found.size > 1 and (found == np.rint(found)).all()
+    for value in (0.6380821, 2.6840191, 19.3710512, -4.5):
+        none = np.full(3, np.nan)
+        numbers = [f"{one:.7g}" for one in ticks(*_limits(np.full(3, value), none, np.full(3, value), []), 3)]
+        assert len(set(numbers)) == len(numbers) > 0 and max(map(len, numbers)) <= 6

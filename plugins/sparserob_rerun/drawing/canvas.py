@@ -170,7 +170,7 @@ class Drawing:
 def _apart(axes: Axes, line: float, whole: bool) -> Floats:
     """Round numbers on the axis upwards, as many as there is room for: a ``line`` from one to the next; two at least,
     where there are as many. ``whole``: no others than whole ones."""
-    choices = [values for values in (ticks(*axes.y, most) for most in (5, 4, 3, 2)) if values.size > 1]
+    choices = [values for values in (ticks(*axes.y, most) for most in (5, 4, 3, 2, 1)) if values.size > 1]
     choices = [values for values in choices if not whole or (values == np.rint(values)).all()] or [ticks(*axes.y)]
     unit = axes.height / (axes.y[1] - axes.y[0])
     return next((v for v in choices if v.size > 1 and unit * float(np.diff(v).min()) >= line), choices[-1])

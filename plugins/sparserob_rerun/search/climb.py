@@ -13,10 +13,13 @@ from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.way import Stage
 
 WIDTH, HEIGHT, GAP = 1150.0, 240.0, 110.0
-EXTENT = (-100.0, WIDTH + 50.0, -100.0, HEIGHT + 166.0)
+EXTENT = (-120.0, WIDTH + 50.0, -100.0, HEIGHT + 166.0)
 LINE = 44.0  # units between two lines of words
 CORNERS, POINTS = 500, 300  # of a curve, and of a cloud, in one panel
 MOST = 4  # panels beside one another; of more stages the last ones
+LEAST = 5e-4
+"""Of the best value, the least height of a panel. With a tenth of it the numbers beside it are wider than their room;
+with ten times as much, the last tenths of a search look flat."""
 
 
 @final
@@ -123,10 +126,11 @@ def _limits(values: Floats, walk: Floats, best: Floats, levels: list[float]) -> 
     settled = walk[walk.size // 20 :]
     walked = bool(np.isfinite(settled).any())
     low = float(np.nanmin(settled)) if walked else float(np.nanquantile(values, 0.5))
-    span = max(top - low, 1e-9 * max(1.0, abs(top)))
+    span = max(top - low, LEAST * (abs(top) or 1.0))
     for level in levels:
         if np.isfinite(level):
             low, top = (min(low, level), top) if level >= top - 3.0 * span else (low, top)
             top = max(top, level) if level <= top + span else top
-    span = max(top - low, 1e-9 * max(1.0, abs(top)))
-    return low - 0.06 * span, top + 0.06 * span
+    span = max(top - low, LEAST * (abs(top) or 1.0))
+    middle = (low + top) / 2.0
+    return middle - 0.56 * span, middle + 0.56 * span
