@@ -95,7 +95,12 @@ else:
         return function
 
 
-__all__ = ["Bool", "Float", "Int", "shaped"]
+__all__ = ["Bool", "Float", "Int", "dense", "shaped"]
+
+
+def dense(value: Any) -> Any:
+    """A sparse matrix of scipy as an array; everything else as it is."""
+    return value.toarray() if hasattr(value, "toarray") else value
 
 
 def read_only(value: Any) -> Any:

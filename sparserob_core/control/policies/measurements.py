@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import sealed
+from sparserob_core.shapes import dense, sealed
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
 
 SAME = (
@@ -39,7 +39,7 @@ class Measurements:
         """The same with ``C`` as an array, and without a noise that is a point at 0; raises `InputError` that begins
         with the key below ``measurements``."""
         try:
-            C = np.array(self.C, dtype=float)
+            C = np.array(dense(self.C), dtype=float)
         except (TypeError, ValueError):
             raise InputError(path="C", expected="a matrix of numbers", got=f"{self.C!r}") from None
         if C.ndim != 2 or C.shape[1] != states or not C.shape[0] or not np.isfinite(C).all():

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from sparserob_core.control.problem.prices import by_time
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import sealed
+from sparserob_core.shapes import dense, sealed
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 EXACT = 16  # states up to which a matrix is shown to be positive semidefinite in fractions
@@ -196,7 +196,7 @@ def _term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
 
 def _numbers(path: str, given: object, shape: tuple[int, ...], expected: str) -> Array:
     try:
-        array = np.asarray(given, dtype=float)
+        array = np.asarray(dense(given), dtype=float)
     except (TypeError, ValueError):
         raise InputError(path=path, expected=expected, got=f"{given!r}") from None
     if array.shape != shape or not np.isfinite(array).all():

@@ -20,7 +20,7 @@ from sparserob_core.control.problem.prices import checked_weights, counted, inte
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Equality, Polytope
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import sealed
+from sparserob_core.shapes import dense, sealed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
 
 if TYPE_CHECKING:
@@ -606,7 +606,7 @@ def _limits(where: str, entry: IntegralConstraint, count: int) -> tuple[Array, A
 
 def _matrix(where: str, rows: object, expected: str, columns: int) -> Array:
     try:
-        matrix = np.array(rows, dtype=float)
+        matrix = np.array(dense(rows), dtype=float)
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.ndim != 2 or matrix.shape[1] != columns or not matrix.size or not np.isfinite(matrix).all():

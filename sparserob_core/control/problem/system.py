@@ -22,7 +22,7 @@ from sparserob_core.control.problem.expression import (
 )
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.errors import InputError, NotEnclosable
-from sparserob_core.shapes import Float, shaped
+from sparserob_core.shapes import Float, dense, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
@@ -238,6 +238,7 @@ class LinearSystem:
         if callable(given) and not isinstance(given, ExpressionMatrix | _AsColumn):
             given = _AsColumn(given)
         elif not callable(given):
+            given = dense(given)
             array = np.asarray(given, dtype=object)
             if array.ndim == 0:
                 raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=f"{given!r}")
@@ -261,7 +262,7 @@ class LinearSystem:
                 )
             return value
         try:
-            array = np.array(value, dtype=float)
+            array = np.array(dense(value), dtype=float)
         except (TypeError, ValueError) as error:
             raise InputError(
                 f"{name} must be a matrix of numbers or a function of the parameters, got {value!r}", path="system"

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Bool, Float, sealed, shaped
+from sparserob_core.shapes import Bool, Float, dense, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, bisect, few_digits, ratios, vertex_excess
 
 _SIGN_DIMENSIONS = 10
@@ -34,7 +34,7 @@ class Ellipsoid(ConvexSet):
 
     def __post_init__(self) -> None:
         try:
-            shape = np.atleast_2d(np.array(self.shape, dtype=float))
+            shape = np.atleast_2d(np.array(dense(self.shape), dtype=float))
         except (TypeError, ValueError) as error:
             raise InputError("shape must be a square matrix of numbers", path="ellipsoid") from error
         if shape.ndim != 2 or shape.shape[0] != shape.shape[1] or not np.isfinite(shape).all():

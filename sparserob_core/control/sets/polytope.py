@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Float, sealed, shaped
+from sparserob_core.shapes import Float, dense, sealed, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_excess
 
 _VERTEX_DIMENSIONS = 6
@@ -38,7 +38,7 @@ class Polytope(ConvexSet):
 
     def __post_init__(self) -> None:
         try:
-            H = np.array(self.H, dtype=float)
+            H = np.array(dense(self.H), dtype=float)
         except (TypeError, ValueError) as error:
             raise InputError("H must be a matrix of numbers, one row per half-space", path="polytope") from error
         if H.ndim != 2 or H.size == 0 or not np.isfinite(H).all():

@@ -11,6 +11,7 @@ from typing import Any, final
 from pydantic import ValidationError
 
 from sparserob_core.errors import ConfigError, InputError, Path, PluginError, UnknownPluginError, dotted
+from sparserob_core.experiment.config.matrices.files import resolve
 from sparserob_core.experiment.config.overrides import Override, apply_override, parse_overrides
 from sparserob_core.experiment.config.reader import Source, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
@@ -74,6 +75,8 @@ def load_config(
         apply_override(data, change)
         _spell_out(data)
     wrong = list(malformed(data))
+    if known is None and not wrong:  # a directory that somebody has left has the numbers themselves
+        wrong = list(resolve(data, lambda path: _folder(path, given, changes)))
     registry = _registry(data, given, changes) if known is None else known
     resolved, more = _checked(data, registry, strangers=known is not None)
     if wrong or more or resolved is None:
@@ -81,6 +84,12 @@ def load_config(
     if not resolved.title:
         resolved = resolved.model_copy(update={"title": File(given.name).stem})
     return Loaded(resolved, registry, given, changes)
+
+
+def _folder(path: Path, source: Source, changes: tuple[Override, ...]) -> File:
+    """What a file is relative to: the folder of the config, or the working directory where an override names it."""
+    changed = _override(source, changes, Complaint(path, "")) is not None
+    return File.cwd() if changed else source.folder
 
 
 def _spell_out(data: dict[str, Any]) -> None:

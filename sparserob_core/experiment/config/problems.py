@@ -19,6 +19,7 @@ from sparserob_core.control.problem.expression import (
     FUNCTIONS,
     KEPLER,
     Definitions,
+    ExpressionMatrix,
     parse_column,
     parse_definitions,
     parse_matrix,
@@ -33,6 +34,7 @@ from sparserob_core.control.problem.problem import (
 from sparserob_core.control.problem.system import TIME, LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.matrices.packed import OrPacked, Packed
 from sparserob_core.experiment.config.option_kinds import (
     LIST,
     NUMBER,
@@ -52,6 +54,7 @@ from sparserob_core.experiment.config.set_options import (
     TerminalOptions,
 )
 from sparserob_core.options import Options
+from sparserob_core.sip.convex_set import Array
 
 
 def _entry(value: object) -> object:
@@ -70,8 +73,9 @@ def _interval(value: object) -> object:
 
 
 Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_interval)]
-Rows: TypeAlias = Annotated[list[Annotated[list[Entry], Field(min_length=1)]], Field(min_length=1)]
-Matrix: TypeAlias = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1)]
+Rows: TypeAlias = Annotated[list[Annotated[list[Entry], Field(min_length=1)]], Field(min_length=1), OrPacked()]
+Column: TypeAlias = Annotated[list[Entry], Field(min_length=1), OrPacked(column=True)]
+Matrix: TypeAlias = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1), OrPacked()]
 
 
 @final
@@ -114,7 +118,7 @@ class PieceOptions(Options):
     E: Rows | None = None
     """How the disturbance enters; the identity unless given."""
 
-    c: Annotated[list[Entry], Field(min_length=1)] | None = None
+    c: Column | None = None
     """Constant drift, one entry per state; none unless given."""
 
 
@@ -141,7 +145,7 @@ class SystemOptions(Options):
     """Intervals ``{name: [lower, upper]}``, or names and a set, as ``{names: [...], polytope: {H: ..., h: ...}}``; none
     if known."""
 
-    c: Annotated[list[Entry], Field(min_length=1)] | None = None
+    c: Column | None = None
     """Constant drift such as gravity, one entry per state, in units of the state per time; none unless given."""
 
     define: dict[str, Entry] | None = None
@@ -403,10 +407,14 @@ def _system(
 ) -> LinearSystem:
     _check_shapes(where, of)
     A, B, E, c = of
+
+    def entries(key: str, rows: list[list[Any]]) -> Array | ExpressionMatrix:
+        return rows.array if isinstance(rows, Packed) else parse_matrix(f"{where}.{key}", rows, names, defined)
+
     return LinearSystem(
-        parse_matrix(f"{where}.A", A, names, defined),
-        parse_matrix(f"{where}.B", B, names, defined),
-        None if E is None else parse_matrix(f"{where}.E", E, names, defined),
+        entries("A", A),
+        entries("B", B),
+        None if E is None else entries("E", E),
         parameters,
         names,
         None if c is None else parse_column(f"{where}.c", c, names, defined),

@@ -11,12 +11,17 @@ from functools import cached_property
 from pathlib import Path as File
 from typing import TYPE_CHECKING, Any, final
 
+import numpy as np
+
 from sparserob_core.errors import ConfigError, Path
+from sparserob_core.experiment.config.matrices.packed import pack
 
 if TYPE_CHECKING:
     from ruamel.yaml import YAML
 
-LARGEST = 1_000_000  # bytes of a config; large data belongs in a plugin that makes it
+# Bytes of a config, which may hold matrices as one text each; large data belongs in a file of arrays, or in a plugin
+# that makes it. Ten times more takes half a minute to read, a tenth is a dense matrix of 200 states.
+LARGEST = 4_000_000
 MOST_VALUES = 200_000  # values of a config, where an alias counts as all that it stands for
 
 __all__ = ["Source", "read_source", "read_value", "require_readable", "write_yaml"]
@@ -210,6 +215,8 @@ def _position(node: Any, step: str | int) -> tuple[tuple[int, int], object] | No
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
+    if hasattr(value, "toarray"):  # a sparse matrix
+        return pack(np.asarray(value.toarray(), dtype=float))
     if hasattr(value, "tolist"):
         return value.tolist()
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

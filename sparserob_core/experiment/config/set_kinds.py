@@ -11,6 +11,7 @@ from pydantic import Field, Tag, model_validator
 
 from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope, SetFactory
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.matrices.packed import OrPacked, RowsOfNumbers
 from sparserob_core.experiment.config.option_kinds import (
     LIST,
     NUMBER,
@@ -81,7 +82,7 @@ class BoxFactory(SetFactory, Sparse):
 class PolytopeFactory(SetFactory, Options):
     """``H x <= h``."""
 
-    H: list[list[float]] = Field(min_length=1)
+    H: RowsOfNumbers
     """Normals, one row per half-space."""
 
     h: OneOrMore
@@ -108,11 +109,11 @@ class EllipsoidFactory(SetFactory, Sparse):
     """Centre; the origin unless given."""
 
     shape: Annotated[
-        Number | Annotated[list[list[float]], Tag("matrix")],
+        Number | Annotated[list[list[float]], OrPacked(), Tag("matrix")],
         one_of(
             "a symmetric positive definite matrix, row by row, or a number for a multiple of the identity",
             number=NUMBER,
-            matrix=LIST,
+            matrix=(*LIST, Mapping),
         ),
     ]
     """Symmetric positive definite matrix; a number stands for that multiple of the identity, the square of a ball's

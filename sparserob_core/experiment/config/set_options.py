@@ -24,6 +24,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from sparserob_core.control.problem.problem import IntegralConstraint, MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, NormBall, Polytope, SetFactory, intersection
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.matrices.packed import RowsOfNumbers
 from sparserob_core.experiment.config.option_kinds import (
     FreeNumbers,
     OneOrMore,
@@ -142,10 +143,10 @@ def shorthand(record: Plugin) -> str | None:
 class MixedOptions(Options):
     """``H x(t) + G u(t) <= h``, row by row."""
 
-    H: list[list[float]] = Field(min_length=1)
+    H: RowsOfNumbers
     """One column per state."""
 
-    G: list[list[float]] = Field(min_length=1)
+    G: RowsOfNumbers
     """As many rows as ``H``, one column per control."""
 
     h: OneOrMore
@@ -206,10 +207,10 @@ class PathOptions(SetOptions, populate_by_name=True):
 class IntegralOptions(Options, populate_by_name=True):
     """``lower <= int (H x(t) + G u(t)) dt <= upper`` over a window of time, row by row."""
 
-    H: list[list[float]] | None = Field(default=None, min_length=1)
+    H: RowsOfNumbers | None = None
     """One column per state; 0 unless given."""
 
-    G: list[list[float]] | None = Field(default=None, min_length=1)
+    G: RowsOfNumbers | None = None
     """One column per control; 0 unless given. As many rows as ``H``."""
 
     start: float = Field(default=0.0, alias="from", ge=0.0)

@@ -13,7 +13,7 @@ from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
-from sparserob_core.experiment.directory.finished import read_arrays
+from sparserob_core.experiment.config.matrices.arrays import read_arrays
 from sparserob_core.sip.convex_set import Array
 
 FILE = "adversary.npz"

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
-from zipfile import BadZipFile, ZipFile
-from zlib import error as ZlibError
 
 import numpy as np
 
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.matrices.arrays import read_arrays
 from sparserob_core.experiment.directory.rounds import BOUND, CUTS, FORMULATIONS, cuts_of, with_decisions
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
@@ -35,8 +34,6 @@ UNFINISHED = "the run has not finished"
 NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
 ANSWERS = ("gains", "observer")  # how a decision answers what is measured, where it does: states, or outputs
 SAME = 1e-9  # of the largest number of an array, how far it may be from what follows from another
-LARGEST = 2**31
-"""Bytes of arrays in one file, at most: no run writes as many, and a small file can pretend to hold any number."""
 LARGEST_TEXT = 2**27
 """Bytes of one JSON file, at most: read, it takes 25 times as much memory where it is nothing but empty lists. The
 largest that runs write have some 10 million; with ten times as many a file could take all of a machine."""
@@ -290,38 +287,6 @@ def read_finished(
             f"got {theta.dtype} of shape {theta.shape}" + ("" if theta.shape != shape else " that are not all finite")
         )
     return FinishedRun(stored, experiment, theta)
-
-
-def read_arrays(file: Path, largest: int | None = None) -> dict[str, Array]:
-    """The arrays of an ``.npz`` file, none when there is no such file; raises `InputError` when it cannot be read, or
-    takes more than ``largest`` bytes in all, `LARGEST` unless given."""
-    if not file.is_file():
-        return {}
-    try:
-        with ZipFile(file) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-        most = LARGEST if largest is None else largest
-        if size > most:
-            raise InputError(f"{file}: cannot be read: expected arrays of at most {most} bytes in all, got {size}")
-        with np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except InputError:
-        raise
-    except (BadZipFile, EOFError):
-        raise InputError(
-            f"{file}: cannot be read: expected arrays in the format .npz, got something else, or a part of it"
-        ) from None
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror or 'it is damaged'}") from None
-    except (ValueError, KeyError, AttributeError, TypeError, NotImplementedError, MemoryError, ZlibError, RuntimeError):
-        raise InputError(
-            f"{file}: cannot be read: expected arrays of numbers and text in the format .npz, got others"
-        ) from None
-    if any(not isinstance(array, np.ndarray) for array in arrays.values()):
-        raise InputError(
-            f"{file}: cannot be read: expected arrays of numbers and text in the format .npz, got other entries"
-        )
-    return arrays
 
 
 def read_json(file: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 from sparserob_core.arguments import is_whole
 from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config.load import Loaded, load_config
+from sparserob_core.experiment.config.matrices.files import resolve
 from sparserob_core.experiment.config.overrides import parse_overrides
 from sparserob_core.experiment.config.plain import BESIDE, difference, identity, value_text
 from sparserob_core.experiment.config.reader import Source, read_source, read_value, write_yaml
@@ -253,8 +255,10 @@ def _fault(source: Source, key: str, said: str) -> ConfigError:
 
 
 def _based(source: Source) -> Source:
-    """The base of a study, which can be moved: the files of its plugins by their whole names, its own name as title."""
-    data = dict(source.data)
+    """The base of a study, which can be moved: the files of its plugins by their whole names, the numbers of matrices
+    instead of their files, its own name as title."""
+    data = copy.deepcopy(source.data)
+    list(resolve(data, lambda _: source.folder))  # what is wrong with one is said where a config is checked
     files = data.get("plugins")
     if isinstance(files, list) and all(isinstance(file, str) for file in files):
         data["plugins"] = [str((source.folder / file).resolve()) for file in files]

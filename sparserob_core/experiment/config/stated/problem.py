@@ -27,6 +27,7 @@ from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, 
 from sparserob_core.control.problem.tracing import traced
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.matrices.packed import pack
 from sparserob_core.experiment.plugins.hookspecs import SetPlugin
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -37,6 +38,7 @@ WRITTEN = {
     "measurements", "repeat",
 }  # fmt: skip
 """The fields of a problem that are written; one that is added and not named here is refused, not lost."""
+MANY = 2500  # entries of a matrix that nobody reads: of ten times more a config has as many values as it may have
 WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
 
 
@@ -137,14 +139,15 @@ def _defined_keys(systems: Sequence[LinearSystem]) -> dict[str, Any]:
     return {"define": {name: one.text for name, one in defined}} if defined else {}
 
 
-def _rows(system: LinearSystem, name: str) -> list[list[str | float]]:
+def _rows(system: LinearSystem, name: str) -> Any:
+    """Rows of numbers and expressions, or large ones in one text."""
     given = getattr(system, name)
     if isinstance(given, ExpressionMatrix):
         return [[entry.text for entry in row] for row in given.entries]
     if callable(given):
         return traced(name, given, system.names, system.probes)
-    rows: list[list[str | float]] = np.asarray(given, dtype=float).tolist()
-    return rows
+    matrix: Array = np.asarray(given, dtype=float)
+    return pack(matrix) if matrix.size > MANY else matrix.tolist()
 
 
 def _parameter_keys(parameters: ConvexSet, names: Sequence[str]) -> dict[str, Any]:

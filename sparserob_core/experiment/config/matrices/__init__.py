@@ -1,0 +1,1 @@
+"""Matrices that stand in a file beside a config, and in one text within it."""

@@ -1,0 +1,97 @@
+"""``{file: plant.npz, name: A}`` in a config: data only, read once, and from then on the numbers themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path as File
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.errors import InputError, Path
+from sparserob_core.experiment.config.matrices.arrays import read_arrays
+from sparserob_core.experiment.config.matrices.packed import Packed, checked, pack, shape_of, spread
+from sparserob_core.experiment.plugins.messages import Complaint, shown
+from sparserob_core.sip.convex_set import Array
+
+KEYS = {"file", "name"}
+PARTS = ("data", "indices", "indptr", "shape")
+LARGEST = 2**28  # bytes of the arrays of a file; ten times less refuses dense matrices of 2000 states
+# Characters of all matrices of a config, which is read back as one text of at most four million: ten times more takes
+# a minute to read, a tenth refuses dense matrices of 200 states.
+MOST_TEXT = 3_500_000
+SUFFIX = ".npz"
+
+
+def resolve(data: dict[str, Any], folder: Callable[[Path], File]) -> Iterator[Complaint]:
+    """Put the numbers in the place of every ``{file: ..., name: ...}`` below the problem, relative to the ``folder`` of
+    its key; what is wrong with one, with its key."""
+    known: dict[File, dict[str, Array]] = {}
+    size = 0
+    for path, holder, key in list(_references(data.get("problem"), ("problem",))):
+        given = holder[key]
+        try:
+            holder[key] = pack(_read(given, folder(path), known).array)
+            size += sum(len(text) for text in holder[key].values() if isinstance(text, str))
+            if size > MOST_TEXT:
+                expected = f"matrices of at most {MOST_TEXT} characters together, as a run directory holds them"
+                raise InputError(expected=expected, got="more")
+        except InputError as error:
+            yield Complaint(path, str(error))
+
+
+def _references(data: Any, path: Path) -> Iterator[tuple[Path, Any, Any]]:
+    """Where a matrix from a file stands: its path, what holds it, and the key there."""
+    entries = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for key, value in entries:
+        if isinstance(value, Mapping) and set(value) == KEYS:
+            yield (*path, key), data, key
+        else:
+            yield from _references(value, (*path, key))
+
+
+def _read(given: Mapping[str, object], folder: File, known: dict[File, dict[str, Array]]) -> Packed:
+    name, stated = given["name"], given["file"]
+    if not isinstance(stated, str) or not stated.endswith(SUFFIX):
+        raise InputError(path="file", expected=f"a file whose name ends with {SUFFIX}", got=shown(stated))
+    if not isinstance(name, str) or not name:
+        raise InputError(path="name", expected="the name of a matrix in the file", got=shown(name))
+    file = folder / stated
+    if file not in known:
+        if not file.is_file():
+            raise InputError(path="file", expected=f"a file, relative to {folder}", got=f"{stated}, which is none")
+        known[file] = read_arrays(file, LARGEST)
+    try:
+        return matrix_in(known[file], name)
+    except InputError as error:
+        error.path = (stated, *error.path)
+        raise
+
+
+def matrix_in(arrays: Mapping[str, Array], name: str) -> Packed:
+    """The matrix of that name: an array of one or two axes, of one a column, or a sparse one in four parts. Raises
+    `InputError` that begins with the name of the array at fault."""
+    if name in arrays:
+        dense = _numbers(arrays, name, "fiu")
+        if dense.ndim not in (1, 2) or not dense.size:
+            raise InputError(path=name, expected="a matrix, rows by columns", got=f"an array of shape {dense.shape}")
+        matrix = dense.reshape(-1, 1) if dense.ndim == 1 else dense
+        shape_of(matrix.shape, name)
+        return checked(matrix, name)
+    missing = [part for part in PARTS if f"{name}_{part}" not in arrays]
+    if missing:
+        there = ", ".join(sorted(arrays)) or "nothing"
+        expected = f"an array {name}, or a sparse matrix as {', '.join(f'{name}_{part}' for part in PARTS)}"
+        raise InputError(path=name, expected=expected, got=there)
+    shape = shape_of(_numbers(arrays, f"{name}_shape", "iu").tolist(), f"{name}_shape")
+    values = _numbers(arrays, f"{name}_data", "fiu").astype(float)
+    indices, pointers = (_numbers(arrays, f"{name}_{part}", "iu") for part in ("indices", "indptr"))
+    return checked(spread(shape, values, indices, pointers, f"{name}_indptr"), f"{name}_data")
+
+
+def _numbers(arrays: Mapping[str, Array], name: str, kinds: str) -> npt.NDArray[Any]:
+    if arrays[name].dtype.kind not in kinds:
+        expected = "real numbers" if "f" in kinds else "whole numbers"
+        raise InputError(path=name, expected=expected, got=f"an array of {arrays[name].dtype}")
+    return np.asarray(arrays[name])

@@ -1,0 +1,157 @@
+"""A matrix as one text, ``{shape: [rows, columns], csr: ...}``: what stands in a resolved config for numbers that a
+file or a sparse array held, so that a run directory needs no other file, and its digest is one of the numbers.
+
+The text is base64 of little-endian numbers: of ``csr`` the row pointers and the column indices, four bytes each, then
+the entries, eight bytes each; of ``dense`` the entries, row by row. It is the shorter of the two.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeAlias, final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, SerializerFunctionWrapHandler
+from pydantic_core import core_schema
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+
+# Entries of a matrix, zeros included: it becomes a dense one. Ten times more are 320 MB for every copy, and no plant of
+# so many states is solved; a tenth would refuse plants of a thousand states.
+MOST = 4_000_000
+CSR, DENSE = "csr", "dense"
+Whole: TypeAlias = npt.NDArray[np.integer[Any]]
+
+
+@final
+class Packed(list[list[float]]):
+    """The rows of a matrix that is written as one text again."""
+
+    @property
+    def array(self) -> Array:
+        """The matrix ``(rows, columns)``."""
+        return np.array(self, dtype=float)
+
+    @property
+    def column(self) -> list[float]:
+        """The numbers of a matrix of one column; raises `InputError` for another one."""
+        if any(len(row) != 1 for row in self):
+            raise InputError(expected="one column", got=f"{len(self[0])}")
+        return [row[0] for row in self]
+
+
+def pack(matrix: Array) -> dict[str, Any]:
+    """The same numbers as data of a config."""
+    rows, columns = np.nonzero(matrix)
+    pointers = np.searchsorted(rows, np.arange(len(matrix) + 1))
+    sparse = [pointers.astype("<i4"), columns.astype("<i4"), matrix[rows, columns].astype("<f8")]
+    parts = {CSR: b"".join(part.tobytes() for part in sparse), DENSE: matrix.astype("<f8").tobytes()}
+    kind = min(parts, key=lambda name: len(parts[name]))
+    return {"shape": list(matrix.shape), kind: base64.b64encode(parts[kind]).decode()}
+
+
+def unpack(data: Mapping[str, Any]) -> Packed:
+    """The matrix that is written so; raises `InputError` that begins with the key at fault."""
+    kinds = [kind for kind in (CSR, DENSE) if kind in data]
+    if len(kinds) != 1 or set(data) != {"shape", *kinds}:
+        raise InputError(
+            expected="rows of numbers, {file: ..., name: ...}, or {shape: ..., csr: ...} as a run writes it",
+            got=f"the keys {', '.join(map(str, data))}",
+        )
+    rows, columns = shape_of(data["shape"], "shape")
+    kind, text = kinds[0], data[kinds[0]]
+    try:
+        raw = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError, TypeError):
+        raise InputError(path=kind, expected="base64", got=f"{str(text)[:20]!r}") from None
+    first = 4 * (rows + 1)
+    wrong = len(raw) != 8 * rows * columns if kind == DENSE else len(raw) < first or (len(raw) - first) % 12
+    if wrong:
+        raise InputError(path=kind, expected=f"the bytes of {rows} x {columns} numbers", got=f"{len(raw)} bytes")
+    if kind == DENSE:
+        return checked(np.frombuffer(raw, "<f8").reshape(rows, columns), kind)
+    count = (len(raw) - first) // 12
+    pointers, indices = np.frombuffer(raw, "<i4", rows + 1), np.frombuffer(raw, "<i4", count, first)
+    values = np.frombuffer(raw, "<f8", count, first + 4 * count)
+    return checked(spread((rows, columns), values, indices, pointers, kind), kind)
+
+
+def shape_of(given: object, where: str) -> tuple[int, int]:
+    """Two positive numbers of rows and columns that are not too many; raises `InputError`."""
+    sizes = list(given) if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) else []
+    whole = [isinstance(size, int | np.integer) and not isinstance(size, bool) and size > 0 for size in sizes]
+    if len(sizes) != 2 or not all(whole):
+        raise InputError(path=where, expected="two whole numbers, rows and columns", got=f"{given!r}"[:60])
+    rows, columns = map(int, sizes)
+    if rows * columns > MOST:
+        raise InputError(path=where, expected=f"at most {MOST} entries, zeros included", got=f"{rows} x {columns}")
+    return rows, columns
+
+
+def spread(shape: tuple[int, int], values: Array, indices: Whole, pointers: Whole, where: str) -> Array:
+    """The dense matrix of a compressed sparse one, entries at one place added up; raises `InputError` for pointers and
+    indices that are none."""
+    rows, columns = shape
+    fits = pointers.shape == (rows + 1,) and values.ndim == 1 and values.shape == indices.shape
+    if not fits or pointers[0] != 0 or pointers[-1] != values.size or (np.diff(pointers) < 0).any():
+        expected = f"{rows + 1} row pointers that do not decrease, from 0 to the number of entries"
+        raise InputError(path=where, expected=expected, got=f"{pointers.size}, for {values.size} entries")
+    if indices.size and not (indices.min() >= 0 and indices.max() < columns):
+        raise InputError(
+            path=where, expected=f"column indices from 0 to {columns - 1}", got=f"{indices.min()} to {indices.max()}"
+        )
+    matrix = np.zeros(shape)
+    np.add.at(matrix, (np.repeat(np.arange(rows), np.diff(pointers)), indices), values)
+    return matrix
+
+
+def checked(matrix: Array, where: str) -> Packed:
+    """The rows of a matrix of finite numbers; raises `InputError`."""
+    if not np.isfinite(matrix).all():
+        place = tuple(int(i) + 1 for i in np.argwhere(~np.isfinite(matrix))[0])
+        raise InputError(path=where, expected="finite numbers", got=f"{matrix[place[0] - 1, place[1] - 1]} at {place}")
+    return Packed(np.asarray(matrix, dtype=float).tolist())
+
+
+@final
+@dataclass(frozen=True)
+class OrPacked:
+    """Marks rows of a config that may also be a matrix from a file, or one in one text; ``column``: numbers that may be
+    one of one column."""
+
+    column: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_wrap_validator_function(
+            self._read,
+            handler(source),
+            serialization=core_schema.wrap_serializer_function_ser_schema(_written, schema=core_schema.any_schema()),
+        )
+
+    def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
+        from_file = {
+            "type": "object",
+            "properties": {"file": {"type": "string"}, "name": {"type": "string"}},
+            "required": ["file", "name"],
+            "additionalProperties": False,
+        }
+        return {"anyOf": [handler(schema), from_file]}
+
+    def _read(self, value: object, handler: Any) -> object:
+        if isinstance(value, Packed):
+            return value
+        if not isinstance(value, Mapping):
+            return handler(value)
+        return handler(unpack(value).column) if self.column else unpack(value)
+
+
+def _written(value: object, handler: SerializerFunctionWrapHandler) -> object:
+    return pack(value.array) if isinstance(value, Packed) else handler(value)
+
+
+RowsOfNumbers: TypeAlias = Annotated[list[list[float]], Field(min_length=1), OrPacked()]
