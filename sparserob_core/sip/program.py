@@ -236,7 +236,7 @@ class SemiInfiniteProgram:
     ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
     ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
     (piece lengths), ``(k,)``. ``activity``: what it counts, always in the user's units, that an entry of ``S x`` is not
-    0, of the first entries or all, where that means something (`methods.counting`).
+    0, of the first entries or all, where that means something (`working.counting`).
     ``twin`` makes the same program in its own units (`own_units`); ``cost_unit`` is what a cost of 1 is in the user's
     units, for a program in its own, and ``image_units (k,)`` what 1 of each entry of ``S x`` is.
     ``blocks (k,)``: images with the same number of at least 0 count together, with their weight times their Euclidean

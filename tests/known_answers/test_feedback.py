@@ -23,7 +23,7 @@ from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, tools_of
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.sip.methods.robust import largest_factor, least_slack
+from sparserob_core.sip.working.scaled import largest_factor, least_slack
 from tests.support.places import CONFIGS, ROOT
 from tests.support.problems import double_integrator, spring
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.methods import robust
+from sparserob_core.sip.working import robust
 
 
 def problem(seed: int) -> dict[str, Any]:

@@ -12,7 +12,9 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.experiment.run import run as run_module
 from sparserob_core.sip.method import Deadline
-from sparserob_core.sip.methods import exchange, robust, sparsest
+from sparserob_core.sip.methods import sparsest
+from sparserob_core.sip.working.plain import PlainRows
+from sparserob_core.sip.working.robust import RobustRows
 
 LOSS, GUST, WALL, START = (0.3, 0.5), 0.1, 1.0, 2.0
 
@@ -191,22 +193,15 @@ def test_a_relaxed_program_that_is_not_solved_leaves_the_control_that_is_proven(
     monkeypatch.setattr(Clock, "looks", looks)
     monkeypatch.setattr(Clock, "passed", False)  # a share of the time is over, the time is not
     monkeypatch.setattr(Clock, "reason", "")
-    relax, solved = exchange._relaxed, robust._solved
+    rows = RobustRows if feedback else PlainRows
+    relax = rows.relax
 
-    def failing(answer: Any) -> Any:
+    def relaxed(working: Any, ledger: Any, *rest: Any) -> Any:
+        answer = relax(working, ledger, *rest)
         failed = replace(answer.solution, status="failed", residual=1.0, message="nothing came of it")
-        return replace(answer, solution=failed)
+        return answer if ledger.proven is None else ledger.without(replace(answer, solution=failed))
 
-    def relaxed(method: Any, working: Any, ledger: Any) -> Any:
-        answer = relax(method, working, ledger)
-        return answer if ledger.proven is None else failing(answer)
-
-    def counterpart(working: Any, ledger: Any) -> Any:
-        answer = solved(working, ledger)
-        return answer if ledger.proven is None else ledger.without(failing(answer))
-
-    monkeypatch.setattr(exchange, "_relaxed", relaxed)
-    monkeypatch.setattr(robust, "_solved", counterpart)
+    monkeypatch.setattr(rows, "relax", relaxed)
     result = sr.run(ridden("moving", 16, not feedback, feedback), quiet=True, figures=False).result
     assert result.status == "verified"
     assert "nothing came of it" in result.message

@@ -25,10 +25,10 @@ from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Deadline, OutOfTime, Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.ledger import Violated, prover_of
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result, relative_gap
+from sparserob_core.sip.working.ledger import Violated, prover_of
 
 PROVEN = ("certified", "verified")
 WHOLE = 10.0  # times what it takes to write a whole program down: a solution takes more

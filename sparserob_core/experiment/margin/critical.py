@@ -15,10 +15,10 @@ from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.ledger import unproven
-from sparserob_core.sip.methods.robust import largest_factor, least_slack
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.parametric import ParametricProgram, extreme_program, slack_program
+from sparserob_core.sip.working.ledger import unproven
+from sparserob_core.sip.working.scaled import largest_factor, least_slack
 
 ROOM = 1e3  # bounds of the slack, in units of the violation without control
 PROBES = 80  # factors at most at which the slack is computed

@@ -14,13 +14,13 @@ from sparserob_core.options import Options
 from sparserob_core.sip.events import RoundFinished, forwarded
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.ledger import alarm, unproven
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, verdict, witness, worst_of
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.scenario_bound import scenario_bound
 from sparserob_core.sip.separation.separation import separate
+from sparserob_core.sip.working.ledger import alarm, unproven
 
 
 class Nominal(Method, Options):

@@ -24,9 +24,9 @@ from sparserob_core.sip.finite import HIGHS, NOBODY, FiniteProgram
 from sparserob_core.sip.inner.duality import farkas_margin, proving
 from sparserob_core.sip.inner.solve import elastic_program, unrelaxed
 from sparserob_core.sip.inner.vertex import Corner, simplex
-from sparserob_core.sip.methods.counting import MISSED, convex_below, prices_of, whole
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
+from sparserob_core.sip.working.counting import MISSED, convex_below, prices_of, whole
 
 SECONDS = 20.0  # that a mixed-integer program may take
 INTEGRAL = 1e-6  # of an entry's range, within which it is 0 or a letter
@@ -78,25 +78,28 @@ class Branching:
     def _safe(self, bound: float) -> float:
         return bound if np.isinf(bound) else whole(self.program, bound - INWARDS * abs(bound))
 
-    def grow(self, incumbent: Callable[[], float], look: Callable[[Array], bool], go_on: Callable[[int], bool]) -> None:
-        """Divide the part with the least bound until none is below the ``incumbent`` count. ``look`` is shown decisions
-        that count less, and returns whether the rows or the incumbent are others now; ``go_on`` is asked before each
-        step, with the number of nodes."""
-        while self._heap and self._heap[0][0] < np.inf:
-            bound, number = self._heap[0]
-            if self._safe(bound) >= incumbent() * (1.0 - MISSED) or not go_on(len(self.nodes)):
-                return
-            x = self.parts[number].x
-            if x is None:
-                return
-            image = self._undecided(number, x)
-            if image is None and look(x):
-                if self._safe(bound) < incumbent() * (1.0 - MISSED):
-                    heapq.heapreplace(self._heap, (self._renewed(number), number))
-                continue
-            if image is None and (image := self._free(number)) is None:
-                return
-            self._divide(number, image, float(self.program.finite.image(x)[image]))
+    def open(self, incumbent: float) -> bool:
+        """Whether a part may hold a decision that counts less than the ``incumbent``."""
+        least = self._heap[0][0] if self._heap else np.inf
+        return least < np.inf and self._safe(least) < incumbent * (1.0 - MISSED)
+
+    def grow(self, incumbent: Callable[[], float], look: Callable[[Array], bool]) -> bool:
+        """Divide the part with the least bound, of a tree that is open; ``False`` where it cannot be divided. ``look``
+        is shown decisions that count less, and returns whether the rows or the ``incumbent`` count are others now: then
+        the part is bounded anew instead."""
+        bound, number = self._heap[0]
+        x = self.parts[number].x
+        if x is None:
+            return False
+        image = self._undecided(number, x)
+        if image is None and look(x):
+            if self._safe(bound) < incumbent() * (1.0 - MISSED):
+                heapq.heapreplace(self._heap, (self._renewed(number), number))
+            return True
+        if image is None and (image := self._free(number)) is None:
+            return False
+        self._divide(number, image, float(self.program.finite.image(x)[image]))
+        return True
 
     def _divide(self, number: int, image: int, value: float) -> None:
         low, high, _ = self._bounds(self.parts[number])

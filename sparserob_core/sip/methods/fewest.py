@@ -12,12 +12,12 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut, Proof
 from sparserob_core.sip.method import Method, Tools
-from sparserob_core.sip.methods.counting import DUST, count, counted_below, prices_of
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.ledger import Violated
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import CELLS, prove
 from sparserob_core.sip.result import Result
+from sparserob_core.sip.working.counting import DUST, count, counted_below, prices_of
+from sparserob_core.sip.working.ledger import Violated
 
 TOLERANCE, ROUNDS = 1e-6, 40  # of the bound, which is told in whole pieces or with six digits
 PROPORTIONAL = 1e-12

@@ -20,12 +20,12 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
-from sparserob_core.sip.methods.counting import DUST, count, prices_of
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.ledger import prover_of, unproven
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result, relative_gap
+from sparserob_core.sip.working.counting import DUST, count, prices_of
+from sparserob_core.sip.working.ledger import prover_of, unproven
 
 FEWER = 1e-9  # relative: a count that is less by no more than this is the same
 PROVEN = ("certified", "verified")

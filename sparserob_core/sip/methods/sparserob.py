@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -23,7 +23,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forwarded, frozen, ignore
 from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, Method, Tools
-from sparserob_core.sip.methods.ledger import Answer, Ledger, prover_of
+from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, worst_of
@@ -34,6 +34,7 @@ from sparserob_core.sip.result import Result, SearchTrace
 from sparserob_core.sip.rules import InnerStop, Metropolis, OptimisersSettle, OuterStep, OuterStop, Schedule, Selection
 from sparserob_core.sip.search.search import Rules, Target, maximise
 from sparserob_core.sip.separation.separation import separate
+from sparserob_core.sip.working.ledger import Answer, Ledger, prover_of
 
 
 class SparseRob(Method, Options):
@@ -93,52 +94,59 @@ class SparseRob(Method, Options):
         relaxed = RelaxedProgram(imposed, tools.solver, tools.regulariser, deadline=tools.deadline)
         ledger = Ledger(program, relaxed, tools, self.tolerance)
         g = TupleValue(imposed, relaxed, self.indices or program.n)
-        steps: list[OuterStep] = []
-        parts: list[SearchTrace] = []
-        try:
-            with tools.deadline.enforced():
-                result = self._maximise(g, ledger, steps, parts)
-        except KeyboardInterrupt as error:
-            result = ledger.stopped(error, prover_of(program, tools))
-        trace = SearchTrace.joined(parts) if parts else None
+        epsilon = 0.0 if tools.regulariser is None else tools.continuation.start
+        outer = _Outer(self, g, ledger, epsilon, tools.rng.uniform(g.domain.lower, g.domain.upper))
+        result = drive(tools.deadline, outer.step, lambda error: ledger.stopped(error, prover_of(program, tools)))
+        trace = SearchTrace.joined(outer.parts) if outer.parts else None
         evaluations = 0 if trace is None else int(trace.value.size)
-        counts = {**result.counts, "rounds": len(steps), "evaluations": evaluations}
+        counts = {**result.counts, "rounds": len(outer.steps), "evaluations": evaluations}
         return replace(result, trace=trace, counts=counts)
 
-    def _maximise(self, g: TupleValue, ledger: Ledger, steps: list[OuterStep], parts: list[SearchTrace]) -> Result:
+
+@dataclass(eq=False)
+class _Outer:
+    """The outer iteration: the weight ``epsilon`` and the best ``point`` so far, (t_0, Beta_0) to begin with; its
+    ``steps``, and the ``parts`` of the search."""
+
+    method: SparseRob
+    g: TupleValue
+    ledger: Ledger
+    epsilon: float
+    point: Array
+    steps: list[OuterStep] = field(default_factory=list)
+    parts: list[SearchTrace] = field(default_factory=list)
+
+    def step(self, number: int) -> Result | None:
+        """Iteration ``j``, counted from 0; its result where it is the last."""
+        method, g, ledger, epsilon, j = self.method, self.g, self.ledger, self.epsilon, number - 1
         program, tools = ledger.program, ledger.tools
-        sc1 = self.sc1 or OptimisersSettle()
-        epsilon = 0.0 if tools.regulariser is None else tools.continuation.start
-        point = tools.rng.uniform(g.domain.lower, g.domain.upper)  # (t_0, Beta_0)
-        j = 0
-        while True:
-            tools.deadline.check()
 
-            # Maximise: g(epsilon; .) over tuples, from the best so far, until SC2; walks accept by SlCr.
-            point = _searched(self, g, ledger, parts, point, epsilon, j)
-            value, x = g.at(point), g.solution.x
-            answer = Answer(g.solution, g.rows(), epsilon, value)
-            steps.append(OuterStep(j, epsilon, value, program.cost(x), ledger.lower, x))
-            if np.isfinite(value):
-                found = separate(program, x, tools, number=j + 1)
-                ledger.tell(j + 1, answer, found, np.inf, kept=int((answer.multipliers > 0).sum()))
+        # Maximise: g(epsilon; .) over tuples, from the best so far, until SC2; walks accept by SlCr.
+        self.point = _searched(method, g, ledger, self.parts, self.point, epsilon, j)
+        value, x = g.at(self.point), g.solution.x
+        answer = Answer(g.solution, g.rows(), epsilon, value)
+        self.steps.append(OuterStep(j, epsilon, value, program.cost(x), ledger.lower, x))
+        if np.isfinite(value):
+            found = separate(program, x, tools, number=number)
+            ledger.tell(number, answer, found, np.inf, kept=int((answer.multipliers > 0).sum()))
 
-            # No optimiser: g is infinite where nothing meets the constraints at the tuple.
-            if g.solution.status == "infeasible" or not np.isfinite(x).all():
-                return ledger.without(answer)
+        # No optimiser: g is infinite where nothing meets the constraints at the tuple.
+        if g.solution.status == "infeasible" or not np.isfinite(x).all():
+            return ledger.without(answer)
 
-            # SC1: when the optimisers of successive weights are near one another, judge the last one like any other.
-            if epsilon <= tools.continuation.stop or sc1(steps):
-                plain = ledger.relaxed.solve(answer.rows, 0.0)
-                if plain.status == "optimal":
-                    ledger.improve(ledger.relaxed.lower_bound(answer.rows, plain))
-                proofs = prove(program, x, tools.notify, deadline=tools.deadline)
-                found = separate(program, x, tools)
-                return ledger.judged(answer, worst_of(found), as_bad_as_found(proofs, found), tools.deadline.reason)
+        # Regu: the next weight, unless SC1: when the optimisers of successive weights are near one another.
+        sc1 = method.sc1 or OptimisersSettle()
+        if epsilon > tools.continuation.stop and not sc1(self.steps):
+            self.epsilon = tools.continuation.lighter(epsilon, number, method.regu)
+            return None
 
-            # Regu: the next weight.
-            j += 1
-            epsilon = tools.continuation.lighter(epsilon, j, self.regu)
+        # Terminate: judge the last one like any other.
+        plain = ledger.relaxed.solve(answer.rows, 0.0)
+        if plain.status == "optimal":
+            ledger.improve(ledger.relaxed.lower_bound(answer.rows, plain))
+        proofs = prove(program, x, tools.notify, deadline=tools.deadline)
+        found = separate(program, x, tools)
+        return ledger.judged(answer, worst_of(found), as_bad_as_found(proofs, found), tools.deadline.reason)
 
 
 def _searched(

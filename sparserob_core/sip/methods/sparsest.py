@@ -23,9 +23,8 @@ from sparserob_core.sip.events import RoundFinished, forwarded, ignore
 from sparserob_core.sip.evidence import Cut, Leaf, Sparsest
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.branching import Branching, proposed
-from sparserob_core.sip.methods.counting import DUST, count, counted_below, prices_of
+from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.ledger import PAID, unproven
 from sparserob_core.sip.methods.reweighted import imposed_cuts, on_support
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -33,6 +32,9 @@ from sparserob_core.sip.proof.verdict import verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.separation.separation import separate
+from sparserob_core.sip.working.counting import DUST, count, counted_below, prices_of
+from sparserob_core.sip.working.ledger import unproven
+from sparserob_core.sip.working.securing import PAID
 
 PROVEN = ("certified", "verified")
 PROPOSALS = 40  # of the mixed-integer solver
@@ -73,7 +75,6 @@ class SparsestMethod(Method, Options):
         return sorted(value)
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        started = time.perf_counter()
         if program.finite.blocks is not None:
             raise InputError("method: sparsest counts channels one by one; expected a cost without groups")
         if program.activity is None or program.n != program.activity.size:
@@ -89,15 +90,7 @@ class SparsestMethod(Method, Options):
             return plain
         state = _Search(self, program, bounded, tools, letters, plain)
         root = state.root()
-        if root is not None:
-            return root
-        try:
-            with tools.deadline.enforced():
-                state.propose()
-                state.branch()
-        except KeyboardInterrupt as error:
-            tools.deadline.interrupt(error)
-        return state.result(started)
+        return drive(tools.deadline, state.step, state.stopped) if root is None else root
 
     def _bounded(self, program: SemiInfiniteProgram) -> tuple[SemiInfiniteProgram, Array | None]:
         """The program with bounds as narrow as the alphabet is, and its letters in the program's units."""
@@ -148,6 +141,13 @@ class _Search:
     """What was solved on the way: the convex program, and one for every set of entries that was tried."""
     missed: float = 0.0
     """By how much the last decision of letters missed constraints that were not yet imposed, in their norms."""
+    margin: float = 0.0
+    """By which the rows of the next proposal are tightened, in their norms."""
+    roomy: bool = True
+    """Whether something may be that far from the constraints."""
+    proposing: bool = True
+    started: float = field(default_factory=time.perf_counter)
+    shown: float = field(default_factory=time.monotonic)
 
     def __post_init__(self) -> None:
         self.relaxed = RelaxedProgram(self.bounded, self.tools.solver, None, deadline=self.tools.deadline)
@@ -294,40 +294,48 @@ class _Search:
         self.rounds.append(self.told)
         self.tools.notify(self.told)
 
-    def propose(self) -> None:
-        """Ask the mixed-integer solver for decisions that count less than the best, until it has none. While none is
-        proven, any will do that keeps away from the constraints by more than the last one missed them."""
-        margin, most = 0.0, np.inf
-        for _ in range(PROPOSALS):
-            self.tools.deadline.check()
-            if self.closed:
-                return
-            crude = self.letters is not None and self.best is None
-            norms = np.linalg.norm(self.rows.G, axis=1)
-            rows = replace(self.rows, h=self.rows.h - margin * norms) if crude else self.rows
-            x = proposed(self.bounded, self.relaxed, rows, self.letters, ANY if crude else 0.0)
-            if x is None and crude and margin > 0.0:
-                margin, most = 0.0, 0.0  # nothing is that far from the constraints
-                continue
-            if x is None or not self.look(x):
-                return
-            margin = min(PAID * self.missed, most)
-
-    def branch(self) -> None:
-        """Close what is left by branch and bound."""
+    def step(self, number: int) -> Result | None:
+        """One proposal, and where there are no more, one division of a part of the tree; the result where the bounds
+        have met, or nothing is left to try."""
         assert self.tree is not None
-        shown = time.monotonic()
 
-        def go_on(nodes: int) -> bool:
-            nonlocal shown
-            if time.monotonic() - shown > 1.0:
-                shown = time.monotonic()
-                self.tell()
-            if nodes >= self.method.nodes:
-                self.ending = f"the {self.method.nodes} nodes of the method are used up"
-            return nodes < self.method.nodes and not self.tools.deadline.passed
+        # Propose: a decision that counts less than the best, as the mixed-integer solver sees it.
+        if self.proposing and number <= PROPOSALS and not self.closed:
+            self.proposing = self.propose()
+            return None
 
-        self.tree.grow(lambda: self.least, self.look, go_on)
+        # Terminate: no part of the tree may hold a decision that counts less, or there are too many parts.
+        if not self.tree.open(self.least):
+            return self.result()
+        if len(self.tree.nodes) >= self.method.nodes:
+            self.ending = f"the {self.method.nodes} nodes of the method are used up"
+            return self.result()
+
+        # Branch: divide the part with the least bound, or prove the decision that is its optimum.
+        if time.monotonic() - self.shown > 1.0:
+            self.shown = time.monotonic()
+            self.tell()
+        return None if self.tree.grow(lambda: self.least, self.look) else self.result()
+
+    def stopped(self, error: KeyboardInterrupt) -> Result:
+        """What is known where the time is over or a key was pressed."""
+        self.tools.deadline.interrupt(error)
+        return self.result()
+
+    def propose(self) -> bool:
+        """Ask the mixed-integer solver for a decision that counts less than the best; whether it is to be asked again.
+        While none is proven, any will do that keeps away from the constraints by more than the last one missed them."""
+        crude = self.letters is not None and self.best is None
+        norms = np.linalg.norm(self.rows.G, axis=1)
+        rows = replace(self.rows, h=self.rows.h - self.margin * norms) if crude else self.rows
+        x = proposed(self.bounded, self.relaxed, rows, self.letters, ANY if crude else 0.0)
+        if x is None and crude and self.margin > 0.0:
+            self.margin, self.roomy = 0.0, False
+            return True
+        if x is None or not self.look(x):
+            return False
+        self.margin = PAID * self.missed if self.roomy else 0.0
+        return True
 
     def _hindrance(self) -> str:
         """Why there is no control, though none is excluded, and what would help."""
@@ -338,14 +346,14 @@ class _Search:
             f"no control of letters was found, and none is excluded; {more} or letters nearer to one another would help"
         )
 
-    def result(self, started: float) -> Result:
+    def result(self) -> Result:
         """What is known, told as a result whose cost is the count."""
         assert self.tree is not None
         program, unit = self.program, self.program.cost_unit
         ending = self.ending or self.tools.deadline.reason
         counts = {"relaxed_programs": self.relaxed.solves, "rounds": len(self.rounds), "nodes": len(self.tree.nodes)}
         letters = None if self.method.alphabet is None else tuple(self.method.alphabet)
-        tree, history, seconds = tuple(self.tree.nodes), tuple(self.rounds), time.perf_counter() - started
+        tree, history, seconds = tuple(self.tree.nodes), tuple(self.rounds), time.perf_counter() - self.started
         if self.best is None:
             none = self.tree.lower == np.inf
             said = f"no control with values in {list(letters or ())} meets the constraints, by branch and bound"

@@ -196,7 +196,7 @@ def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws
     elsewhere = (
         "control.feedback.closed_loop",
         "control.response.measurable",
-        "sip.methods.robust",
+        "sip.working.robust",
         "sip.search.search",
     )
     assert not loaded & {f"sparserob_core.{module}" for module in elsewhere}

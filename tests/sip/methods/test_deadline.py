@@ -1,4 +1,4 @@
-"""Guards sip/method (deadline) and sip/methods/ledger: a method that runs out of time or is interrupted returns what it
+"""Guards sip/method (deadline) and sip/working/ledger: a method that runs out of time or is interrupted returns what it
 knows, and claims no more than that; bounds that cross are an alarm."""
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.method import Deadline, OutOfTime
-from sparserob_core.sip.methods.ledger import alarm
 from sparserob_core.sip.program import Enclosure
 from sparserob_core.sip.proof.branch_and_bound import prove_family
 from sparserob_core.sip.result import relative_gap
+from sparserob_core.sip.working.ledger import alarm
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 KNOWN = ("verified", "refuted", "undecided")
@@ -178,7 +178,8 @@ def test_a_limit_that_is_over_before_anything_was_solved_returns_without_a_decis
 
 @pytest.mark.parametrize("when", ["before the first program", "before the first round"])
 def test_a_limit_under_feedback_leaves_what_is_known(when, monkeypatch):
-    from sparserob_core.sip.methods import robust
+    from sparserob_core.sip.methods import exchange
+    from sparserob_core.sip.working.robust import RobustRows
 
     system = sr.LinearSystem(A=[[-1.0]], B=[[1.0]])
     problem = sr.OptimalControlProblem(
@@ -200,11 +201,11 @@ def test_a_limit_under_feedback_leaves_what_is_known(when, monkeypatch):
     def over(*_, **__):
         raise OutOfTime("the time is over")
 
-    step = {"before the first program": "_solved", "before the first round": "separate"}[when]
-    monkeypatch.setattr(robust, step, over)
+    first = when == "before the first program"
+    monkeypatch.setattr(*((RobustRows, "relax") if first else (exchange, "separate")), over)
     result = solve()
     assert result.stopped == "the time is over"
-    if step == "_solved":
+    if first:
         assert (result.status, result.decision, result.upper_bound) == ("undecided", None, np.inf)
         assert result.lower_bound == 0.0  # of an L1 norm that much is known
     else:  # the only relaxed program, looked at once
@@ -215,7 +216,7 @@ def test_a_limit_under_feedback_leaves_what_is_known(when, monkeypatch):
 def test_a_limit_before_a_control_is_in_its_set_is_no_failure(monkeypatch):
     """The first relaxed program knows the round set of controls by few tangents, and peaks beyond it are no decision
     that is missed by its own bounds."""
-    from sparserob_core.sip.methods import robust
+    from sparserob_core.sip.methods import exchange
 
     problem = sr.OptimalControlProblem(
         system=sr.LinearSystem(A=[[0.0, 1.0], [-1.0, -0.2]], B=[[0.4, 0.0], [0.0, 1.0]]),
@@ -225,7 +226,7 @@ def test_a_limit_before_a_control_is_in_its_set_is_no_failure(monkeypatch):
         disturbance=sr.NormBall(2, 0.1, [0.0, 0.0]),
         terminal=[sr.NormBall(2, 0.3, [0.0, 0.0])],
     )
-    rounds, separated = [], robust.separate
+    rounds, separated = [], exchange.separate
 
     def over(*arguments):
         if len(rounds) == 2:
@@ -233,7 +234,7 @@ def test_a_limit_before_a_control_is_in_its_set_is_no_failure(monkeypatch):
         rounds.append(arguments)
         return separated(*arguments)
 
-    monkeypatch.setattr(robust, "separate", over)
+    monkeypatch.setattr(exchange, "separate", over)
     policy = sr.AffinePolicy(cost="peak", causal_signals=0)
     result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 6}, policy=policy)
     assert result.stopped == "the time is over"

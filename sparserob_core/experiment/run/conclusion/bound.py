@@ -84,7 +84,7 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
 
 
 def _allowed(result: Result) -> float:
-    """By how much the bound may be above the cost: multiplier times tolerance of every row (`sip.methods.ledger.alarm`,
+    """By how much the bound may be above the cost: multiplier times tolerance of every row (`sip.working.ledger.alarm`,
     which has judged the bound before, in the program's own units)."""
     units = {proof.family: proof.units for proof in result.proofs}
     allowed = np.inf if result.dual.mu.size else ROUNDING * abs(result.cost)

@@ -14,11 +14,11 @@ from sparserob_core.control.transcription.rounding import rounded_down
 from sparserob_core.experiment.assemble import ControlExperiment
 from sparserob_core.sip.evidence import Activity
 from sparserob_core.sip.method import Tools
-from sparserob_core.sip.methods.counting import count, share_of, whole
 from sparserob_core.sip.methods.fewest import LeastCount, is_vertex, multiple
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
+from sparserob_core.sip.working.counting import count, share_of, whole
 
 INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding does not find less
 ROUNDS, CELLS = 30, 64

@@ -17,9 +17,9 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Tools
-from sparserob_core.sip.methods.ledger import Ledger, Prover, unproven
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.result import Result, Status
+from sparserob_core.sip.working.ledger import Ledger, Prover, unproven
 
 Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an exchange that closes the gap
 FALLS = 1e-7  # of the largest coefficient: a cost per unit of a direction that is no rounding

@@ -1,16 +1,11 @@
-"""The accounts of a method: the best lower bound, the rounds that were told, and what may be claimed at the end.
-
-A proven decision comes first: one that keeps away from the constraints, so that there is an upper bound while a better
-one is sought and proven. Any exchange can have one that says how its imposed rows are solved when they are tightened by
-more (`Tightening`).
-"""
+"""The accounts of a method: the best lower bound, the rounds that were told, and what may be claimed at the end."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -32,33 +27,10 @@ from sparserob_core.sip.proof.branch_and_bound import CELLS, prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
-from sparserob_core.sip.separation.separation import separate
 
 ROUNDING = 1e-13  # of the terms of a cost, with which it is evaluated
 CRUDE = 1e-8  # of bounds, rows and equalities, relative to their scale, at a decision of which nothing is claimed
-THINNER = 1e-3  # share of a margin that leaves nothing feasible, which is tried next
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
-# Cells for the first look at a decision. With a tenth of them, decisions of ordinary problems with parameters are
-# secured that are proven at once; with ten times as many, who rides a wall waits ten times longer for a first bound.
-GLANCE = 4096
-DUE = (0.4, 0.65, 0.85)  # shares of a limit after which a decision is secured, where none is proven yet
-# Rounds as long as the longest so far that must be left when a decision is secured: one to tighten and separate, one to
-# prove, one to try again. With a third of them there is time for no proof; with ten times as many nothing has been
-# imposed by then.
-RESERVED = 3
-# The first round after which a decision is secured though nothing limits the time, and again after twice as many: for
-# who interrupts. Ordinary problems end before; with ten times as many a minute's search leaves nothing proven.
-PATIENT = 8
-# Rounds of that at most, of which each imposes what is violated or is at least twice as far away as the last. With a
-# third of them a wall of a hundred pieces is not yet imposed; ten times as many are a search of their own.
-SECURED = 10
-# Of the cost, what the distance may cost at first. A tenth of it takes three times as many cells along a wall that is
-# ridden; ten times as much is a bound that nobody is content with.
-SPARED = 1e-3
-# Of the cost, up to which a violation that can be imposed is kept away from besides. With a tenth of it a wall between
-# two imposed times takes two rounds more; with all of the cost, what is far from feasible leaves nothing to choose.
-DEAR = 0.1
-PAID = 2.0  # of what is left open, what the rows are tightened by: half of it is for what the new optimum violates
 
 Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d), rows (k,) and the name of a family
 
@@ -193,9 +165,14 @@ class Ledger:
         x = answer.solution.x
         if any(missed > most for _, missed, most in self._fixed(x, strictly=True)):
             return False
-        if self.proven is None or self.program.cost(x) < self.program.cost(self.proven[0].solution.x):
+        if self.cheaper(answer):
             self.proven = answer, found, proofs
         return True
+
+    def cheaper(self, answer: Answer) -> bool:
+        """Whether nothing that costs as little as an answer is proven."""
+        cost = self.program.cost(answer.solution.x)
+        return self.proven is None or cost < self.program.cost(self.proven[0].solution.x)
 
     def judged(self, answer: Answer, worst: WorstConstraint, proofs: Sequence[Proof], ending: str = "") -> Result:
         """The result with the decision of ``answer``: what the proofs, the gap and the comparison of the bounds allow.
@@ -365,94 +342,6 @@ def _units(lower: Array, upper: Array) -> Array:
     return np.where(np.isfinite(units), units, 0.0)
 
 
-class Missed(NamedTuple):
-    """The largest violation of a family that was met, or that is not excluded, and its index ``(1, d)`` and row
-    ``(1,)``."""
-
-    violation: float
-    family: str
-    at: Array
-    row: np.ndarray
-
-
-class Tightening(Protocol):
-    """Imposed rows that are tightened by a ``margin``; ``secured``: how often a share of a limit has asked that a
-    decision be secured."""
-
-    margin: float
-    secured: int
-
-    def priced(self, answer: Answer) -> float:
-        """What the cost of an answer grows by when all rows are tightened by 1, to first order."""
-
-    @property
-    def longest(self) -> float:
-        """By how much the row that changes most is moved by a margin of 1."""
-
-    def distance(self, missed: Missed) -> float:
-        """The margin that makes good what was missed."""
-
-    def impose(self, violated: Violated) -> int:
-        """Impose constraints; how many were new."""
-
-    def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
-        """The optimum of the imposed rows, tightened by so much; ``None`` where there is none. ``answer``: where they
-        are tightened less."""
-
-
-def proofs_of(
-    tightening: Tightening, ledger: Ledger, prover: Prover, answer: Answer, found: Found
-) -> tuple[Sequence[Proof], bool]:
-    """What is proven of an answer: by one glance where that will do, else by a proof in full, before which there is a
-    decision that is proven; and whether constraints were imposed for that."""
-    x = answer.solution.x
-    proofs = prover(x, GLANCE // 4 if ledger.tools.deadline.bounded else GLANCE)
-    if ledger.prove(answer, found, proofs) or not proofs:
-        return proofs, False
-    missed, imposed = _left_open(ledger.program, proofs), False
-    searched = any(above(*one)[1].size for one in _rows(found))  # then the rounds are used up, and this would be more
-    if missed and not searched and not _is_secured(ledger):
-        imposed = _secure(tightening, ledger, prover, answer, missed, witnesses(ledger.program, proofs))
-    # Where there are no cells, another look would be the same one.
-    if any(proof.cells for proof in proofs) and not any(proof.verdict == "refuted" for proof in proofs):
-        proofs = prover(x)
-        ledger.prove(answer, found, proofs)
-    return proofs, imposed
-
-
-def secure_in_time(
-    tightening: Tightening, ledger: Ledger, prover: Prover, answer: Answer, found: Found, number: int
-) -> bool:
-    """Secure a decision when time is due, though that of round ``number`` violates what was ``found``: where there is a
-    limit, as soon as little would pay for that, at certain shares of it, and when no more is left of it than that may
-    take; without a limit after some rounds. Whether constraints were imposed."""
-    deadline, began = ledger.tools.deadline, [event.seconds for event in ledger.history]
-    missed, violated = [_peak(family, one) for family, one in _rows(found)], [above(*one) for one in _rows(found)]
-    if deadline.left is None:
-        due = number >= PATIENT and number & (number - 1) == 0
-    else:
-        near = tightening.secured == 0 and _is_near(tightening, ledger.program, answer, missed)
-        due = near or (tightening.secured < len(DUE) and deadline.used >= DUE[tightening.secured])
-        tightening.secured += due
-        longest = max(np.diff(began, prepend=0.0), default=0.0)
-        due = due or (ledger.proven is None and deadline.left <= RESERVED * longest)
-    if not due or _is_secured(ledger):
-        return False
-    if not any(rows.size for _, rows, _ in violated):  # it may be proven as it is, and solving takes longer
-        ledger.prove(answer, found, prover(answer.solution.x, GLANCE // 4))
-        if ledger.proven is not None:
-            return False
-    return _secure(tightening, ledger, prover, answer, missed, violated)
-
-
-def or_proven(ledger: Ledger, result: Result) -> Result:
-    """The result, or that of the decision that is proven where the result is not."""
-    if result.status not in ("refuted", "undecided") or ledger.proven is None:
-        return result
-    secured, found, proofs = ledger.proven
-    return ledger.judged(secured, worst_of(found), proofs, ledger.tools.deadline.reason)
-
-
 def above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
     """The indices, rows and family of what is violated by more than the search may leave to the proof."""
     violated = found.violations > ALLOWED
@@ -468,95 +357,3 @@ def witnesses(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> Violated
         and proof.index is not None
         and proof.formulation == program.family(proof.family).formulation
     ]
-
-
-def _secure(
-    tightening: Tightening,
-    ledger: Ledger,
-    prover: Prover,
-    answer: Answer,
-    missed: Sequence[Missed],
-    violated: Violated,
-) -> bool:
-    """Prove a decision that keeps away from the constraints, so that there is an upper bound while the proof of a
-    better one goes on: the optimum of the imposed rows and of those that are ``violated``, all of them tightened by as
-    much as `SPARED` of the cost of ``answer`` pays for and by more than what it ``missed``, and again by what that
-    proof leaves open. What it missed is kept away from only as long as something is that far away, and what is imposed
-    for it not for ever. Nothing is claimed where nothing keeps away at all. Whether anything was imposed.
-    """
-    program, margin, imposed = ledger.program, tightening.margin, 0
-    for _ in range(SECURED):
-        cost, price = abs(program.cost(answer.solution.x)), tightening.priced(answer)
-        fresh = tightening.impose(violated)
-        imposed += fresh
-        more = PAID * max((tightening.distance(one) for one in missed), default=0.0)
-        margin = max(margin, tightening.margin + (SPARED * cost / price if price > 0.0 else 0.0))
-        margin += 0.0 if fresh else more
-        more = more if fresh and more * price < DEAR * cost else 0.0
-        if not np.isfinite(PAID * float(margin + more) * tightening.longest):  # in Python's numbers, which overflow
-            break
-        farther = tightening.tightened(ledger, answer, margin + more)
-        if farther is None and more:  # nothing is that far away, but what was imposed may do
-            farther = tightening.tightened(ledger, answer, margin)
-        if farther is None:
-            break
-        answer = farther
-        x = farther.solution.x
-        looked = separate(program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
-        found = [
-            (family, one) for family, one in looked if not family.defines and one.violations.max(initial=0.0) > ALLOWED
-        ]
-        missed, violated = [_peak(*one) for one in found], [above(*one) for one in found]
-        if missed:
-            continue
-        proofs = prover(x, GLANCE)
-        if ledger.prove(farther, looked, proofs) or not proofs:
-            break
-        missed, violated = _left_open(program, proofs), witnesses(program, proofs)
-        if not missed:
-            break
-    return imposed > 0
-
-
-def _is_near(tightening: Tightening, program: SemiInfiniteProgram, answer: Answer, missed: Sequence[Missed]) -> bool:
-    """Whether to keep away from the constraints by more than an answer ``missed`` costs no more than what a decision is
-    secured for in any case. A round may take longer than all before it, so such an answer is not let go."""
-    distance, price = max((tightening.distance(one) for one in missed), default=0.0), tightening.priced(answer)
-    if distance > 0.0 and not price > 0.0:  # no row has a multiplier, which says nothing of those that are missed
-        return False
-    return PAID * distance * price <= SPARED * abs(program.cost(answer.solution.x))
-
-
-def _is_secured(ledger: Ledger) -> bool:
-    """Whether a decision is proven that costs little more than what such a one must."""
-    return ledger.proven is not None and ledger.gap(ledger.proven[0].solution.x) <= PAID * SPARED
-
-
-def _rows(found: Found) -> Found:
-    """What was found of families that constrain; what others define is settled, not violated."""
-    return [(family, separation) for family, separation in found if not family.defines]
-
-
-def _peak(family: ConstraintFamily, separation: Separation) -> Missed:
-    """The largest violation that was found of a family."""
-    largest = max(0.0, float(separation.violations[0]))
-    return Missed(largest, family.name, separation.indices[:1], separation.rows[:1])
-
-
-def _left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Missed]:
-    """What proofs could not exclude, each with where the largest violation was met; nothing where one of them excludes
-    nothing at all, or speaks of another formulation than the imposed rows: then no distance would help it."""
-    missed = [
-        Missed(
-            proof.violation if proof.verdict == "refuted" else proof.bound,
-            proof.family,
-            proof.index[None],
-            np.array([proof.row]),
-        )
-        for proof in proofs
-        if proof.verdict != "proven"
-        and proof.index is not None
-        and proof.formulation == program.family(proof.family).formulation
-    ]
-    complete = len(missed) == sum(proof.verdict != "proven" for proof in proofs)
-    return missed if complete and all(np.isfinite(one.violation) for one in missed) else []

@@ -1,0 +1,1 @@
+"""What an exchange works with: the imposed constraints, how they are solved, and the accounts of what is known."""

@@ -1,0 +1,427 @@
+"""Imposed rows that must hold for every deviation: times are exchanged, deviations are all in the relaxed program.
+
+The relaxed program is the robust counterpart at the imposed indices (`inner.counterpart`, or `inner.central` where that
+is quicker). The lower bound is that of cuts: every row with a multiplier, at the deviation that its multipliers say
+(weak duality over the bounds of the program). Nothing is dropped: a row has variables of its own, and the last basis,
+from which the next solution starts, goes through them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import ignore
+from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem
+from sparserob_core.sip.finite import INTERIOR, FiniteSolution
+from sparserob_core.sip.inner.central.interior import Interior
+from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
+from sparserob_core.sip.proof.verdict import NAMED, explained
+from sparserob_core.sip.relaxed.relaxed import Rows
+from sparserob_core.sip.result import Result
+from sparserob_core.sip.separation.separation import separate
+from sparserob_core.sip.solver import Asked
+from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above, unproven
+from sparserob_core.sip.working.plain import Close
+from sparserob_core.sip.working.securing import GLANCE, SPARED
+from sparserob_core.sip.working.working import Missed, Working, size_of
+
+ROUNDING = 2.0**-46  # of the numbers of which a bound is made
+SHARES = (0.1, 0.5, 1.0)  # of the way from the best decision known to the relaxed optimum, where rows are sought
+ENDED = 0.05  # seconds after the end of the time, when it is over for certain
+CUTS = 4  # rows at each of these shares
+CHOOSING = 30  # rounds of a second objective
+MANY = 4000  # variables of a second objective. With ten times as many the simplex method takes minutes where the first
+# objective takes seconds (100 pieces, two states: 10 000); with ten times fewer six states on twelve pieces go without.
+COARSE, SHARPER = 10.0, 0.1  # share of the cost to which the first round is solved, and how much closer the next ones
+FINEST = 0.1  # share of the tolerance to which the last rounds are solved
+FARKAS = 1e-9  # a weighted sum of rows is violated by more than that: nothing is feasible
+
+
+@final
+@dataclass(eq=False)
+class RobustRows(Working):
+    """The imposed indices of every family and the ``counterpart`` at them, with all rows of an index as ``cuts``.
+
+    ``accuracy``: to which share of the cost a round is solved, where the method can choose; ``price``: of a margin of
+    1, the last time. ``raw``, ``best``: the relaxed optimum before it is settled, and the best decision known, of a
+    program with a guide. ``calls``: whose answers there were; ``asked``: who solves the counterparts, where a solver
+    was named. ``close``: the exchange of another program.
+    """
+
+    counterpart: Counterpart | Interior = field(kw_only=True)
+    close: Close | None = None
+    cuts: list[Cut] = field(default_factory=list)
+    known: set[tuple[str, bytes]] = field(default_factory=set)
+    raw: Array = field(default_factory=lambda: np.zeros(0))
+    best: Array = field(default_factory=lambda: np.zeros(0))
+    tolerance: float = 0.0
+    accuracy: float = COARSE
+    price: float = 0.0
+    calls: Counter[str] = field(default_factory=Counter)
+    asked: Asked | None = None
+    guided: bool = False
+
+    @staticmethod
+    def start(program: SemiInfiniteProgram, ledger: Ledger, close: Close) -> RobustRows:
+        """What every family begins with, and what the bounds of the decision prove alone."""
+        assert program.spread is not None
+        central, asked = Interior(program.finite, program.spread), ledger.relaxed.counted
+        working = RobustRows(program, counterpart=central, close=close, tolerance=ledger.tolerance)
+        working.asked = None if asked.instead is None else asked
+        for family in program.families:
+            assert family.start is not None
+            working.add(family, family.start)
+        if working.asked is not None or program.guide is not None or not central.fits():
+            working.by_simplex()
+        ledger.improve(working.at_rest)
+        return working
+
+    def by_simplex(self) -> None:
+        """From now on by the simplex method, which takes all there is, or by the solver that was named."""
+        if isinstance(self.counterpart, Counterpart):
+            return
+        known = self.counterpart.blocks
+        self.counterpart = Counterpart(self.program.finite, self.counterpart.spread, asked=self.asked)
+        for block in known:
+            self.counterpart.add(block)
+
+    def solve(self, margin: float, accuracy: float, seconds: float = np.inf) -> RobustAnswer:
+        """The optimum with the rows tightened by a margin, about as accurate; not solved where ``seconds`` do not
+        suffice."""
+        if isinstance(self.counterpart, Interior):
+            answer = self.counterpart.solve(margin, accuracy, seconds)
+            self.calls[INTERIOR] += 1
+        else:
+            before = Counter(self.counterpart.answered)
+            answer = self.counterpart.solve(margin, seconds)
+            self.calls += self.counterpart.answered - before
+        return answer
+
+    def relax(self, ledger: Ledger, prover: Prover, last: bool) -> Answer | Result:
+        """Where rows that are tightened leave nothing, less and less so, and in the end the proof that nothing is
+        feasible; of a program with a guide the best decision known, once, where that closes the gap."""
+        self._guide(ledger)
+        program = self.program
+        size = program.largest_cost if ledger.best is None else size_of(program, ledger.best)
+        while not (found := self.solve(self.margin, self.accuracy * size, left(ledger.tools))).solved:
+            self._count(ledger)
+            if ledger.tools.deadline.passed:
+                if found.x.size:  # broken off: what it has come to is what is known
+                    ledger.best = ledger.best or self._told(ledger, found)
+                ledger.tools.deadline.check()
+            if isinstance(self.counterpart, Interior):
+                refuted = self.refuted(found)
+                if refuted is not None:
+                    return self._refuted(ledger, found, refuted)
+                self.by_simplex()
+            elif not self.thin():
+                return self._infeasible(ledger, found.said)
+        self._count(ledger)
+        answer = self._told(ledger, found)
+        self.price = self.priced(answer)
+        self.pay(ledger, answer)
+        if self.best.size and ledger.open(answer.solution.x) and (last or not ledger.open(self.best)):
+            answer, self.best = self._at(answer, self.best), np.zeros(0)
+        return answer
+
+    def _guide(self, ledger: Ledger) -> None:
+        """Begin where the program's guide ends: with its times, and with what its optimum defines."""
+        program, tools = self.program, ledger.tools
+        if program.guide is None or self.guided:
+            return
+        assert self.close is not None
+        self.guided, (guide, shared) = True, program.guide
+        result = self.close(guide, replace(tools, notify=ignore), unproven)
+        self.calls += Counter(result.solved_by)
+        tools.deadline.check()
+        if result.decision is None:
+            return
+        self.raw = np.concatenate([result.decision[:shared], np.zeros(program.n - shared)])
+        self.best = self.raw if program.settle is None else program.settle(self.raw)
+        imposed = result.history[-1].imposed
+        for family in program.families:
+            held = [cut.index for cut in imposed if cut.family == family.name and not cut.row]
+            if not family.defines and held:
+                self.add(family, np.array(held))
+        self.impose(self._undefined(self.best, False))
+
+    def _undefined(self, x: Array, feasible: bool) -> Violated:
+        """Where the bounds that a family defines are exceeded at the relaxed optimum, before they are settled, and
+        between it and the best decision known (Ben-Ameur and Neto 2007); where that is ``feasible``, a better one is
+        kept."""
+        program, raw = self.program, self.raw
+        if feasible and not (self.best.size and program.cost(self.best) <= program.cost(x)):
+            self.best = x
+        best = self.best if self.best.size else x
+        violated: list[tuple[Array, np.ndarray, str]] = []
+        for family in program.families:
+            if not family.defines or family.worst is None:
+                continue
+            for share in SHARES:
+                at = share * raw + (1.0 - share) * best
+                separation = family.worst(at)
+                over = family.violations(raw, separation.indices).max(axis=1) > ALLOWED
+                violated.append((separation.indices[over][:CUTS], separation.rows[over][:CUTS], family.name))
+                if feasible and program.settle is not None:
+                    at = program.settle(at)
+                    if program.cost(at) < program.cost(self.best):
+                        self.best = at
+        return violated
+
+    def candidate(self, answer: Answer) -> Answer | None:
+        return self._at(answer, self.best) if self.best.size else None
+
+    @property
+    def size(self) -> int:
+        return len(self.cuts)
+
+    def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
+        """With new rows the worst deviations of those that are imposed, and where these are all known a closer
+        solution."""
+        x = answer.solution.x
+        if not any(rows.size for _, rows, _ in violated):
+            return 0
+        added = self.impose(violated)
+        if self.program.guide is not None:
+            added += self.impose(self._undefined(x, False))
+        worst = max(float(self.program.family(name).violations(x, at).max(initial=0.0)) for at, _, name in violated)
+        return added + self._closer(answer, worst, bool(added)) + self.counterpart.sharpen(x)
+
+    def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
+        """By what a program's guide does not tell, by a closer solution, or by the worst deviations."""
+        x, undefined = answer.solution.x, 0
+        if self.program.guide is not None:
+            undefined = self.impose(self._undefined(x, True))
+        return bool(undefined + self._closer(answer, 0.0, bool(undefined)) + self.counterpart.sharpen(x))
+
+    def _closer(self, answer: Answer, violation: float, added: bool) -> bool:
+        """Whether the next round can be more accurate; it is where what was added changes little."""
+        if not isinstance(self.counterpart, Interior) or self.accuracy <= FINEST * self.tolerance:
+            return False
+        if not added or self.price * violation < self.accuracy * size_of(self.program, answer):
+            self.accuracy = max(FINEST * self.tolerance, SHARPER * self.accuracy)
+        return True
+
+    def impose(self, violated: Violated) -> int:
+        return sum(self.add(self.program.family(name), indices) for indices, _, name in violated)
+
+    def add(self, family: ConstraintFamily, indices: Array) -> int:
+        """Impose all rows of a family at indices ``(k, d)``; how many indices were new."""
+        assert family.uncertain is not None
+        added = 0
+        for index in indices:
+            key = (family.name, index.tobytes())
+            if key in self.known:
+                continue
+            rows = family.uncertain(index)
+            self.known.add(key)
+            self.counterpart.add(rows)
+            self.cuts += [Cut(family.name, index, row) for row in range(rows.h.size)]
+            added += 1
+        return added
+
+    def knows(self, missed: Missed) -> bool:
+        return (missed.family, missed.at[0].tobytes()) in self.known
+
+    def priced(self, answer: Answer) -> float:
+        return float(answer.multipliers.sum())
+
+    @property
+    def longest(self) -> float:
+        """Margins are in the rows' own units."""
+        return 1.0
+
+    @property
+    def unit(self) -> float:
+        return 1.0
+
+    def distance(self, missed: Missed) -> float:
+        return missed.violation
+
+    def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
+        """No more accurate than its distance costs."""
+        accuracy = min(self.accuracy, SHARPER * SPARED) * size_of(self.program, answer)
+        found = self.solve(margin, accuracy, left(ledger.tools))
+        self._count(ledger)
+        return self._told(ledger, found) if found.solved else None
+
+    def _told(self, ledger: Ledger, found: RobustAnswer) -> Answer:
+        """The decision of an answer, with the bound that its multipliers prove."""
+        self.raw = np.clip(found.x, self.program.finite.lower, self.program.finite.upper)
+        dual, none = self.dual(found, priced=True), np.zeros(0)
+        ledger.improve(dual)
+        solution = FiniteSolution("optimal", self.raw, np.inf, dual.bound, found.y, found.mu, none, np.inf, np.inf)
+        return self._at(Answer(solution, self._rows, 0.0, np.inf), self._settled(self.raw))
+
+    def _settled(self, x: Array) -> Array:
+        """A decision within its bounds, and what families define at what they say."""
+        settled = x if self.program.settle is None else self.program.settle(x)
+        if self.program.finite.residual(settled) > TOLERANCE:
+            # what is settled is beyond its bounds: then so is what it stands for
+            settled = np.clip(settled, self.program.finite.lower, self.program.finite.upper)
+        return settled
+
+    def _at(self, answer: Answer, x: Array) -> Answer:
+        """An answer with another decision."""
+        value, bound = self.program.cost(x), answer.solution.lower_bound
+        residual = self.program.finite.residual(x)
+        solution = replace(answer.solution, x=x, value=value, residual=residual, gap=value - bound)
+        return replace(answer, solution=solution, value=value)
+
+    @property
+    def _rows(self) -> Rows:
+        """The imposed rows by name; what they are depends on the deviations."""
+        return Rows(np.zeros((len(self.cuts), 0)), np.zeros(len(self.cuts)), tuple(self.cuts))
+
+    def dual(self, answer: RobustAnswer, priced: bool) -> Dual:
+        """What the multipliers of an answer prove, with the cuts that prove it."""
+        blocks = self.counterpart.blocks
+        bound, size = robust_bound(self.program.finite, blocks, answer.y, answer.deviations, answer.mu, priced)
+        cuts = tuple(
+            replace(cut, index=np.concatenate([cut.index, w]), multiplier=float(y), formulation="literal")
+            for cut, y, w in zip(self.cuts, answer.y, answer.deviations, strict=True)
+            if y > 0.0
+        )
+        return Dual(bound - (ROUNDING + self.counterpart.spread.missed) * size, cuts, answer.mu)
+
+    @property
+    def at_rest(self) -> Dual:
+        """What the bounds of the decision prove alone, without a multiplier."""
+        rows, size = len(self.cuts), self.counterpart.spread.size
+        none = RobustAnswer(
+            True, "", np.zeros(0), np.zeros(rows), np.zeros((rows, size)), np.zeros(self.program.finite.b.size)
+        )
+        return self.dual(none, priced=True)
+
+    def refuted(self, answer: RobustAnswer) -> Dual | None:
+        """What the multipliers of an answer prove of all decisions alike: that there is none; or nothing."""
+        total = float(answer.y.sum() + np.abs(answer.mu).sum())
+        if not 0.0 < total < np.inf:
+            return None
+        dual = self.dual(replace(answer, y=answer.y / total, mu=answer.mu / total), priced=False)
+        return dual if dual.bound > FARKAS else None
+
+    def _infeasible(self, ledger: Ledger, said: str) -> Result:
+        """``infeasible`` where multipliers prove it, else ``failed``."""
+        none = np.zeros(0)
+        relaxing = Counterpart(self.program.finite, self.counterpart.spread, elastic=True, asked=self.asked)
+        for block in self.counterpart.blocks:
+            relaxing.add(block)
+        elastic = relaxing.solve()
+        while elastic.solved and relaxing.sharpen(elastic.x):
+            elastic = relaxing.solve()
+        self.calls += relaxing.answered
+        self._count(ledger)
+        dual = self.refuted(elastic) if elastic.solved else None
+        if dual is not None:
+            return self._refuted(ledger, elastic, dual)
+        x = np.zeros(self.program.n)
+        found = FiniteSolution("failed", x, np.nan, -np.inf, none, none, none, np.inf, np.inf, said)
+        answer = Answer(found, self._rows, 0.0, np.nan)
+        return ledger.result("failed", f"the relaxed program was not solved: {said}", answer)
+
+    def _refuted(self, ledger: Ledger, answer: RobustAnswer, dual: Dual) -> Result:
+        """Nothing is feasible, as these multipliers prove."""
+        solution = FiniteSolution(
+            "infeasible",
+            answer.x,
+            np.inf,
+            np.inf,
+            answer.y,
+            answer.mu,
+            np.zeros(0),
+            np.inf,
+            0.0,
+            answer.said,
+            (),
+            dual.bound,
+        )
+        ledger.dual = dual
+        reason, worst = _reason(self.program, dual)
+        found = Answer(solution, self._rows, 0.0, np.inf)
+        return replace(ledger.result("infeasible", reason.sentence(), found, worst), infeasible=reason)
+
+    def _count(self, ledger: Ledger) -> None:
+        ledger.relaxed.solves = self.calls.total()
+        if self.asked is None:
+            ledger.relaxed.counted.calls = ledger.relaxed.solves
+        ledger.relaxed.solved_by.update(self.calls - ledger.relaxed.solved_by)
+
+    def choose(
+        self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
+    ) -> tuple[Answer, Found, Violated]:
+        """The one that is best by the second objective of the program, `SemiInfiniteProgram.among`, among those that
+        cost at most the lower bound and half of the tolerance more, once this one has been proven."""
+        second, x = self.program.among, answer.solution.x
+        violated = any(above(*one)[1].size for one in found)
+        if second is None or second[0].n > MANY or violated or ledger.open(x):
+            return answer, found, ()
+        if not ledger.prove(answer, found, prover(x, GLANCE)):
+            return answer, found, ()
+        decision = self._preferred(ledger, answer, *second)
+        if decision is None or self.program.finite.residual(decision) > TOLERANCE or ledger.open(decision):
+            return answer, found, ()
+        looked = separate(self.program, decision, ledger.tools, ALLOWED, number)
+        if any(above(*one)[1].size for one in looked):
+            return answer, found, ()
+        return self._at(answer, decision), looked, ()
+
+    def _preferred(self, ledger: Ledger, answer: Answer, second: SemiInfiniteProgram, shared: int) -> Array | None:
+        """The optimum of the ``second`` program, whose decision begins with so many of the same entries: the rows that
+        are active, and one more of the cost."""
+        program, tools, spread = self.program, replace(ledger.tools, notify=ignore), self.counterpart.spread
+        weights = np.append(program.finite.weights[:shared], np.zeros(second.n - shared))
+        most = max(ledger.lower, 0.0) * (1.0 + 0.5 * ledger.tolerance)
+        counterpart = Counterpart(second.finite, spread, ceiling=(weights, most), asked=self.asked)
+        working = RobustRows(second, margin=self.margin, counterpart=counterpart, asked=self.asked)
+        for family in second.families:
+            held = {cut.index.tobytes(): cut.index for cut in answer.active if cut.family == family.name}
+            start = np.zeros((0, family.index_set.dimension)) if family.start is None else family.start
+            working.add(family, np.array(list(held.values())) if held else start)
+        violated: Violated = ()
+        for number in range(1, CHOOSING + 1):
+            if tools.deadline.passed:
+                return None
+            solved = working.solve(working.margin, 0.0, left(tools))
+            if not solved.solved:
+                return None
+            x = np.clip(solved.x, second.finite.lower, second.finite.upper)
+            x = x if second.settle is None else second.settle(x)
+            violated = [above(*one) for one in separate(second, x, tools, ALLOWED, number)]
+            if not (working.impose(violated) or counterpart.sharpen(x)):
+                break
+        self.calls += working.calls
+        self._count(ledger)
+        if any(rows.size for _, rows, _ in violated):
+            return None
+        return x[:shared] if program.settle is None else program.settle(x[:shared])
+
+
+def left(tools: Tools) -> float:
+    """The seconds that a solution may take."""
+    return np.inf if tools.deadline.left is None else tools.deadline.left + ENDED
+
+
+def _reason(program: SemiInfiniteProgram, dual: Dual) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
+    """The constraints that cannot hold together, those with the largest multipliers first."""
+    units = {family.name: family for family in program.families}
+    order = sorted(dual.cuts, key=lambda cut: -cut.multiplier)
+    told = [units[cut.family].explanation(cut.index[: units[cut.family].index_set.dimension], cut.row) for cut in order]
+    first = order[0]
+    bare = WorstConstraint(dual.bound, first.family, first.index[: units[first.family].index_set.dimension], first.row)
+    members = tuple(one.text for one in told[:NAMED])
+    found = InfeasibleSubsystem(
+        members=members,
+        others=max(0, len(told) - NAMED),
+        equalities=bool(program.finite.b.size),
+        decides="policy",
+        irreducible=False,
+    )
+    return found, explained(program, bare)

@@ -1,0 +1,91 @@
+"""Guards sip/methods/driver: every run passes the same functions of driver, exchange, ledger and securing, whatever is
+imposed; a driver ends with the first result, or with what is known."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.assemble import assemble, tools_of
+from sparserob_core.experiment.config.load import load_config
+from sparserob_core.sip.method import Deadline, OutOfTime, Tools
+from sparserob_core.sip.methods import driver, exchange
+from sparserob_core.sip.methods.driver import drive
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.result import Result
+from sparserob_core.sip.working import ledger, securing, working
+from tests.support.problems import spring
+
+SHARED = {str(Path(str(module.__file__))): module.__name__ for module in (driver, exchange, ledger, securing, working)}
+RESULT = Result(status="undecided", message="", counts={}, seconds=0.0)
+
+
+def passed(call: Callable[[], Any]) -> tuple[Any, set[str]]:
+    """What a call returns, and the functions of the shared modules that it enters."""
+    entered: set[str] = set()
+
+    def note(frame: Any, event: str, _: object) -> None:
+        if event == "call" and frame.f_code.co_filename in SHARED and "<" not in frame.f_code.co_name:
+            entered.add(f"{SHARED[frame.f_code.co_filename]}.{frame.f_code.co_qualname}")
+
+    sys.setprofile(note)
+    try:
+        return call(), entered
+    finally:
+        sys.setprofile(None)
+
+
+def case(policy: str) -> tuple[sr.SemiInfiniteProgram, Tools]:
+    problem = spring(0.05, since=0.5)
+    control = {"name": "piecewise_constant", "pieces": 4}
+    config = {"problem": problem, "dictionaries": {"control": control}, "policy": {"name": policy}}
+    loaded = load_config(config)
+    return assemble(loaded).program, tools_of(loaded)
+
+
+def test_a_run_with_feedback_and_one_without_pass_the_same_functions_of_the_driver() -> None:
+    cases = [case(policy) for policy in ("open_loop", "affine")]
+    assert [program.spread is None for program, _ in cases] == [True, False]
+    results, entered = zip(*[passed(partial(Exchange().solve, *each)) for each in cases], strict=True)
+    assert [result.status for result in results] == ["certified", "certified"]
+    assert entered[0] == entered[1]
+    steps = {f"{exchange.__name__}.Rounds.{name}" for name in ("step", "_ending", "_earlier")}
+    assert steps | {f"{driver.__name__}.drive", f"{securing.__name__}.proofs_of"} <= entered[0]
+    assert {f"{working.__name__}.Working.pay", f"{ledger.__name__}.Ledger.tell"} <= entered[0]
+
+
+def test_the_first_step_with_a_result_is_the_last() -> None:
+    taken: list[int] = []
+
+    def step(number: int) -> Result | None:
+        taken.append(number)
+        return RESULT if number == 3 else None
+
+    assert drive(Deadline(), step, pytest.fail) is RESULT
+    assert taken == [1, 2, 3]
+
+
+@pytest.mark.parametrize("when", ["before a step", "within a step"])
+def test_what_is_known_is_the_answer_where_the_time_is_over(when: str) -> None:
+    deadline, errors = Deadline(), list[KeyboardInterrupt]()
+
+    def step(number: int) -> Result | None:
+        if number == 2:
+            raise AssertionError("no step is begun when the time is over")
+        if when == "within a step":
+            raise KeyboardInterrupt
+        deadline.interrupt(OutOfTime("the time is over"))
+        return None
+
+    def stopped(error: KeyboardInterrupt) -> Result:
+        errors.append(error)
+        return RESULT
+
+    assert drive(deadline, step, stopped) is RESULT
+    assert [isinstance(error, OutOfTime) for error in errors] == [when == "before a step"]

@@ -1,0 +1,134 @@
+"""Guards sip/working/working: the rules of margins, which are the same for rows of the decision and for rows that must
+hold for every deviation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+import sparserob_core as sr
+from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.finite import FiniteSolution, Spread, UncertainRows
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.program import Separation
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
+from sparserob_core.sip.working.ledger import Answer, Ledger
+from sparserob_core.sip.working.plain import PlainRows
+from sparserob_core.sip.working.robust import RobustRows
+from sparserob_core.sip.working.working import ALLOWANCES, LARGEST_MARGIN, SMALLEST_MARGIN, Working
+from sparserob_piqp import Piqp
+
+KINDS = ("plain", "robust")
+AT = np.array([[0.5]])
+
+
+def program(kind: str) -> sr.SemiInfiniteProgram:
+    """The least ``x >= t`` for t in [0, 1], and in the second kind for all deviations of at most 0."""
+
+    def uncertain(index: np.ndarray) -> UncertainRows:
+        nothing = csr_array((1, 1))
+        row, each = csr_array([[-1.0]]), np.zeros(1, dtype=int)
+        return UncertainRows(row, -index, each, np.ones(1), (nothing,), np.zeros((1, 1)))
+
+    family = sr.ConstraintFamily(
+        name="above",
+        index_set=sr.Box([0.0], [1.0]),
+        rows=lambda t: (-np.ones((len(t), 1, 1)), -t),
+        uncertain=uncertain,
+        start=np.zeros((0, 1)),
+    )
+    spread = Spread(((1, sr.Box([0.0], [0.0])),)) if kind == "robust" else None
+    return sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=9.0, families=[family], spread=spread)
+
+
+def begun(kind: str) -> tuple[Working, Ledger]:
+    """A working set with one row imposed, and its accounts."""
+    case, tools = program(kind), Tools(Piqp())
+    ledger = Ledger(case, RelaxedProgram(case, tools.solver), tools, 1e-7)
+    close = Exchange().close
+    working = PlainRows.start(case, tools, True, close) if kind == "plain" else RobustRows.start(case, ledger, close)
+    assert working.impose([(AT, np.zeros(1, dtype=int), "above")]) == 1
+    return working, ledger
+
+
+def answer(working: Working, ledger: Ledger) -> Answer:
+    found = working.relax(ledger, lambda x, cells=0: (), False)
+    assert isinstance(found, Answer)
+    return found
+
+
+def violated(amount: float) -> Separation:
+    return Separation(AT, np.zeros(1, dtype=int), np.array([amount]))
+
+
+def undecided(bound: float) -> Proof:
+    return Proof("above", "undecided", bound, index=AT[0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_margin_costs_no_more_than_four_tenths_of_the_tolerated_gap_and_is_worth_having(kind: str) -> None:
+    working, ledger = begun(kind)
+    exact = answer(working, ledger)
+    assert exact.solution.x == pytest.approx([0.5], abs=1e-12)
+    assert working.margin > 0.0
+    tightened = answer(working, ledger)
+    spent = tightened.solution.x[0] - 0.5
+    assert 0.05 * ledger.tolerance * 0.5 <= spent <= 0.4 * ledger.tolerance * 0.5
+    assert ledger.gap(tightened.solution.x) <= ledger.tolerance
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_imposed_row_that_is_violated_is_tightened_by_twice_as_much_and_no_other(kind: str) -> None:
+    working, ledger = begun(kind)
+    family = working.program.families[0]
+    answer(working, ledger)
+    before = working.margin
+    assert not working.tighten([(family, Separation(AT / 2, np.zeros(1, dtype=int), np.array([1e-7])))])
+    assert not working.tighten([(family, violated(1e-10))])
+    assert working.margin == before
+    assert working.tighten([(family, violated(1e-7))])
+    assert working.margin == working.floor == pytest.approx(2e-7)
+    assert working.tighten([(family, violated(1.0))])
+    assert working.margin == LARGEST_MARGIN
+    assert not working.tighten([(family, violated(1.0))])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_rounding_leaves_open_is_allowed_for_a_few_times_and_what_is_more_is_not(kind: str) -> None:
+    working, ledger = begun(kind)
+    answer(working, ledger)
+    before = working.margin
+    assert not working.allow_for([undecided(1e-5)])
+    assert not working.allow_for([undecided(np.inf)])
+    assert not working.allow_for([Proof("above", "refuted", np.inf, violation=1e-8, index=AT[0])])
+    assert working.margin == before
+    for number in range(1, ALLOWANCES + 1):
+        assert working.allow_for([undecided(2e-9)])
+        assert working.margin == pytest.approx(before + number * 2.5e-9)
+    assert not working.allow_for([undecided(2e-9)])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_margin_that_leaves_nothing_becomes_less_until_there_is_none(kind: str) -> None:
+    working, _ = begun(kind)
+    working.margin, tried = LARGEST_MARGIN, []
+    while working.thin():
+        tried.append(working.margin)
+    assert tried == pytest.approx([1e-9, 1e-12, 1e-15, 0.0], rel=1e-9, abs=0.0)
+    assert min(margin for margin in tried if margin) >= SMALLEST_MARGIN * (1.0 - 1e-9)
+    assert not working.slater and working.most == 0.0
+    assert not working.tighten([(working.program.families[0], violated(1e-7))])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_violated_is_imposed_once(kind: str) -> None:
+    working, ledger = begun(kind)
+    found = answer(working, ledger)
+    later = np.array([[0.75]])
+    assert working.exchange(found, [(AT, np.zeros(1, dtype=int), "above")], 1) == 0
+    assert working.exchange(found, [(later, np.zeros(1, dtype=int), "above")], 1) == 1
+    assert working.size == 2
+    assert answer(working, ledger).solution.x == pytest.approx([0.75], abs=1e-6)
+    assert isinstance(found.solution, FiniteSolution)
