@@ -35,7 +35,7 @@ FILES = {
         " constraint, and what counts as no violation of its rows, in the user's units), sparsity (with"
         " `fewest_active`: `lower` and `upper` of the least share of time that any admissible control"
         " must act, the mean over the `channels`), `units` (of time, states, and of the rows of every constraint,"
-        " where the config names any),"
+        " where the config names any), `parameters` (the names of what is uncertain, in order),"
         " under feedback `causal_lower_bound` (no causal policy with this dictionary costs less; null where"
         " nothing is proven), `causal_infeasible` (no causal policy exists) and `causal_ended` (why no better bound"
         " was sought: `settled`, as the last rounds did not improve it, or the limit that was met: `signals`, `work`,"

@@ -376,6 +376,13 @@ def _units(case: Case, summary: Mapping[str, Any]) -> list[str]:
     return wrong
 
 
+def _parameters(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+    """The names of the uncertain parameters, in the order of their values."""
+    mine = [] if case.problem.system.parameters is None else list(case.problem.system.names)
+    said = summary.get("parameters", mine)
+    return [] if said == mine else [f"parameters are {said!r}, not {mine!r}"]
+
+
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "gap": _gap,
     "cost_scale": _cost_scale,
@@ -384,6 +391,7 @@ COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "value": _value,
     "worst": _worst,
     "units": _units,
+    "parameters": _parameters,
 }
 
 

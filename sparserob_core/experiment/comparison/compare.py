@@ -104,7 +104,7 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
                 _text(curve.lower_bound, ".9g"),
                 _text(curve.cost, ".9g"),
                 *part,
-                _text(curve.violation, ".2e"),
+                f"{_text(curve.violation, '.2e')} {curve.measured}".rstrip(),
                 _text(curve.all_evaluations, ".0f"),
                 _text(curve.all_seconds, ".3f"),
             ]

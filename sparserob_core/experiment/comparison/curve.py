@@ -32,7 +32,7 @@ class Curve:
 
     For a run that searches (``searched``) an evaluation is a value of g, and the entries are those at which the bound
     rose; for any other it is a relaxed program, and the entries are the rounds. Numbers that the run does not know are
-    nan.
+    nan. ``measured``: the unit of the worst ``violation``, where it is known.
     """
 
     directory: Path
@@ -49,6 +49,7 @@ class Curve:
     gap: float
     cost: float
     violation: float
+    measured: str
     all_evaluations: float
     all_seconds: float
     dimension: int = 0
@@ -74,7 +75,7 @@ def spent_until(target: float, best: Array, spent: Array) -> float:
 def read_curve(directory: Path) -> Curve:
     """Read a run directory; raises `InputError` when it is none, or a file of it cannot be understood."""
     summary, config = stored_run(directory).summary, _config(directory / "config.yaml")
-    counts, worst = _mapping(summary, "counts"), _mapping(summary, "worst")
+    counts, worst, units = _mapping(summary, "counts"), _mapping(summary, "worst"), summary.get("units")
     status, searched = str(summary["status"]), (directory / SEARCH[0]).is_file()
     spent, lower = _number(counts, "evaluations" if searched else "relaxed_programs"), _number(summary, "lower_bound")
     seconds, upper = _number(summary, "seconds"), _number(summary, "upper_bound")
@@ -96,6 +97,7 @@ def read_curve(directory: Path) -> Curve:
         gap=relative_gap(lower, upper, summary.get("cost_scale") or 0.0),
         cost=_number(summary, "cost"),
         violation=_number(worst, "violation"),
+        measured=str(units.get("worst") or "") if isinstance(units, Mapping) else "",
         all_evaluations=spent,
         all_seconds=seconds,
         dimension=_dimension(directory, searched) if status not in WITHOUT_CURVE else 0,

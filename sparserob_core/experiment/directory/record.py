@@ -32,6 +32,7 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
     """``result.json`` but for what only the run knows (title, seed, versions); ``model``: of a control problem."""
     acting = asdict(sparsity(control, model.control.breakpoints)) if control is not None and model is not None else None
     units = {} if model is None else units_of(model, result)
+    parameters = () if model is None or model.problem.system.parameters is None else model.problem.system.names
     return {
         "status": result.status,
         "message": result.message,
@@ -46,6 +47,7 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
         "stopped": result.stopped,
         "worst": _witness(result.worst),
         **({"units": units} if units else {}),
+        **({"parameters": list(parameters)} if parameters else {}),
         "tolerances": {proof.family: _tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
         **({} if result.missed is None else {"equalities": {"allowed": EQUALITY, "missed": result.missed}}),
         "sparsity": {

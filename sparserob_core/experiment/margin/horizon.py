@@ -75,7 +75,7 @@ class HorizonSearch:
             title=self.title,
             of=HORIZON,
             sense="smallest",
-            quantity="horizon",
+            quantity=f"horizon [{self.problem.names.time}]" if self.problem.names.time else "horizon",
             status=status,
             message=message,
             lower=low,
@@ -93,14 +93,18 @@ class HorizonSearch:
         longest = self.problem.horizon
         cells = f"{len(self.covered)} cell{'s' if len(self.covered) != 1 else ''}"
         if best is None and low >= longest:
-            return "infeasible", f"no horizon up to {longest:g} is feasible, proven on {cells}: {self._why(longest)}"
+            return "infeasible", f"no horizon up to {self._in(longest)} is feasible, proven on {cells}: {self._why(longest)}"
         if best is None:
-            return "undecided", f"no horizon up to {longest:g} was found feasible; {stuck}"
+            return "undecided", f"no horizon up to {self._in(longest)} was found feasible; {stuck}"
         if low == 0.0 and best.factor <= MET * self.width:
-            return "unbounded", f"feasible at every horizon that was looked at on the way down to {best.factor:g}"
+            return "unbounded", f"feasible at every horizon that was looked at on the way down to {self._in(best.factor)}"
         if best.factor - low <= MET * self.width:
-            return "certified", f"no horizon up to {low:.9g} is feasible, proven on {cells}: {self._why(low)}"
-        return "undecided", f"what is between {low:.9g} and {best.factor:.9g} could not be proven: {stuck}"
+            return "certified", f"no horizon up to {self._in(low)} is feasible, proven on {cells}: {self._why(low)}"
+        return "undecided", f"what is between {low:.9g} and {self._in(best.factor)} could not be proven: {stuck}"
+
+    def _in(self, time: float) -> str:
+        """A time with its unit."""
+        return f"{time:.9g} {self.problem.names.time}".rstrip()
 
     def _why(self, horizon: float) -> str:
         point = self.points.get(horizon)
@@ -124,7 +128,7 @@ class HorizonSearch:
                 best = min(best, high)
             elif status == "infeasible" and self._excluded(low, high):
                 self.covered.append((low, high))
-                self.told.say(f"no horizon up to {high:.9g} is feasible")
+                self.told.say(f"no horizon up to {self._in(high)} is feasible")
                 continue
             short = high - low <= self.width
             if short and status in FEASIBLE:
@@ -140,14 +144,14 @@ class HorizonSearch:
         """Why an interval that was not excluded is not to be halved any more; empty where it is."""
         point = self.points[high]
         if point.status not in (*FEASIBLE, "infeasible"):
-            return f"the run at {high:.9g} is {point.status}: {point.message}"
+            return f"the run at {self._in(high)} is {point.status}: {point.message}"
         if point.status == "infeasible" and high > self._cells.changes:
-            return f"the system changes at {self._cells.changes:g}, and beyond horizons are looked at one by one only"
+            return f"the system changes at {self._in(self._cells.changes)}, and beyond horizons are looked at one by one only"
         if short:
             left_out = (
                 "" if self.problem.control_step is None else "; control_step is left out of what excludes horizons"
             )
-            return f"no multipliers exclude {low:.9g} to {high:.9g}{left_out}"
+            return f"no multipliers exclude {low:.9g} to {self._in(high)}{left_out}"
         return f"{MOST} runs did not suffice" if len(self.points) > MOST else ""
 
     def _descend(self, low: float, points: list[float]) -> None:

@@ -121,7 +121,7 @@ def margin_rows(found: Margin) -> list[tuple[str, str]]:
     rows = [("status", f"{found.status}: {found.message}")]
     if found.of == HORIZON:
         rows += [
-            ("shortest horizon", _between(found.lower, found.upper)),
+            (f"shortest {found.quantity}", _between(found.lower, found.upper)),
             ("excluded", f"(0, {found.lower:.9g}] on {len(found.covered)} cells" if found.covered else "nothing"),
         ]
         if found.feasible is not None:

@@ -171,7 +171,7 @@ class Simulation:
                 f"every trajectory was looked at at {self.times} times, at least {self.inside} of them inside every"
                 " piece, not between them"
             )
-        worst = max((one.worst for one in self.constraints), default=np.nan)
+        worst = max(self.constraints, key=lambda one: one.worst, default=None)
         if self.contradicts:
             yield (
                 "a trajectory contradicts the run: it violates what is proven, or it is worse than the worst case"
@@ -185,7 +185,7 @@ class Simulation:
         else:
             yield (
                 f"the run proves nothing of its constraints (status {self.status}): the worst case found is a violation"
-                f" of {worst:.3g}"
+                f" of {'nothing' if worst is None else _number(worst.worst, '.3g', worst.unit)}"
             )
         if self.undrawn:
             yield self.undrawn

@@ -56,7 +56,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("upper bound", _number(summary["upper_bound"], ".9g")),
         ("relative gap", _number(summary["gap"], ".2e")),
         ("any causal policy", _causal(summary)),
-        ("worst violation", _worst(worst, units)),
+        ("worst violation", _worst(worst, units, summary.get("parameters") or ())),
         ("proven to", _tolerances(summary.get("tolerances") or {}, units.get("rows") or {})),
         ("equalities", _equalities(summary.get("equalities"))),
         ("active indices", str(counts["active_indices"])),
@@ -153,13 +153,15 @@ def _equalities(said: Mapping[str, Any] | None) -> str:
     return f"missed by {said['missed']:.1e} of the numbers added up, computed; {said['allowed']:g} counts as none"
 
 
-def _worst(worst: Mapping[str, Any], units: Mapping[str, Any]) -> str:
+def _worst(worst: Mapping[str, Any], units: Mapping[str, Any], parameters: Sequence[str]) -> str:
     if worst["violation"] is None:
         return "unknown"
     unit, time, states = (units.get(key) or "" for key in ("worst", "time", "states"))
     at = "" if worst["time"] is None else f" at t = {_measured(worst['time'], time)}"
     if worst["parameter"] is not None and len(worst["parameter"]):
-        at += ", p = (" + ", ".join(f"{value:.6g}" for value in worst["parameter"]) + ")"
+        values = [f"{value:.6g}" for value in worst["parameter"]]
+        named = [f"{name} = {value}" for name, value in zip(parameters, values, strict=False)]
+        at += ", " + (", ".join(named) if len(named) == len(values) else f"p = ({', '.join(values)})")
     if worst.get("initial_state") is not None:
         begun = worst["initial_state"]
         measured = zip(begun, states or [""] * len(begun), strict=True)

@@ -52,6 +52,20 @@ def test_a_run_tells_units_row_by_row(outcome: sr.Outcome) -> None:
     assert where["time"] == "s"
 
 
+def test_a_parameter_is_told_by_its_name(tmp_path: Path) -> None:
+    system = {"A": [[0, 1], [0, 0]], "B": [[0], ["1 / mass"]], "parameters": {"mass": [1.1, 1.3]}}
+    problem = PROBLEM | {"system": system, "disturbance": None, "names": {"states": ["place", "speed"]}}
+    outcome = sr.run({"problem": problem, "dictionaries": PIECES}, out=tmp_path / "run", quiet=True, figures=False)
+    assert outcome.summary["parameters"] == ["mass"]
+    assert ", mass = 1." in told(outcome)["worst violation"]
+    said = {claim.name: (claim.verdict, claim.text) for claim in sr.check(outcome).claims}
+    assert said["result.json"][0] == "holds"
+    file = tmp_path / "run" / "result.json"
+    file.write_text(file.read_text("utf-8").replace('"mass"', '"length"'), "utf-8")
+    said = {claim.name: (claim.verdict, claim.text) for claim in sr.check(tmp_path / "run").claims}
+    assert said["result.json"] == ("fails", "parameters are ['length'], not ['mass']")
+
+
 def test_shares_of_several_channels_say_of_what_they_are(outcome: sr.Outcome) -> None:
     rows = told(outcome)
     assert rows["share of time active"].endswith("%, in at least one channel")
