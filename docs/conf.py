@@ -44,6 +44,7 @@ html_theme_options = {
     "dark_css_variables": {"color-brand-primary": "#56b4e9", "color-brand-content": "#56b4e9"},
 }
 pygments_style, pygments_dark_style = "default", "github-dark"
+highlight_language = "text"  # a block that names no language is what a command printed
 
 
 def setup(app: object) -> None:

@@ -93,11 +93,17 @@ class HorizonSearch:
         longest = self.problem.horizon
         cells = f"{len(self.covered)} cell{'s' if len(self.covered) != 1 else ''}"
         if best is None and low >= longest:
-            return "infeasible", f"no horizon up to {self._in(longest)} is feasible, proven on {cells}: {self._why(longest)}"
+            return (
+                "infeasible",
+                f"no horizon up to {self._in(longest)} is feasible, proven on {cells}: {self._why(longest)}",
+            )
         if best is None:
             return "undecided", f"no horizon up to {self._in(longest)} was found feasible; {stuck}"
         if low == 0.0 and best.factor <= MET * self.width:
-            return "unbounded", f"feasible at every horizon that was looked at on the way down to {self._in(best.factor)}"
+            return (
+                "unbounded",
+                f"feasible at every horizon that was looked at on the way down to {self._in(best.factor)}",
+            )
         if best.factor - low <= MET * self.width:
             return "certified", f"no horizon up to {self._in(low)} is feasible, proven on {cells}: {self._why(low)}"
         return "undecided", f"what is between {low:.9g} and {self._in(best.factor)} could not be proven: {stuck}"
@@ -146,7 +152,8 @@ class HorizonSearch:
         if point.status not in (*FEASIBLE, "infeasible"):
             return f"the run at {self._in(high)} is {point.status}: {point.message}"
         if point.status == "infeasible" and high > self._cells.changes:
-            return f"the system changes at {self._in(self._cells.changes)}, and beyond horizons are looked at one by one only"
+            at = self._in(self._cells.changes)
+            return f"the system changes at {at}, and beyond horizons are looked at one by one only"
         if short:
             left_out = (
                 "" if self.problem.control_step is None else "; control_step is left out of what excludes horizons"

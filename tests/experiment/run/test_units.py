@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.comparison.compare import comparison_table
 from sparserob_core.experiment.terminal.table import result_rows
 
 NAMES = {
@@ -50,6 +51,15 @@ def test_a_run_tells_units_row_by_row(outcome: sr.Outcome) -> None:
     assert " m in path" in rows["proven to"] and " m/s in terminal" in rows["proven to"] and " m, " in rows["proven to"]
     assert sorted(where["rows"]["terminal"]) == ["m", "m", "m/s", "m/s"]
     assert where["time"] == "s"
+
+
+def test_horizons_and_comparisons_have_units(outcome: sr.Outcome) -> None:
+    problem = PROBLEM | {"names": NAMES, "initial_state": [0.5, 0.0], "disturbance": None, "terminal": [{"box": 0.45}]}
+    found = sr.margin({"problem": problem, "dictionaries": PIECES}, of="horizon", tolerance=0.05, write=False)
+    assert found.quantity == "horizon [s]" and " s is feasible, proven on " in found.message
+    columns, rows = comparison_table(sr.compare([outcome.directory, outcome.directory]))
+    worst = outcome.summary["units"]["worst"]
+    assert all(dict(zip(columns, row, strict=True))["worst violation"].endswith(f" {worst}") for row in rows)
 
 
 def test_a_parameter_is_told_by_its_name(tmp_path: Path) -> None:
