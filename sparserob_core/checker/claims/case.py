@@ -310,7 +310,7 @@ class Case:
 
     @cached_property
     def price(self) -> Price:
-        return Price(self.problem, self.control, self.clock)
+        return Price(self.problem, self.control, self.clock, self.changing)
 
     @cached_property
     def rows(self) -> dict[tuple[object, ...], Row]:

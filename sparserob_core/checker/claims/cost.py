@@ -17,6 +17,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
+from sparserob_core.checker.reach.varying import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic, nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 ENOUGH = 1e-20  # of the sizes that are added up: how closely the quadratic terms are wanted
 MOST_BITS = 8192
+EVERY = 1000  # terms of a series, more than there are
 
 
 @final
@@ -47,6 +49,12 @@ class Price:
     problem: OptimalControlProblem
     control: Dictionary
     clock: Clock = NO_LIMIT
+    varying: VaryingFlow | None = None
+
+    @cached_property
+    def _changing(self) -> _Changing | None:
+        """The nominal motion of a system that changes with time."""
+        return None if self.varying is None else _Changing(self.problem, self.varying)
 
     @cached_property
     def _lengths(self) -> list[Fraction]:
@@ -178,7 +186,7 @@ class Price:
         bits = int(ctx.prec)
         while True:
             with ctx.workprec(bits):
-                found = _walked(self.problem, self.control, pieces)
+                found = _walked(self.problem, self.control, pieces, self._changing)
             if found.blurred <= ENOUGH:
                 return found
             bits *= 2
@@ -197,7 +205,9 @@ class _Walk:
     blurred: float
 
 
-def _walked(problem: OptimalControlProblem, control: Dictionary, pieces: Sequence[arb_mat]) -> _Walk:
+def _walked(
+    problem: OptimalControlProblem, control: Dictionary, pieces: Sequence[arb_mat], changing: _Changing | None
+) -> _Walk:
     """``z = (x, 1, u)`` along the nominal trajectory, and back with the costates of what it costs; a control acts on
     the state as late as the system says, and costs when it is given."""
     from flint import arb, arb_mat
@@ -206,7 +216,10 @@ def _walked(problem: OptimalControlProblem, control: Dictionary, pieces: Sequenc
     still = stacked([[arb(0)] for _ in range(m)])
     x, walked = modes[0].start, []
     for start, stop, k, leg in _acting(problem, control):
-        flow, weight = modes[leg].over(stop - start, acting=k >= 0)
+        if changing is None:
+            flow, weight = modes[leg].over(stop - start, acting=k >= 0)
+        else:
+            flow, weight = changing.over(float(start), float(stop), modes[0].M)
         z = arb_mat(x.tolist() + (still if k < 0 else pieces[k]).tolist())
         walked.append((k, flow, weight, z))
         x = arb_mat((flow * z).tolist()[: d + 1])
@@ -304,6 +317,66 @@ class _Nominal:
         if (length, acting) not in self._known:
             self._known[length, acting] = _integrated(self.F if acting else self.waiting, self.M, length)
         return self._known[length, acting]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Changing:
+    """`_Nominal` of a system that changes with time, of which ``law`` is the flow."""
+
+    problem: OptimalControlProblem
+    law: VaryingFlow
+    _known: dict[tuple[float, float], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+
+    def over(self, start: float, stop: float, M: arb_mat) -> tuple[arb_mat, arb_mat]:
+        """What the time from ``start`` to ``stop`` does to ``z``, and what it costs, segment by segment of the law."""
+        if (start, stop) not in self._known:
+            times = [start, *(t for t in self.law.ends if start < t < stop), stop]
+            parts = [self._within(*ends, M) for ends in pairwise(times)]
+            flow, weight = parts[0]
+            for onward, cost in parts[1:]:
+                weight = weight + flow.transpose() * cost * flow
+                flow = onward * flow
+            self._known[start, stop] = flow, weight
+        return self._known[start, stop]
+
+    def _within(self, start: float, stop: float, M: arb_mat) -> tuple[arb_mat, arb_mat]:
+        """`over` within one segment, by the integrals of the products of all terms of the flow's series; what this
+        leaves out is in a ball at every time."""
+        from flint import arb
+
+        terms, rest = self.law.within(start, stop, EVERY)
+        every, left = [self._of(term, n == 0) for n, term in enumerate(terms)], self._of(rest, False)
+        flow = every[0]
+        for term in every[1:]:
+            flow = flow + term
+        if M == M * 0:
+            return flow + left, M
+        seen, share, pushed = every[0], arb(0).union(arb(1)), [M * term for term in every]
+        for term in every[1:]:
+            seen = seen + term * share
+        weight = left.transpose() * M * (seen + left) + seen.transpose() * M * left
+        for i, term in enumerate(every):
+            along = term.transpose()
+            for j, other in enumerate(pushed):
+                weight = weight + along * other / (i + j + 1)
+        return flow + left, weight * (arb(stop) - arb(start))
+
+    def _of(self, term: arb_mat, first: bool) -> arb_mat:
+        """A term on states, controls and disturbances as one on ``z``."""
+        from flint import arb
+
+        problem, d, m = self.problem, self.problem.system.states, self.problem.system.controls
+        w = balls(np.ones(term.ncols() - d - m))  # a drift, whose input is 1
+        mw = problem.system.disturbances
+        point = np.zeros(mw) if problem.disturbance is None else nominal_point(problem.disturbance)
+        w[len(w) - mw :] = balls(point)
+        rows = [
+            [*row[:d], sum((e * v for e, v in zip(row[d + m :], w, strict=True)), arb(0)), *row[d : d + m]]
+            for row in term.tolist()
+        ]
+        below = [[arb(int(first and i == j)) for j in range(d + 1 + m)] for i in range(d, d + 1 + m)]
+        return stacked([*rows, *below])
 
 
 def _deviation(term: Quadratic | None, size: int) -> list[list[arb]]:

@@ -257,11 +257,9 @@ class OptimalControlProblem:
             raise InputError(
                 path="system", expected=f"a law up to {self.horizon:g}, the horizon", got=f"up to {system.horizon:g}"
             )
-        quadratic = [name for name, term in zip(("state", "control", "final"), self.cost.terms, strict=True) if term]
         refused: dict[str, object] = {
             "measurements": self.measurements,
             "integral": self.integral,
-            "cost." + (quadratic or ["state"])[0]: quadratic,
         }
         for key, given in refused.items():
             if given:

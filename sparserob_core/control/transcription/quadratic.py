@@ -8,6 +8,7 @@ cancel.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,8 @@ import numpy as np
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.response.response import merge_grids
+from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.response.response import Propagator, TimeGrid, merge_grids
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 MOST = 5000  # values of a control that may be coupled: a matrix of their square
+POINTS = 16  # of Gauss' rule, on times on which the norm of A is at most 2: half of them leave a millionth of a digit
 SHORT = 0.5  # the norm of F h up to which W is read off one exponential
 
 
@@ -73,7 +76,8 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     d, m, horizon = system.states, system.controls, float(breakpoints[-1])
     given = np.zeros(m) if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
     ends, constants = np.array([0.0, horizon]), int(system.c is not None)
-    grid = merge_grids(breakpoints, ends, system.delay, given, constants, system.switches)
+    varying = isinstance(system, VaryingSystem)
+    grid = merge_grids(breakpoints, ends, system.delay, given, constants, system.switches, varying)
     parameter = np.zeros(0) if system.parameters is None else nominal_point(system.parameters)
     modes = [[matrix[0] for matrix in mode.matrices(parameter[None])] for mode in system.forced.modes]
     reference = np.zeros(d) if state is None else state.reference
@@ -81,9 +85,31 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     M = np.zeros((d + 1 + m, d + 1 + m))
     if state is not None:
         M[:d, :d] = state.Q
+    if varying:
+        which, (flows, weights) = np.arange(grid.pieces), _in_time(Propagator(system.forced, grid), reference, noise, M)
+    else:
+        which, flows, weights = _by_kind(grid, modes, reference, noise, given, M)
+    end = np.zeros((d + 1, d + 1))
+    if final is not None:
+        away = np.hstack([np.eye(d), (reference - final.reference)[:, None]])
+        end = away.T @ final.Q @ away
+    begin = np.asarray(problem.initial_state, dtype=float)
+    if problem.initial_set is not None:
+        begin = begin + nominal_point(problem.initial_set)
+    start = np.append(begin - reference, 1.0)
+    return NominalPieces(which, grid.control_piece, flows, weights, start, end)
+
+
+def _by_kind(
+    grid: TimeGrid, modes: Sequence[Sequence[Array]], reference: Array, noise: Array, given: Array, M: Array
+) -> tuple[np.ndarray, Array, Array]:
+    """Which of a few kinds every piece is of, ``(L,)``, and the flows and weights of these, `NominalPieces`."""
+    d, m = reference.size, given.size
     decided, mode = grid.control_piece >= 0, np.zeros(grid.pieces) if grid.mode is None else grid.mode
     kinds, which = np.unique(
-        np.column_stack([np.round(grid.lengths / horizon, 13), decided, mode]), axis=0, return_inverse=True
+        np.column_stack([np.round(grid.lengths / float(grid.breakpoints[-1]), 13), decided, mode]),
+        axis=0,
+        return_inverse=True,
     )
     which = which.reshape(-1)
     means = np.bincount(which, grid.lengths) / np.bincount(which)  # the rounding of equal pieces must not add up
@@ -96,15 +122,30 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
         flow, weight = _integrated(F, M, float(length))
         flows.append(flow)
         weights.append(weight)
-    end = np.zeros((d + 1, d + 1))
-    if final is not None:
-        away = np.hstack([np.eye(d), (reference - final.reference)[:, None]])
-        end = away.T @ final.Q @ away
-    begin = np.asarray(problem.initial_state, dtype=float)
-    if problem.initial_set is not None:
-        begin = begin + nominal_point(problem.initial_set)
-    start = np.append(begin - reference, 1.0)
-    return NominalPieces(which, grid.control_piece, np.stack(flows), np.stack(weights), start, end)
+    return which, np.stack(flows), np.stack(weights)
+
+
+def _in_time(propagator: Propagator, reference: Array, noise: Array, M: Array) -> tuple[Array, Array]:
+    """Flows and weights of every piece of a system that changes with time, ``(L, ...)`` each: the integrals by Gauss'
+    rule between the times at which it is another polynomial."""
+    grid, expansion, d = propagator.grid, propagator.expansion, reference.size
+    assert expansion is not None
+    m = M.shape[0] - d - 1
+
+    def moved(starts: Array, stops: Array) -> Array:
+        flow = expansion.flow(starts, stops)
+        found = np.tile(np.eye(M.shape[0]), (starts.size, 1, 1))
+        drift = flow.state @ reference - reference + flow.control[:, :, m:].sum(axis=2) + flow.disturbance @ noise
+        found[:, :d, :d], found[:, :d, d], found[:, :d, d + 1 :] = flow.state, drift, flow.control[:, :, :m]
+        return found
+
+    points, shares = np.polynomial.legendre.leggauss(POINTS)
+    half = np.diff(propagator.marks)[:, None] / 2
+    times = (propagator.marks[:-1, None] + half * (1.0 + points)).ravel()
+    pieces, weights = grid.locate(times), np.zeros((grid.pieces, *M.shape))
+    inside = moved(grid.breakpoints[pieces], times)
+    np.add.at(weights, pieces, np.swapaxes(inside, 1, 2) @ M @ inside * (half * shares).reshape(-1, 1, 1))
+    return moved(grid.breakpoints[:-1], grid.breakpoints[1:]), weights
 
 
 def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> QuadraticCost:
