@@ -55,6 +55,9 @@ from sparserob_core.experiment.loop.study import ClosedLoops as ClosedLoops
 from sparserob_core.experiment.loop.loop import loop as loop
 from sparserob_core.experiment.margin.margin import Margin as Margin
 from sparserob_core.experiment.margin.margin import margin as margin
+from sparserob_core.experiment.bound.bound import Bound as Bound
+from sparserob_core.experiment.bound.bound import WorstCase as WorstCase
+from sparserob_core.experiment.bound.bound import bound as bound
 from sparserob_core.experiment.initial_states.initial_states import InitialStates as InitialStates
 from sparserob_core.experiment.initial_states.initial_states import initial_states as initial_states
 from sparserob_core.experiment.sweep.study import Study as Study

@@ -45,7 +45,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
     from flint import ctx
 
     status = case.certificate.get("status")
-    with ctx.workprec(_precision(case)):
+    with ctx.workprec(precision_of(case)):
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
             return [Finding("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
         causal = [judged("causal", lambda: _causal(case))] if "causal" in case.certificate else []
@@ -76,7 +76,7 @@ def derived_bound(case: Case) -> float:
     `Broken` where there is none."""
     from flint import ctx
 
-    with ctx.workprec(_precision(case)):
+    with ctx.workprec(precision_of(case)):
         return below(_multiplied(case, priced=True))
 
 
@@ -87,11 +87,11 @@ def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> f
 
     from sparserob_core.checker.claims.causal import causal_bound
 
-    with ctx.workprec(_precision(case)):
+    with ctx.workprec(precision_of(case)):
         return below(causal_bound(case, data, priced))
 
 
-def _precision(case: Case) -> int:
+def precision_of(case: Case) -> int:
     """Bits of a number. The exponential of a matrix is enclosed in a norm, so that its smallest entries need as many
     more bits as the system's numbers differ by, in the units that the user chose."""
     problem = case.problem

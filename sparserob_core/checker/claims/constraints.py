@@ -57,8 +57,8 @@ def bounded(case: Case, window: Window) -> str:
     covered(case, window, lower, upper)
     basis, gains, work = _work(case, window, normals, lower, upper)
     found = prove(
-        _tubes(case, basis, lower, upper),
-        _parameters(case),
+        tubes(case, basis, lower, upper),
+        parameters_of(case),
         work,
         case.clock,
         case.beside(window, basis, gains),
@@ -92,7 +92,8 @@ def normals_of(window: Window, data: object) -> Array:
     return normals
 
 
-def _parameters(case: Case) -> Parameters:
+def parameters_of(case: Case) -> Parameters:
+    """The set of the parameters."""
     bound = case.problem.system.parameters
     return Parameters(None if bound is None else known(bound))
 
@@ -178,12 +179,13 @@ def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
     return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), parts, strict=True)]
 
 
-def _tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Corners], Tube | VaryingTube]:
+def tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Corners], Tube | VaryingTube]:
+    """What makes the tube of a box of parameters; the cells ``[lower, upper]`` say how far these go."""
     if case.changing is not None:
         known_tube = VaryingTube(case.changing, case.scene, basis)
         return lambda _: known_tube
     nu = case.problem.system.parameter_count
-    widened = nu and not _parameters(case).is_box
+    widened = nu and not parameters_of(case).is_box
     extra = WIDER * (upper[:, 1 : 1 + nu].max(axis=0) - lower[:, 1 : 1 + nu].min(axis=0)) if widened else np.zeros(nu)
     made: dict[Corners, Tube] = {}
 

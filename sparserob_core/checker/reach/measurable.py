@@ -126,7 +126,7 @@ class Kernel:
             sums = np.abs(P).sum(axis=2)
             e = (off[:, : last + 1] + rounding(C.shape[1] + 2 * ORDER + 8) * large[:, : last + 1]) @ (C + side.rad).T
             e = (e + large[:, : last + 1] @ side.rad.T) * OUTWARD
-            value, more, less = _swept(P.reshape(-1, *P.shape[2:]), e.reshape(-1, e.shape[2]), np.tile(ends, len(size)))
+            value, more, less = swept(P.reshape(-1, *P.shape[2:]), e.reshape(-1, e.shape[2]), np.tile(ends, len(size)))
             value, more, less = (one.reshape(len(size), -1).sum(axis=1) for one in (value, more, less))
             low, high = low + value - less, high + value + more
             tops = sums.max(axis=2)
@@ -146,7 +146,7 @@ class Kernel:
         return np.asarray((slopes @ radii).max(axis=1) * OUTWARD)
 
 
-def _swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
+def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
     """The integral over ``u`` from -1 to ``ends (M,)`` of the largest of polynomials ``P (M, p + 1, v)``, which are off
     by at most ``e (M, v)``: values, and by how much more and less it may be, ``(M,)``."""
     orders = np.arange(P.shape[1])

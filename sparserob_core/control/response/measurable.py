@@ -167,20 +167,11 @@ class MeasurableSupport:
         lost = far * (np.linalg.norm(row @ A, axis=1) * growth * np.linalg.norm(E, 2))
         lost = lengths * (lost + far * rounding(operations) * np.linalg.norm(sizes, axis=1)) * (1.0 + rounding(8))
         np.add.at(total, owner, lost[:, None] * [-1.0, 1.0])
-        points = np.einsum("kj,jlw->lkw", BEZIER.T, np.array(terms))
         largest = np.zeros(int(member.max(initial=0)) + 1)
         np.maximum.at(largest, member[owner], far * np.linalg.norm(sizes, axis=1))
         accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
-        for turn in range(HALVINGS + 1):
-            best = self.bound.support_point(points[:, ORDER // 2])
-            low = (points @ best[:, :, None])[..., 0].mean(axis=1) * lengths
-            high = self.bound.support(points).mean(axis=1) * lengths
-            open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
-            np.add.at(total, owner[~open_], np.stack([low, high], axis=1)[~open_])
-            points, owner = _halved(points[open_]), np.tile(owner[open_], 2)
-            lengths = np.tile(lengths[open_] / 2, 2)
-            if not owner.size:
-                break
+        points = np.array(terms).swapaxes(0, 1)
+        np.add.at(total, owner, integrated(self.bound, points, lengths, accuracy[owner]))
         return total
 
     @shaped
@@ -228,6 +219,25 @@ class MeasurableSupport:
         lines = np.einsum("lqij,jw->lqiw", _flows(A, lengths[:, None] * (NODES + 1) / 2), W)
         values = self.bound.support(np.einsum("li,lqiw->lqw", starts, lines))
         return (values * WEIGHTS).sum(axis=1) * lengths / 2, np.abs(values).max(axis=1, initial=0.0)
+
+
+def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) -> Array:
+    """Lower and upper bounds ``(l, 2)`` of the integrals of the support function of ``bound`` over intervals of
+    ``lengths (l,)``, on which its argument is a polynomial with ``terms (l, ORDER + 1, w)`` in the share of the
+    interval that has passed; intervals across a kink are halved until their bounds are within ``accuracy (l,)``."""
+    total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
+    points = np.einsum("kj,ljw->lkw", BEZIER.T, terms)
+    for turn in range(HALVINGS + 1):
+        best = bound.support_point(points[:, ORDER // 2])
+        low = (points @ best[:, :, None])[..., 0].mean(axis=1) * lengths
+        high = bound.support(points).mean(axis=1) * lengths
+        open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
+        np.add.at(total, owner[~open_], np.stack([low, high], axis=1)[~open_])
+        points, owner = _halved(points[open_]), np.tile(owner[open_], 2)
+        lengths = np.tile(lengths[open_] / 2, 2)
+        if not owner.size:
+            break
+    return total
 
 
 def _halved(points: Array) -> Array:

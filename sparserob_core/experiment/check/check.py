@@ -14,7 +14,7 @@ from sparserob_core.checker.outcome import Clock, Finding
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.check.files import compared
 from sparserob_core.experiment.config.run_config import digest
-from sparserob_core.experiment.directory.finished import read_json, stored_run
+from sparserob_core.experiment.directory.finished import read_config, read_json, stored_run
 from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
@@ -65,8 +65,10 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
 
     if type(seconds) not in (int, float) or not seconds > 0:
         raise InputError(path="seconds", expected="a positive number", got=repr(seconds))
-    started, clock, stored = time.perf_counter(), Clock(float(seconds)), stored_run(_place(directory))
-    path = stored.directory
+    started, clock, path = time.perf_counter(), Clock(float(seconds)), _place(directory)
+    if (path / "bound.json").is_file():
+        return _worst_cases(path, plugins, clock, started)
+    stored = stored_run(path)
     if not (path / "certificate.json").is_file():
         raise InputError(f"{path}: expected the directory of a finished run, got one without certificate.json")
     data, summary = read_json(path / "certificate.json"), read_json(path / "result.json")
@@ -90,6 +92,31 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
     files = compared(replace(stored, largest=_largest(path, case)), loaded, case, summary)
     claims = (_config(loaded, data, summary), *derived, *files.claims)
     return Check(loaded.config.title or path.name, claims, time.perf_counter() - started, files.not_compared)
+
+
+def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, started: float) -> Check:
+    """The verdicts on the directory that `bound` wrote."""
+    from sparserob_core.checker.claims.case import Case
+    from sparserob_core.checker.suprema.suprema import check_suprema
+    from sparserob_core.experiment.assemble import dictionaries_of, problem_of
+
+    data = read_json(path / "bound.json")
+    loaded = read_config(path, plugins)
+    problem = problem_of(loaded)
+    if isinstance(problem, SemiInfiniteProgram):
+        raise InputError(f"{path}: expected worst cases of a control problem")
+    control, disturbance = dictionaries_of(loaded, problem.horizon)
+    decision = data.get("decision")
+    if decision is None:  # without any control
+        data = {**data, "decision": [[0.0] * control.functions for _ in range(problem.system.controls)]}
+    claims = check_suprema(Case(problem, control, disturbance, data, clock))
+    rest = tuple(name for name in ("envelopes.npz", "bound.png") if (path / name).is_file())
+    return Check(
+        loaded.config.title or path.name,
+        (_config(loaded, data, data), *claims),
+        time.perf_counter() - started,
+        rest,
+    )
 
 
 def _policy(

@@ -16,6 +16,7 @@ from sparserob_core.errors import SparseRobError, named
 from sparserob_core.experiment.cli.catalogue.examples import examples
 from sparserob_core.experiment.cli.catalogue.plugins import new_plugin, plugins
 from sparserob_core.experiment.cli.catalogue.schema import schema
+from sparserob_core.experiment.cli.commands.bound import bound
 from sparserob_core.experiment.cli.commands.check import check
 from sparserob_core.experiment.cli.commands.compare import benchmark, compare
 from sparserob_core.experiment.cli.commands.figures import figures
@@ -149,6 +150,7 @@ for command in (
     simulate,
     loop,
     margin,
+    bound,
     initial_states,
     compare,
     benchmark,

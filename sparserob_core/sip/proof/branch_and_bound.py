@@ -6,9 +6,11 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ProofProgress, ignore
@@ -61,6 +63,28 @@ def prove(
     )
 
 
+def supremum(
+    family: ConstraintFamily,
+    x: Array,
+    tolerance: float,
+    least: float = 0.0,
+    notify: Notify = ignore,
+    cells: int = CELLS,
+    deadline: Deadline | None = None,
+) -> Supremum:
+    """The largest violation of a family over its whole index set, between one that an index reaches and a proven bound:
+    the proof that stops at a violation is asked for a number.
+
+    A cell is closed where its enclosure is within ``tolerance`` times the best violation met so far, or times ``least``
+    where that is larger. Past the deadline, or when ``cells`` were examined, the two sides are farther apart, and hold
+    all the same. Raises `NotEnclosable` for a family that offers no enclosure.
+    """
+    if family.enclosure is None:
+        raise NotEnclosable(f"{family.name} offers no enclosure")
+    course = Course(family, notify, cells, deadline or Deadline())
+    return _branch_and_bound(family, x, course, Within(tolerance, least))[1]
+
+
 def prove_family(
     family: ConstraintFamily, x: Array, notify: Notify = ignore, cells: int = CELLS, deadline: Deadline | None = None
 ) -> Proof:
@@ -75,7 +99,7 @@ def prove_family(
         if family.enclosure is None:
             return _by_separation(family, x)
         try:
-            return _branch_and_bound(family, x, Course(family, notify, cells, time_left))
+            return _branch_and_bound(family, x, Course(family, notify, cells, time_left), NoViolation())[0]
         except NotEnclosable as error:
             if time_left.passed:
                 return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: {error}")
@@ -150,36 +174,89 @@ class Course:
         return f"{self.family.name}: {cell}; {advice or ADVICE}"
 
 
-def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Proof:
-    tolerance, box = TOLERANCE, family.index_set
+@dataclass(frozen=True)
+class NoViolation:
+    """The question whether anything is violated: cells are closed where nothing is, and a violation ends the search."""
+
+    def closes(self, best: float) -> float:
+        """The bound up to which a cell is closed, where ``best`` was met."""
+        return TOLERANCE
+
+    def ends(self, best: float) -> bool:
+        """Whether what was met answers the question."""
+        return best > TOLERANCE
+
+
+@dataclass(frozen=True)
+class Within:
+    """The question how large the largest violation is, to a ``tolerance`` relative to it, or to ``least`` where that is
+    larger."""
+
+    tolerance: float
+    least: float
+
+    def closes(self, best: float) -> float:
+        """As `NoViolation.closes`."""
+        return best + self.tolerance * max(abs(best), self.least)
+
+    def ends(self, best: float) -> bool:
+        """As `NoViolation.ends`."""
+        return False
+
+
+@dataclass(frozen=True, eq=False)
+class Supremum:
+    """The largest violation of a family, between ``lower``, reached by ``row`` at ``index (d,)``, and ``upper``, proven
+    over the continuum. ``reason``: what hindered the two from being as close as was asked for, empty where they are.
+
+    ``leaves``: lower and upper corners ``(k, d)`` of the cells that prove it, and the proven bounds ``(k,)`` there.
+    """
+
+    lower: float
+    upper: float
+    index: Array
+    row: int
+    cells: int
+    leaves: tuple[Array, Array, Array]
+    reason: str = ""
+
+    __repr__ = brief
+
+
+def _branch_and_bound(
+    family: ConstraintFamily, x: Array, course: Course, goal: NoViolation | Within
+) -> tuple[Proof, Supremum]:
+    """What is known of one family, as an answer to whether anything is violated, and as a number."""
+    box = family.index_set
     lower, upper = family.cells if family.cells is not None else (box.lower[None], box.upper[None])
-    closed, best = -np.inf, (-np.inf, lower[0], 0)
-    leaves: list[tuple[Array, Array]] = []  # one entry per halving
+    best, known = (-np.inf, lower[0], 0), np.full(lower.shape[0], np.inf)
+    leaves: list[tuple[Array, Array, Array]] = []  # one entry per halving
     slacks: list[float] = []
+
     while True:
         # Bound every cell, and close those where no violation is left.
         bounds, split, bend = _bounded(course, x, lower, upper)
+        bounds = np.minimum(bounds, known)  # a part violates no more than the whole
         course.examined += bounds.size
-        open_ = bounds > tolerance
-        leaves.append((lower[~open_], upper[~open_]))
-        closed = max(closed, float(bounds[~open_].max(initial=-np.inf)))
+        open_ = bounds > goal.closes(best[0])
 
         # Look for a witness: where separation finds the largest violations, and in the worst cells.
-        first, peaks = len(leaves) == 1, _NOWHERE
+        first, peaks = not leaves, _NOWHERE
         if first and bend is not None and family.worst is not None:
             peaks = family.worst(x)
         if peaks.violations.size:
             best = (float(peaks.violations[0]), peaks.indices[0], int(peaks.rows[0]))
         elif first or open_.any():
             best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
-        if open_.any() and best[0] <= tolerance and len(leaves) in CLIMBED and box.dimension > 1:
+        if open_.any() and not goal.ends(best[0]) and len(leaves) + 1 in CLIMBED and box.dimension > 1:
             worst_cell = (corner[bounds.argmax()] for corner in (lower, upper))
             best = max(best, _climb(family, x, *worst_cell), key=lambda found: found[0])
-        if best[0] > tolerance:
-            return Proof(family.name, "refuted", np.inf, best[0], best[1], best[2], course.examined)
+        open_ = bounds > goal.closes(best[0])
+        leaves.append((lower[~open_], upper[~open_], bounds[~open_]))
+        if goal.ends(best[0]):
+            return _answers(course, "refuted", best, leaves)
         if not open_.any():
-            leaf_cells = _in_order(leaves)
-            return Proof(family.name, "proven", closed, best[0], best[1], best[2], course.examined, leaves=leaf_cells)
+            return _answers(course, "proven", best, leaves)
 
         # Cut what is open, as long as cells, their width and time allow: once towards the peaks, then into halves.
         worst, at = float(bounds.max()), int(bounds.argmax())
@@ -188,14 +265,42 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Pro
         low, high = lower[open_], upper[open_]
         parts = None if bend is None else _towards(peaks, low, high, bounds[open_], bend[open_])
         if parts is None or course.examined + parts[0].shape[0] > course.budget:
-            parts = _halved(low, high, split[open_])
+            parts, known = _halved(low, high, split[open_]), np.tile(bounds[open_], 2)
+        else:
+            known = np.full(parts[0].shape[0], np.inf)
         slacks.append(worst - best[0])
         spent = parts is None or course.examined + parts[0].shape[0] > course.budget or course.deadline.passed
         if parts is None or spent or _at_rest(slacks):
             hindrance = course.hindrance(worst, lower[at], upper[at])
+            leaves.append((low, high, bounds[open_]))
             reason = f"{int(open_.sum())} of {course.examined} cells were left; {hindrance}"
-            return Proof(family.name, "undecided", worst, best[0], best[1], best[2], course.examined, reason)
+            return _answers(course, "undecided", best, leaves, reason)
         lower, upper = parts
+
+
+def _answers(
+    course: Course,
+    verdict: Literal["proven", "refuted", "undecided"],
+    best: tuple[float, Array, int],
+    leaves: list[tuple[Array, Array, Array]],
+    reason: str = "",
+) -> tuple[Proof, Supremum]:
+    """Both answers, where ``best`` was met and ``leaves`` were closed, or left open where it is undecided."""
+    lower, upper, bounds = _in_order(leaves)
+    top, name, (violation, index, row) = float(bounds.max(initial=-np.inf)), course.family.name, best
+    proof = Proof(
+        name,
+        verdict,
+        np.inf if verdict == "refuted" else top,
+        violation,
+        index,
+        row,
+        course.examined,
+        reason,
+        leaves=(lower, upper) if verdict == "proven" else None,
+    )
+    cells = lower, upper, bounds
+    return proof, Supremum(violation, max(top, violation), index, row, course.examined, cells, reason)
 
 
 def _at_rest(slacks: Sequence[float]) -> bool:
@@ -295,11 +400,11 @@ def _climb(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tu
     return best
 
 
-def _in_order(leaves: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """All leaves, by their lower and then by their upper corners."""
-    lower, upper = (np.vstack(corners) for corners in zip(*leaves, strict=True))
+def _in_order(leaves: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
+    """All leaves, by their lower and then by their upper corners, and their bounds."""
+    lower, upper, bounds = (np.concatenate(parts) for parts in zip(*leaves, strict=True))
     order = np.lexsort(np.hstack([lower, upper]).T[::-1])
-    return lower[order], upper[order]
+    return lower[order], upper[order], bounds[order]
 
 
 def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | None:

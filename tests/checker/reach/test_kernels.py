@@ -12,7 +12,7 @@ from flint import arb, ctx
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.reach.disturbance_support import Operator
 from sparserob_core.checker.reach.flow import OwnUnits, stacked
-from sparserob_core.checker.reach.measurable import APART, Kernel, Side, _equal, _swept, _valued
+from sparserob_core.checker.reach.measurable import APART, Kernel, Side, _equal, _valued, swept
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Box, NormBall
 
@@ -28,7 +28,7 @@ def test_the_integral_of_the_largest_of_polynomials_is_enclosed_and_sharp():
     P = rng.normal(size=(12, 5, 3)) * 0.7 ** np.arange(5)[:, None]
     ends = np.where(np.arange(12) % 3, 1.0, rng.uniform(-0.9, 0.9, size=12))
     none = np.zeros((12, 3))
-    value, more, less = _swept(P, none, ends)
+    value, more, less = swept(P, none, ends)
     truth = np.array([largest(p, end) for p, end in zip(P, ends, strict=True)])
     assert (less == 0.0).all()
     assert (value <= truth + 1e-6).all() and (truth <= value + more + 1e-6).all()
@@ -40,7 +40,7 @@ def test_two_that_cross_are_integrated_from_crossing_to_crossing():
     P = np.zeros((2, 3, 2))
     P[0, 1] = [1.0, -1.0]
     P[1, 2, 0], P[1, 0, 1] = 1.0, 0.25
-    value, more, less = _swept(P, np.zeros((2, 2)), np.ones(2))
+    value, more, less = swept(P, np.zeros((2, 2)), np.ones(2))
     assert value == pytest.approx([1.0, 2.0 * (0.125 + (1.0 - 0.125) / 3.0)])
     assert (more < 1e-12).all() and (less == 0.0).all()
 
@@ -49,7 +49,7 @@ def test_errors_of_polynomials_are_errors_of_the_integral():
     """What stands for the largest is off by its own error; another one may be larger by both."""
     P = np.array([[[3.0, 1.0]]])
     for e in ([0.1, 0.4], [0.4, 0.1], [0.25, 0.25]):
-        value, more, less = _swept(P, np.array([e]), np.array([0.5]))
+        value, more, less = swept(P, np.array([e]), np.array([0.5]))
         assert value[0] == pytest.approx(4.5)
         assert more[0] == pytest.approx(1.5 * (e[0] + 2.0 * max(e)))
         assert less[0] == pytest.approx(1.5 * e[0])

@@ -1,0 +1,412 @@
+"""A row ``c'x(t)`` of a known system that does not change, by its adjoint ``l(s) = e^{A's} c``: what it is along one
+trajectory, and how large it is at most along all of them.
+
+The rows at the ends of equal steps are vectors of balls, each a product of few matrices; from there on they are floats
+with a radius. Within a step a row, and what an input adds, is a polynomial of the time with a rest. Nothing is as large
+as a transition at every time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import ceil, exp, factorial, floor, log2
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Clock, Unchecked
+from sparserob_core.checker.reach.closed_loop import middle
+from sparserob_core.checker.reach.flow import OwnUnits, middles, stacked
+from sparserob_core.checker.reach.measurable import Side, swept
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from flint import arb_mat
+
+ORDER = 13  # of the polynomials
+SHORT = 1.0  # growth times length of a step, at most: what is left of them is then 3e-11 of a row's largest term
+BENDING = 7  # terms of the bounds of second derivatives
+MOST_STEPS = 2**17
+MOST = 2**27  # numbers that the rows of all steps take
+AT_ONCE = 2**22  # numbers of rows that are worked on at once
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Adjoint:
+    """``l`` at the ends of steps, ``nodes (N + 1, d)``; ``rows (p + 1, d, d)`` and ``inputs (p + 1, d, q)``: what makes
+    of a node the terms of the polynomials of ``l`` and of ``l'F`` on the step after it. ``growth``: a bound of how fast
+    ``l`` moves, in the states' own ``units``. ``step`` is a power of two, so that places within it are exact."""
+
+    A: arb_mat
+    F: arb_mat
+    nodes: Enclosed
+    rows: Enclosed
+    inputs: Enclosed
+    units: Array
+    growth: float
+    step: float
+
+    @staticmethod
+    def of(A: arb_mat, F: arb_mat, c: Array, horizon: float, clock: Clock) -> Adjoint:
+        """That of the row ``c (d,)``, an exact one, with inputs through ``F (d, q)``."""
+        from flint import arb, arb_mat
+
+        d = A.nrows()
+        own = OwnUnits.of(A, horizon, np.abs(middles(F)).sum(axis=1))
+        inside = own.rows(own.states(own.matrix)).tolist()
+        growth = max(float(sum((abs(x) for x in row), arb(0)).upper()) for row in inside) * OUTWARD
+        step = 2.0 ** floor(log2(min(horizon / 64.0, SHORT / max(growth, 1e-300))))
+        count = ceil(horizon / step)
+        if not (count <= MOST_STEPS and count * d <= MOST):
+            raise Unchecked("the system is too fast for its horizon to be followed")
+        unit = arb_mat(d, d, [int(i == j) for i in range(d) for j in range(d)])
+        power, found = (A * arb(step)).exp(), [[arb(float(v)) for v in c]]
+        while len(found) <= count:
+            clock.check()
+            found += (stacked(found) * power).tolist()
+            power = power * power
+        nodes = Enclosed.of(stacked(found[: count + 1]))
+        terms, driven = [unit], [F]
+        for order in range(1, ORDER + 1):
+            clock.check()
+            terms.append(A * terms[-1] * (arb(step) / order))
+            driven.append(A * driven[-1] * (arb(step) / order))
+        rows = Enclosed.all(terms, (ORDER + 1, d, d))
+        return Adjoint(A, F, nodes, rows, Enclosed.all(driven, (ORDER + 1, d, F.ncols())), own.units, growth, step)
+
+    def reversed(self) -> Adjoint:
+        """That of ``-c``."""
+        return replace(self, nodes=Enclosed(-self.nodes.mid, self.nodes.rad))
+
+    @property
+    def count(self) -> int:
+        """How many steps there are."""
+        return int(self.nodes.mid.shape[0]) - 1
+
+    @cached_property
+    def sizes(self) -> Array:
+        """The sums of the absolute values of ``l`` in own units at the ends of steps, ``(N + 1,)``."""
+        return np.asarray(((np.abs(self.nodes.mid) + self.nodes.rad) * self.units).sum(axis=1) * OUTWARD)
+
+    @cached_property
+    def left(self) -> Array:
+        """What is left of the expansion of ``l``, in the same sums, ``(N,)``."""
+        short = self.growth * self.step
+        return np.asarray(self.sizes[:-1] * (short ** (ORDER + 1) / factorial(ORDER + 1) * exp(short)) * OUTWARD)
+
+    @cached_property
+    def pushes(self) -> Array:
+        """How large a row of ``F`` is in own units, ``(q,)``."""
+        F = Enclosed.of(self.F)
+        return np.asarray(((np.abs(F.mid) + F.rad) / self.units[:, None]).max(axis=0, initial=0.0) * OUTWARD)
+
+    @cached_property
+    def driven(self) -> Enclosed:
+        """The terms ``(N, p + 1, q)`` of ``l'F`` on every step, the rest among their radii, at the first."""
+        mid, rad = _product(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.inputs)
+        rad[:, 0] += self.left[:, None] * self.pushes
+        return Enclosed(mid, rad * OUTWARD)
+
+    @cached_property
+    def _weights(self) -> Array:
+        return 1.0 / np.arange(1.0, ORDER + 2.0)
+
+    @cached_property
+    def sums(self) -> Enclosed:
+        """``int l'F`` up to the end of every step, ``(N + 1, q)``; the radius grows from step to step by what the terms
+        of the step are off, so that what the difference of two is off is the difference of their radii."""
+        from flint import arb
+
+        moved, size = (
+            self.step * np.einsum("kjq,j->kq", part, self._weights)
+            for part in (self.driven.mid, np.abs(self.driven.mid))
+        )
+        rad = self.step * np.einsum("kjq,j->kq", self.driven.rad, self._weights) + rounding(ORDER + 2) * size
+        totals = [[arb(0)] * moved.shape[1]]
+        for row in moved.tolist():
+            totals.append([a + b for a, b in zip(totals[-1], row, strict=True)])
+        mid = np.array([[float(x.mid()) for x in row] for row in totals])
+        return Enclosed(mid, np.vstack([np.zeros((1, mid.shape[1])), np.cumsum(rad, axis=0)]) * OUTWARD)
+
+    def placed(self, times: Array) -> tuple[np.ndarray, Array]:
+        """The step of every time, and the share of it that has passed, exactly."""
+        steps = np.clip(np.floor(times / self.step).astype(int), 0, self.count - 1)
+        return steps, (times - steps * self.step) / self.step
+
+    def at(self, times: Array) -> Enclosed:
+        """``l`` at exact times ``(k,)``, ``(k, d)``."""
+        steps, shares = self.placed(times)
+        mid, rad = np.empty((times.size, self.units.size)), np.empty((times.size, self.units.size))
+        whole = shares == 0.0
+        mid[whole], rad[whole] = self.nodes.mid[steps[whole]], self.nodes.rad[steps[whole]]
+        used, which = np.unique(steps[~whole], return_inverse=True)
+        others = np.flatnonzero(~whole)
+        several = max(1, AT_ONCE // self.rows.mid[:, 0].size)
+        for start in range(0, used.size, several):
+            part = used[start : start + several]
+            terms, off = _product(Enclosed(self.nodes.mid[part], self.nodes.rad[part]), self.rows)
+            mine = (which >= start) & (which < start + several)
+            here, place = others[mine], which[mine] - start
+            powers = shares[here][:, None] ** np.arange(ORDER + 1)
+            chosen = terms[place]
+            mid[here] = np.einsum("kjd,kj->kd", chosen, powers)
+            lost = np.einsum("kjd,kj->kd", off[place] + rounding(3 * ORDER) * np.abs(chosen), powers)
+            rad[here] = (lost + self.left[steps[here]][:, None] / self.units) * OUTWARD
+        return Enclosed(mid, rad)
+
+    def integrals(self, times: Array) -> tuple[Enclosed, Array]:
+        """``int_0^t l'F`` at exact times ``(...)``, ``(..., q)``, 0 before 0, with radii as of `sums`; and what
+        rounding makes of it here."""
+        steps, shares = self.placed(np.maximum(times, 0.0))
+        powers = self.step * shares[..., None] ** np.arange(1, ORDER + 2) * self._weights
+        mid = np.einsum("...jq,...j->...q", self.driven.mid[steps], powers)
+        rad = np.einsum("...jq,...j->...q", self.driven.rad[steps], powers)
+        size = np.einsum("...jq,...j->...q", np.abs(self.driven.mid[steps]), powers)
+        total = self.sums.mid[steps] + mid
+        rounded = rounding(3 * ORDER) * size + 2.0 * HALF_ULP * (np.abs(self.sums.mid[steps]) + np.abs(total))
+        return Enclosed(total, (self.sums.rad[steps] + rad) * OUTWARD), rounded * OUTWARD
+
+    def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
+        """What an input of 1 from ``start`` to ``stop`` adds to the row at exact times, ``(..., q)``; where the
+        difference of two times is rounded, the radius allows for it."""
+        (since, one), (until, other) = _apart(times, start), _apart(times, stop)
+        (late, first), (early, second) = self.integrals(since), self.integrals(until)
+        mid = late.mid - early.mid
+        rad = np.abs(late.rad - early.rad) + (OUTWARD - 1.0) * (late.rad + early.rad) + first + second
+        rad = rad + HALF_ULP * np.abs(mid) + (one + other)[..., None] * self._fastest
+        return Enclosed(mid, rad * OUTWARD)
+
+    @cached_property
+    def _fastest(self) -> Array:
+        """The largest absolute value of ``l'F``, ``(q,)``."""
+        return np.asarray((np.abs(self.driven.mid) + self.driven.rad).sum(axis=1).max(axis=0) * OUTWARD)
+
+    @cached_property
+    def bends(self) -> tuple[Array, Array, Array]:
+        """On every step bounds of ``|l''|``, ``(N, d)``, of ``|l'AF|`` and of ``|l'A^2 F|``, ``(N, q)``."""
+        from flint import arb, arb_mat
+
+        d, q = self.A.nrows(), self.F.ncols()
+        once, twice = self.A * self.F, self.A * (self.A * self.F)
+        every = zip((self.A * self.A).tolist(), once.tolist(), twice.tolist(), strict=True)
+        term = arb_mat([[*a, *b, *c] for a, b, c in every])
+        first = Enclosed.of(term)
+        short = self.growth * self.step
+        rest = short ** (BENDING + 1) / factorial(BENDING + 1) * exp(short)
+        heights = ((np.abs(first.mid) + first.rad) / self.units[:, None]).max(axis=0)
+        found = self.sizes[:-1, None] * rest * heights
+        nodes = Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1])
+        for order in range(BENDING + 1):
+            if order:
+                term = self.A * term * (arb(self.step) / order)
+            mid, rad = _product(nodes, Enclosed.all([term], (1, d, d + 2 * q)))
+            found += np.abs(mid[:, 0]) + rad[:, 0]
+        found *= OUTWARD
+        return found[:, :d], found[:, d : d + q], found[:, d + q :]
+
+
+def _apart(times: Array, others: Array | float) -> tuple[Array, Array]:
+    """Differences of times, and by how much they are rounded (Knuth 1997, section 4.2.2, theorem B)."""
+    nearest = times - np.asarray(others, dtype=float)
+    part = nearest - times
+    return nearest, np.abs((times - (nearest - part)) - (others + part))
+
+
+def _product(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
+    """Rows ``(k, d)`` times matrices ``(j, d, n)``, ``(k, j, n)``, with its error."""
+    j, d, n = right.mid.shape
+    flat, off = (part.transpose(1, 0, 2).reshape(d, j * n) for part in (right.mid, right.rad))
+    size = np.abs(left.mid)
+    mid = left.mid @ flat
+    rad = size @ (off + rounding(d) * np.abs(flat)) + left.rad @ (np.abs(flat) + off)
+    return mid.reshape(-1, j, n), rad.reshape(-1, j, n) * OUTWARD
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Worst:
+    """The largest ``c'x(t)`` over all initial states ``centre + begun`` and disturbances in ``pushed``, which enter by
+    the last inputs of the ``adjoint``: constant between ``changes (M + 1,)``, or, where these are ``None``, measurable;
+    the ``drives (q', L)`` between times ``grid (L + 1,)`` enter by the first."""
+
+    adjoint: Adjoint
+    centre: Array
+    begun: ConvexSet | None
+    grid: Array
+    drives: Enclosed
+    pushed: ConvexSet | None
+    changes: Array | None
+
+    @property
+    def _mine(self) -> slice:
+        return slice(self.drives.mid.shape[0], None)
+
+    def along(self, time: float, deviation: Array, changes: Array, signal: Array | None) -> tuple[float, float]:
+        """The value at a time, between bounds, from the centre and a ``deviation (d,)``, under a ``signal (mw, M)``
+        that is constant between ``changes (M + 1,)``."""
+        times = np.array([time])
+        row = self.adjoint.at(times)
+        value, rad = self._driven(times)
+        for state in (self.centre, deviation):
+            value = value + row.mid @ state
+            rad = rad + row.rad @ np.abs(state) + rounding(state.size) * (np.abs(row.mid) @ np.abs(state))
+            rad = rad + 2.0 * HALF_ULP * np.abs(value)
+        if signal is not None:
+            late, early = np.append(changes[:-1], time)[:-1], np.minimum(changes[1:], time)
+            part = self.adjoint.between(np.full(late.size, time), late, early)
+            gains, off = part.mid[:, self._mine] * signal.T, part.rad[:, self._mine] * np.abs(signal.T)
+            value = value + gains.sum()
+            rad = rad + off.sum() + rounding(gains.size) * np.abs(gains).sum()
+        lost = float(rad[0] + 4.0 * HALF_ULP * abs(value[0])) * OUTWARD
+        return float(value[0]) - lost, float(value[0]) + lost
+
+    def _driven(self, times: Array) -> tuple[Array, Array]:
+        """What is known of the inputs adds, and how far that is off, ``(k,)``."""
+        mid, rad, size = np.zeros(times.size), np.zeros(times.size), np.zeros(times.size)
+        used = self.drives.mid.shape[0]
+        for k, (start, stop) in enumerate(zip(self.grid[:-1], self.grid[1:], strict=True)):
+            u, off = self.drives.mid[:, k], self.drives.rad[:, k]
+            if u.any():
+                part = self.adjoint.between(times, float(start), float(stop))
+                mid += part.mid[:, :used] @ u
+                rad += part.rad[:, :used] @ (np.abs(u) + off) + np.abs(part.mid[:, :used]) @ off
+                size += np.abs(part.mid[:, :used]) @ np.abs(u)
+        return mid, rad + rounding(used + self.grid.size) * size
+
+    def most(self, times: Array) -> tuple[Array, Array]:
+        """Upper bounds ``(k,)`` of the largest value at exact times, and how far they may be above it, with flat sets
+        (of curved ones that is not told)."""
+        rows = self.adjoint.at(times)
+        top, rad = self._driven(times)
+        size = np.abs(rows.mid) @ np.abs(self.centre)
+        top = top + rows.mid @ self.centre
+        rad = rad + rows.rad @ np.abs(self.centre) + rounding(self.centre.size) * size
+        parts = [] if self.begun is None else [_supported(self.begun, rows)]
+        if self.pushed is not None:
+            parts.append(self._constant(times) if self.changes is not None else self._measurable(times))
+        for high, more in parts:
+            top, rad, size = top + high, rad + more, size + np.abs(high)
+        rad = (rad + 8.0 * HALF_ULP * (np.abs(top) + size)) * OUTWARD
+        return top + rad, 3.0 * rad
+
+    def _constant(self, times: Array) -> tuple[Array, Array]:
+        assert self.pushed is not None and self.changes is not None
+        top, rad = np.zeros(times.size), np.zeros(times.size)
+        for start, stop in zip(self.changes[:-1], self.changes[1:], strict=True):
+            part = self.adjoint.between(times, float(start), float(stop))
+            high, more = _supported(self.pushed, Enclosed(part.mid[:, self._mine], part.rad[:, self._mine]))
+            top, rad = top + high, rad + more + HALF_ULP * np.abs(top)
+        return top, rad
+
+    @cached_property
+    def _sides(self) -> tuple[Array, list[Side]]:
+        assert self.pushed is not None
+        return middle(self.pushed), Side.of(self.pushed)
+
+    @cached_property
+    def _swept(self) -> tuple[Array, Array]:
+        """What a measurable disturbance adds up to the end of every step, but for the middle of its set, and by how
+        much it may be more, ``(N + 1,)`` each."""
+        steps = np.arange(self.adjoint.count)
+        value, more = self._part(steps, np.ones(steps.size))
+        more = more + rounding(self.adjoint.count) * np.abs(value)
+        return np.append(0.0, np.cumsum(value)), np.append(0.0, np.cumsum(more)) * OUTWARD
+
+    def _part(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array]:
+        """The integrals over the first ``shares (k,)`` of steps ``(k,)``, and by how much they may be more."""
+        polynomials, off = (
+            part[steps][:, :, self._mine] for part in (self.adjoint.driven.mid, self.adjoint.driven.rad)
+        )
+        moved = np.einsum("ij,kjw->kiw", CENTRED, polynomials)
+        size = np.einsum("ij,kjw->kiw", np.abs(CENTRED), np.abs(polynomials)).sum(axis=1)
+        lost = off.sum(axis=1) + rounding(2 * ORDER) * size
+        value, more = np.zeros(steps.size), np.zeros(steps.size)
+        for side in self._sides[1]:
+            corners = np.abs(side.corners)
+            P = np.einsum("kiw,vw->kiv", moved, side.corners)
+            e = (
+                lost @ (corners + side.rad).T
+                + size @ side.rad.T
+                + rounding(corners.shape[1] + 2 * ORDER) * size @ corners.T
+            )
+            high, over, less = swept(P, e * OUTWARD, 2.0 * shares - 1.0)
+            value, more = (
+                value + high,
+                more + np.maximum(over, less) + rounding(4 * ORDER) * 2.0 * np.abs(P).sum(axis=1).max(axis=1),
+            )
+        half = self.adjoint.step / 2.0
+        return value * half, more * half * OUTWARD
+
+    def _measurable(self, times: Array) -> tuple[Array, Array]:
+        about, _ = self._sides
+        steps, shares = self.adjoint.placed(times)
+        inside, more = self._part(steps, shares)
+        linear, rounded = self.adjoint.integrals(times)
+        mid, off = linear.mid[:, self._mine], (linear.rad + rounded)[:, self._mine]
+        top = self._swept[0][steps] + inside + mid @ about
+        rad = self._swept[1][steps] + more + off @ np.abs(about)
+        return top, rad + rounding(about.size + 2) * (np.abs(mid) @ np.abs(about) + np.abs(top))
+
+    @cached_property
+    def _bent(self) -> Array:
+        """On every step what, times an eighth of the square of a cell's width, the row is above its chord by,
+        ``(N,)``."""
+        states, once, twice = self.adjoint.bends
+        far = np.abs(self.centre) + (0.0 if self.begun is None else np.array(known(self.begun).radius))
+        found = states @ far
+        inputs = np.zeros(once.shape[1])
+        used = self.drives.mid.shape[0]
+        inputs[:used] = (np.abs(self.drives.mid) + self.drives.rad).max(axis=1, initial=0.0)
+        if self.pushed is not None:
+            radius = np.array(known(self.pushed).radius)
+            if self.changes is None:  # an integral of a support function, whose argument moves by l'AE
+                found = found + once[:, self._mine] @ radius
+            else:
+                inputs[self._mine] = radius
+        # of inputs on pieces, l'AF at the end of each less that at its beginning: how far it moves, and the last
+        total = self.adjoint.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
+        return np.asarray((found + total) * OUTWARD)
+
+    def over(self, start: Array, stop: Array, beside: Array | float = 0.0) -> Array:
+        """Upper bounds ``(k,)`` on ``[start, stop]``, each between two `cuts`; ``beside (2, k)``: what is added at both
+        ends, linear in between."""
+        ends, which = np.unique(np.concatenate([start, stop]), return_inverse=True)
+        tops = self.most(ends)[0][which]
+        left, right = (np.clip((t / self.adjoint.step).astype(int), 0, self.adjoint.count - 1) for t in (start, stop))
+        bent = np.maximum(self._bent[left], self._bent[right])
+        width = (stop - start) * OUTWARD
+        both = tops.reshape(2, -1) + beside
+        lost = 4.0 * HALF_ULP * (np.abs(both) + np.abs(beside)).max(axis=0)
+        return np.asarray(both.max(axis=0) + (width**2 / 8.0 * bent + lost) * OUTWARD)
+
+    def cuts(self, more: Sequence[float]) -> Array:
+        """Times between which no input jumps, and ``more``; no two are farther apart than a step."""
+        parts = [np.arange(self.adjoint.count + 1) * self.adjoint.step, np.asarray(more, dtype=float)]
+        parts += [self.grid] if self.drives.mid.any() else []
+        parts += [self.changes] if self.pushed is not None and self.changes is not None else []
+        return np.unique(np.concatenate(parts))
+
+
+def _supported(bound: ConvexSet, rows: Enclosed) -> tuple[Array, Array]:
+    """The support function of a set at rows ``(k, d)``, and by how much it may be more, ``(k,)`` each."""
+    w, excess = known(bound).bound(rows.mid, rows.rad)
+    size = (np.abs(w) * np.abs(rows.mid)).sum(axis=1)
+    more = (np.abs(w) * rows.rad).sum(axis=1) + rounding(rows.mid.shape[1]) * size
+    return (w * rows.mid).sum(axis=1), (more + np.abs(excess)) * OUTWARD
+
+
+def _centred() -> Array:
+    """From powers of a share ``v`` of a step to those of ``u = 2 v - 1``: ``v^j = (1 + u)^j / 2^j``."""
+    found = np.zeros((ORDER + 1, ORDER + 1))
+    for j in range(ORDER + 1):
+        for i in range(j + 1):
+            found[i, j] = factorial(j) / (factorial(i) * factorial(j - i)) / 2.0**j
+    return found
+
+
+CENTRED = _centred()

@@ -1,0 +1,1 @@
+"""The worst cases that ``sparserob bound`` writes down, derived anew."""

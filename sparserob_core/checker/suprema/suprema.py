@@ -1,0 +1,343 @@
+"""The two sides of every worst case, derived anew: one along its witness, the other over the continuum, on cells of the
+checker's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import above, balls, below
+from sparserob_core.checker.claims.case import Case, listed, number, numbers
+from sparserob_core.checker.claims.cells import Work, prove
+from sparserob_core.checker.claims.claims import FIGURES, judged, precision_of
+from sparserob_core.checker.claims.constraints import covered, cut, parameters_of, tubes
+from sparserob_core.checker.claims.replay import reached
+from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
+from sparserob_core.checker.reach.adjoint import Adjoint, Worst
+from sparserob_core.checker.reach.flow import flows, stacked
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed
+from sparserob_core.checker.sets.sides import Bounded, Sides
+from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.sets.sets import Box, Polytope
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb
+
+MOST_CELLS = 400_000  # of time, examined for one row
+PARTS = 8  # into which a cell is cut that is not bounded: a tenth of a chord's distance is left, and less
+HALVINGS = 16  # rounds of cuts: cells are then rounding
+SHARE = 1e-3  # of a bound, the unit of a row: what is forgiven of it is a thousandth of what bounds are apart at best
+OUTPUT, STATE = "output", "state"  # what rows are called that no constraint asks for
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """A row of the problem: ``direction'(x - r, u) <= wall`` in a window."""
+
+    window: Window
+    direction: Array
+    wall: arb | None
+
+
+Made: TypeAlias = dict[bytes, Adjoint]
+"""Adjoints by their rows: what bounds a quantity from both sides has one."""
+
+
+def check_suprema(case: Case) -> list[Finding]:
+    """One verdict per worst case that the certificate writes down, and one on whether these are the problem's."""
+    from flint import ctx
+
+    with ctx.workprec(precision_of(case)):
+        if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
+            return [Finding("bound", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
+        found, entries = list[Finding](), list[Any]()
+
+        def every() -> str:
+            entries.extend(_matched(case))
+            return f"{len(entries)} rows, each of the problem's once"
+
+        found.append(judged("rows", every))
+        made: Made = {}
+        for asked, entry in entries:
+            name = f"{asked.window.name}: {_sense(asked)} {entry.get('quantity')}"
+            found.append(judged(name, lambda asked=asked, entry=entry: _enclosed(case, asked, entry, made)))  # type: ignore[misc]
+        return found
+
+
+def _sense(asked: Asked) -> str:
+    return "inf" if asked.direction[np.flatnonzero(asked.direction)[0]] < 0.0 else "sup"
+
+
+def _asked(case: Case) -> list[Asked]:
+    """The rows of the problem."""
+    found = [
+        Asked(window, direction, b)
+        for window in case.windows
+        if window is not case.returned
+        for direction, b in window.seen.facets or []
+    ]
+    if found:
+        return found
+    d, measured = case.problem.system.states, case.problem.measurements
+    name, every = (STATE, np.eye(d)) if measured is None else (OUTPUT, np.asarray(measured.C, dtype=float))
+    free = Box(np.full(d, -np.inf), np.full(d, np.inf))
+    window = Window(name, free, 0.0, case.problem.horizon, d)
+    return [Asked(window, sign * direction, None) for direction in every for sign in (1.0, -1.0)]
+
+
+def _matched(case: Case) -> list[tuple[Asked, Mapping[str, Any]]]:
+    """The rows that are written, each with the one of the problem that it is about."""
+    left, found = _asked(case), []
+    for entry in listed(case.certificate, "rows"):
+        if not isinstance(entry, Mapping):
+            raise Broken("rows: expected a constraint, a direction and two bounds each")
+        direction = numbers(entry.get("direction"), "direction")
+        same = [
+            one
+            for one in left
+            if one.window.name == entry.get("constraint") and np.array_equal(one.direction, direction)
+        ]
+        if not same:
+            raise Broken(f"{entry.get('constraint')}: {direction.tolist()} is no row of it, or is written twice")
+        left.remove(same[0])
+        found.append((same[0], entry))
+    if left:
+        raise Broken(f"{len(left)} rows of the problem are not written, such as one of {left[0].window.name}")
+    return found
+
+
+def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any], made: Made) -> str:
+    """Both sides of one row; a sentence with the figures."""
+    sense = _sense(asked)
+    if entry.get("sense") != sense:
+        raise Broken(f"it is called {entry.get('sense')!r}, its direction is that of {sense}")
+    least, most = (None if entry.get(side) is None else number(entry, side) for side in ("lower", "upper"))
+    if least is not None and most is not None and least > most:
+        raise Broken(f"from {least!r} to {most!r} is empty")
+    reached_side, proven_side = (least, most) if sense == "sup" else (most, least)
+    if reached_side is None:
+        raise Unchecked("no value is written that is reached")
+    sign = 1.0 if sense == "sup" else -1.0
+    low, high = sign * reached_side, None if proven_side is None else sign * proven_side
+    _margin(asked, entry, sign, high)
+    case.clock.check()
+    followed = _followed(case, asked, made)
+    value = _witnessed(case, asked, entry, followed)
+    if not value[0] >= low:
+        raise Broken(f"{reached_side!r} is written, its witness reaches {sign * value[0]!r}")
+    if high is None:
+        raise Unchecked(f"{reached_side:.9g} is reached, and no bound is written on the other side")
+    if value[0] > high:
+        raise Broken(f"{proven_side!r} is written, its witness reaches {sign * value[0]!r}")
+    if followed is None:
+        count = _proven_in_cells(case, asked, high)
+    else:
+        count = _proven(case, asked, followed, high)
+    side = "above" if sense == "sup" else "below"
+    return f"{reached_side:.9g} is reached, nothing is {side} {proven_side:.9g} ({count} cells)"
+
+
+def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
+    """The wall must be the problem's, and what is left to it follow."""
+    wall, margin = entry.get("wall"), entry.get("margin")
+    if asked.wall is None:
+        if wall is not None or margin is not None:
+            raise Broken(f"a wall at {wall!r} is written, the problem has none")
+        return
+    written = sign * number(entry, "wall")
+    size = max(1.0, abs(float(asked.wall.mid())))
+    if not abs(balls([written])[0] - asked.wall) <= FIGURES * size:
+        raise Broken(f"a wall at {wall!r} is written, it is at {sign * float(asked.wall.mid())!r}")
+    if high is None:
+        if margin is not None:
+            raise Broken("a margin is written without a bound")
+    elif abs(number(entry, "margin") - (written - high)) > FIGURES * max(size, abs(high)):
+        raise Broken(f"a margin of {margin!r} is written, {written - high!r} follows")
+
+
+def _followed(case: Case, asked: Asked, made: Made) -> Worst | None:
+    """The row by its adjoint, where the system is known and does not change; ``None`` elsewhere."""
+    system, problem = case.problem.system, case.problem
+    if isinstance(system, VaryingSystem):
+        raise Unchecked("worst cases of a system that changes with time are not derived")
+    if not isinstance(system, LinearSystem) or system.parameter_count:
+        return None
+    parts = flows(system, [])[0].parts
+    A, B, E = (parts[name][0] for name in ("A", "B", "E"))
+    pushed = problem.disturbance
+    F = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)]) if pushed is not None else B
+    drives = [u.entries() for u in case.scene.control]
+    table = Enclosed.of(stacked([list(row) for row in zip(*drives, strict=True)]))
+    jumps = None if case.measurable else case.changes
+    state = asked.window.split(asked.direction)[0]
+    if (-state).tobytes() in made:
+        made[state.tobytes()] = made[(-state).tobytes()].reversed()
+    elif state.tobytes() not in made:
+        made[state.tobytes()] = Adjoint.of(A, F, state, case.grid[-1], case.clock)
+    return Worst(
+        made[state.tobytes()],
+        np.asarray(problem.initial_state, dtype=float),
+        problem.initial_set,
+        np.array(case.grid),
+        replace(table, rad=np.where(table.rad > 1e-290, table.rad, 0.0)),
+        pushed,
+        None if jumps is None else np.append(jumps, problem.horizon),
+    )
+
+
+def _beside(case: Case, asked: Asked, time: float, inside: float) -> tuple[float, float]:
+    """What stands beside the state in the row at a time, with the control of the piece that holds ``inside``, between
+    bounds."""
+    window = asked.window
+    state, gains = window.split(asked.direction)
+    offset, _ = window.moved(time, time)
+    total = -sum((a * b for a, b in zip(balls(state), offset, strict=True)), balls([0.0])[0])
+    if window.is_mixed:
+        ends = case.control.breakpoints
+        piece = int(np.clip(np.searchsorted(ends, inside, side="right") - 1, 0, case.control.pieces - 1))
+        window.meets(ends.tolist(), piece, time)
+        total = total + sum((a * u for a, u in zip(balls(gains), case.pieces[piece].entries(), strict=True)), 0 * total)
+    return below(total), above(total)
+
+
+def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Worst | None) -> tuple[float, float]:
+    """The value of the row along its witness, which must be one of the problem's, between bounds."""
+    problem, window, time = case.problem, asked.window, number(entry, "time")
+    if not window.start <= time <= window.stop:
+        raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
+    parameter, deviation = (numbers(entry.get(key), key) for key in ("parameter", "deviation"))
+    if parameter.shape != (problem.system.parameter_count,):
+        raise Broken(f"parameter: {parameter.size} numbers where {problem.system.parameter_count} are expected")
+    if problem.system.parameters is not None and not known(problem.system.parameters).contains(parameter):
+        raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
+    if deviation.shape != (problem.system.states,):
+        raise Broken(f"deviation: {deviation.size} numbers where {problem.system.states} are expected")
+    if problem.initial_set is None and deviation.any():
+        raise Broken("a deviation is written, there is one initial state")
+    if problem.initial_set is not None and not known(problem.initial_set).contains(deviation):
+        raise Broken("the deviation of the initial state is not shown to be in its set")
+    changes, signal = _signal(case, entry)
+    low, high = _beside(case, asked, time, time)
+    if followed is not None:
+        value = followed.along(time, deviation, changes, signal)
+        return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
+    state = reached(case, time, parameter, entry.get("disturbance"), entry.get("deviation"))
+    direction = window.split(asked.direction)[0]
+    total = sum((a * x for a, x in zip(balls(direction), state, strict=True)), balls([0.0])[0])
+    return below(total + low), above(total + high)
+
+
+def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
+    """The disturbance of a witness, which must be admissible, and when it changes."""
+    problem = case.problem
+    changes = numbers(entry.get("changes"), "changes")
+    if changes.ndim != 1 or changes.size < 2 or not (np.diff(changes) > 0.0).all():
+        raise Broken("changes: expected increasing times")
+    if changes[0] != 0.0 or changes[-1] < problem.horizon:
+        raise Broken(f"changes: expected times from 0 to {problem.horizon:g}")
+    if problem.disturbance is None:
+        if entry.get("disturbance") is not None:
+            raise Broken("a disturbance is written, there is none")
+        return changes, None
+    signal = numbers(entry.get("disturbance"), "disturbance")
+    if signal.shape != (problem.disturbance.dimension, changes.size - 1):
+        raise Broken(f"disturbance: expected shape {(problem.disturbance.dimension, changes.size - 1)}")
+    jumps = changes[1:-1][(signal[:, 1:] != signal[:, :-1]).any(axis=0)]
+    if not case.measurable and not np.isin(jumps, case.changes or []).all():
+        raise Broken("the disturbance jumps within a piece")
+    shape, seen = known(problem.disturbance), set[tuple[float, ...]]()
+    for value in case.clock.each(map(tuple, signal.T.tolist())):
+        if value not in seen and not shape.contains(value):
+            raise Broken(f"the disturbance {list(value)} is not shown to be in its set")
+        seen.add(value)
+    return changes, signal
+
+
+def _proven(case: Case, asked: Asked, followed: Worst, limit: float) -> int:
+    """Show that a row is nowhere above ``limit``; the number of cells that this took."""
+    window = asked.window
+    breaks = case.control.breakpoints.tolist()
+    more = [window.start, window.stop, *window.cuts(breaks)]
+    times = followed.cuts(more)
+    times = times[(times >= window.start) & (times <= window.stop)]
+    start, stop = (times[:-1], times[1:]) if times.size > 1 else (times, times)
+    count = 0
+    plain = window.reference is None and not window.is_mixed
+    for _ in range(HALVINGS):
+        case.clock.check()
+        count += start.size
+        if count > MOST_CELLS:
+            break
+        tops = followed.over(start, stop, 0.0 if plain else _added(case, asked, start, stop))
+        open_ = ~(tops <= limit)
+        if not open_.any():
+            return count
+        _refute(case, asked, followed, start[open_], stop[open_], limit)
+        start, stop = _parts(start[open_], stop[open_])
+        if not start.size:
+            break
+    raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
+
+
+def _added(case: Case, asked: Asked, start: Array, stop: Array) -> Array:
+    """What stands beside the state at both ends of cells, ``(2, k)``, at most."""
+    cells = case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
+    return np.array([[_beside(case, asked, t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
+
+
+def _refute(case: Case, asked: Asked, followed: Worst, start: Array, stop: Array, limit: float) -> None:
+    """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell, with sets whose support
+    functions are sharp."""
+    sets = (case.problem.initial_set, case.problem.disturbance)
+    if any(one is not None and known(one).facets is None for one in sets):
+        return
+    middles = (start + stop) / 2
+    top, wide = followed.most(middles)
+    least = (top - wide) - HALF_ULP * 8.0 * np.abs(top)
+    if asked.window.reference is not None or asked.window.is_mixed:
+        beside = [_beside(case, asked, t, t)[0] for t in middles.tolist()]
+        least = least + np.array(beside) - HALF_ULP * 8.0 * np.abs(beside)
+    worst = int(least.argmax())
+    if least[worst] > limit:
+        raise Broken(f"{limit!r} is exceeded, by {least[worst] - limit:.3g} at t = {middles[worst]:.6g}")
+
+
+def _parts(start: Array, stop: Array) -> tuple[Array, Array]:
+    """Cells in equal parts; none where these are rounding."""
+    ends = start[:, None] + (stop - start)[:, None] * (np.arange(PARTS + 1) / PARTS)
+    ends[:, 0], ends[:, -1] = start, stop
+    if not (np.diff(ends, axis=1) > 0.0).all():
+        return np.zeros(0), np.zeros(0)
+    return ends[:, :-1].ravel(), ends[:, 1:].ravel()
+
+
+def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
+    """As `_proven`, over the parameters and pieces of the system, in cells of times and parameters."""
+    if case.measurable:
+        raise Unchecked("measurable disturbances of a system with parameters or pieces are not followed")
+    window = asked.window
+    alone = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))
+    found = alone.seen.basis
+    assert found is not None
+    (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
+    unit = SHARE * abs(limit) or 1.0  # what counts as no violation is then taken off the limit, and is rounding of it
+    bounded = Bounded(z[0], float(np.nextafter(limit - TOLERANCE * unit * OUTWARD, -np.inf)), unit)
+    bound = case.problem.system.parameters
+    box = None if bound is None else bound.bounding_box()
+    ends = ([], []) if box is None else (box.lower.tolist(), box.upper.tolist())
+    lower, upper = (np.array([[t, *p]]) for t, p in zip((window.start, window.stop), ends, strict=True))
+    covered(case, alone, lower, upper)
+    cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist())})
+    times = cut(np.array(case.grid), np.array(cuts), window.start, window.stop)
+    work: Sequence[Work] = [((tuple(ends[0]), tuple(ends[1])), Sides([bounded]), times)]
+    shown = prove(
+        tubes(case, basis, lower, upper), parameters_of(case), work, case.clock, case.beside(alone, basis, gains)
+    )
+    return shown.cells

@@ -1,0 +1,360 @@
+"""The worst case of every row of a problem, as a number between two bounds, at a control that is given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.brief import brief
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint, Return
+from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.response.response import merge_grids
+from sparserob_core.control.sets.sets import Equality, Polytope
+from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
+from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.shapes import sealed
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.program import ConstraintFamily, Enclosure
+from sparserob_core.sip.proof.branch_and_bound import Supremum, supremum
+
+Sense: TypeAlias = Literal["sup", "inf"]
+
+OUTPUT, STATE = "output", "state"  # what rows are called that no constraint asks for
+LEAST = 1e-3  # of the largest value of a row that is met: the enclosure of one that is near 0 is as wide as one of that
+LOOKS = 65  # times at which values of a row are looked at first
+BINS = 240  # equal parts of a window, on each of which both sides are told: the width of a figure in half points
+TERMS = 4  # of a row, at most, that are spelt out
+LOST = 2e-11  # of a row's largest value: by so much both sides are told wider, for the rounding of whoever checks them
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Row:
+    """``direction'(x(t) - r(t), u(t)) <= wall`` on a window: a row of a ``constraint`` with flat sides, or one that
+    nothing bounds, with the wall infinite. Of a mixed one the direction has a part on the control, ``(d + m,)``;
+    ``relative_to``: times and points of ``r``."""
+
+    constraint: str
+    direction: Array
+    wall: float
+    start: float
+    stop: float
+    relative_to: Array | None = None
+
+    def __post_init__(self) -> None:
+        sealed(self)
+
+    @property
+    def sense(self) -> Sense:
+        """``inf`` where the first number of the direction is negative: what is bounded from below is then the
+        quantity."""
+        return "inf" if self.direction[np.flatnonzero(self.direction)[0]] < 0.0 else "sup"
+
+    @property
+    def sign(self) -> float:
+        """What the quantity is of the row."""
+        return 1.0 if self.sense == "sup" else -1.0
+
+    def quantity(self, problem: OptimalControlProblem) -> str:
+        """The row in words, with the sign that its sense says."""
+        d, names = problem.system.states, problem.names
+        used = np.flatnonzero(self.direction).tolist()
+        if len(used) > TERMS:
+            return f"a combination of {len(used)} states"
+        text = ""
+        for i in used:
+            factor = self.sign * float(self.direction[i])
+            name = names.state(i) if i < d else names.control(i - d)
+            size = "" if abs(factor) == 1.0 else f"{abs(factor):g} "
+            join = (" - " if factor < 0 else " + ") if text else ""
+            text += f"{join}{size}{name}"
+        return text if self.relative_to is None else f"{text}, relative to its reference"
+
+    def unit(self, problem: OptimalControlProblem) -> str:
+        """The unit of the row, empty where none is known."""
+        return measured_in(self.direction, problem.names, problem.system.states).strip()
+
+
+def rows_of(problem: OptimalControlProblem) -> list[Row]:
+    """The rows of the constraints with flat sides, on the path and at the end; of a problem that has none the outputs
+    that are measured, each way, and where there are none the states. Fixed final states are no rows. Raises
+    `InputError` where all constraints are curved."""
+    path = [one for one in problem.path if not isinstance(one, Return)]
+    ends = [one for one in problem.terminal if not isinstance(one, Equality)]
+    found: list[Row] = []
+    curved: list[str] = []
+
+    def add(name: str, bound: ConvexSet, start: float, stop: float, moved: object = None) -> None:
+        flat = bound.halfspaces()
+        if flat is None:
+            curved.append(name)
+            return
+        reference = None if moved is None else np.asarray(moved, dtype=float)
+        for direction, wall in zip(*flat, strict=True):
+            if np.isfinite(wall):
+                found.append(Row(name, direction, float(wall), start, stop, reference))
+
+    for i, entry in enumerate(path):
+        assert isinstance(entry, PathConstraint | MixedConstraint) and entry.stop is not None
+        moved = entry.relative_to if isinstance(entry, PathConstraint) else None
+        add(entry.name or (f"path[{i}]" if len(path) > 1 else "path"), entry.set, entry.start, entry.stop, moved)
+    for i, end in enumerate(ends):
+        add(f"terminal[{i}]" if len(ends) > 1 else "terminal", end, problem.horizon, problem.horizon)
+    if found:
+        return found
+    if curved:
+        raise InputError(
+            f"{', '.join(curved)}: expected a constraint with flat sides, whose rows have a worst case each, got only"
+            " curved ones"
+        )
+    name, every = STATE, np.eye(problem.system.states)
+    if problem.measurements is not None:
+        name, every = OUTPUT, np.asarray(problem.measurements.C, dtype=float)
+    return [Row(name, sign * direction, np.inf, 0.0, problem.horizon) for direction in every for sign in (1.0, -1.0)]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class BoundedRow:
+    """The largest value of a ``row``: at least ``lower``, which is reached at ``time`` with ``parameter (nu,)``, from
+    ``initial_state (d,)``, under ``disturbance (mw, M)`` between the times ``changes (M + 1,)`` (``None``: there is
+    none); at most ``upper``, which is proven over the continuum.
+
+    ``edges (n + 1,)``: parts of the window, on each of which the worst case is at least ``low (n,)``, reached in its
+    middle, and at most ``high (n,)``; nothing of a window of one time. ``cells``: how many were examined; ``reason``:
+    what hindered the sides from being as close as was asked for.
+    """
+
+    row: Row
+    lower: float
+    upper: float
+    time: float
+    parameter: Array
+    deviation: Array
+    changes: Array
+    disturbance: Array | None
+    edges: Array
+    low: Array
+    high: Array
+    cells: int
+    reason: str = ""
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        sealed(self)
+
+
+def bound_row(
+    problem: OptimalControlProblem,
+    dictionaries: tuple[Dictionary, Dictionary],
+    theta: Array,
+    row: Row,
+    tolerance: float,
+    notify: Notify = ignore,
+    deadline: Deadline | None = None,
+) -> BoundedRow:
+    """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it, or to `LEAST`
+    of the largest value that the row has anywhere in its window. Dictionaries are those of control and disturbance."""
+    if isinstance(problem.system, VaryingSystem):
+        raise InputError(
+            path="system",
+            expected="a system that does not change with time, or has pieces",
+            got="one with entries in t",
+        )
+    known = followed(problem, dictionaries, theta, row)
+    if known is not None:
+        return _of_known(known, row, tolerance, notify, deadline)
+    return _of_program(problem, dictionaries, theta, row, tolerance, notify, deadline)
+
+
+def followed(
+    problem: OptimalControlProblem, dictionaries: tuple[Dictionary, Dictionary], theta: Array, row: Row
+) -> WorstRow | None:
+    """The row by its adjoint; ``None`` where the system has parameters or pieces, or where disturbances are of a kind
+    that adds up otherwise."""
+    control, disturbance = dictionaries
+    system, d = problem.system, problem.system.states
+    if not isinstance(system, LinearSystem) or system.parameter_count:
+        return None
+    changes: Array | None = None
+    if problem.disturbance is not None and problem.disturbance_class == "piecewise_constant":
+        jumps = np.flatnonzero(disturbance.changes) + 1
+        if disturbance.functions != jumps.size + 1:
+            return None
+        changes = disturbance.breakpoints[[0, *jumps, -1]]
+    elif problem.disturbance is not None and (
+        problem.disturbance_class != "measurable" or problem.disturbance.halfspaces() is None
+    ):
+        return None
+    forced = system.forced
+    A, B, E = (part[0] for part in forced.matrices(np.zeros((1, 0))))
+    constants = forced.controls - system.controls
+    before = np.zeros(system.controls) if problem.initial_control is None else np.asarray(problem.initial_control)
+    grid = merge_grids(control.breakpoints, disturbance.breakpoints, system.delay, before, constants)
+    pieces = control.control(theta)
+    inputs = np.hstack([B, E]) if problem.disturbance is not None else B
+    state, gains = row.direction[:d], row.direction[d:]
+    adjoint = Adjoint.of(np.asarray(A, dtype=float), inputs, state, problem.horizon)
+    moving = None if row.relative_to is None else (row.relative_to[:, 0], row.relative_to[:, 1:] @ state)
+    return WorstRow(
+        adjoint,
+        np.asarray(problem.initial_state, dtype=float),
+        problem.initial_set,
+        grid.breakpoints,
+        grid.inputs(pieces),
+        None
+        if problem.disturbance is None
+        else Pushes(problem.disturbance, slice(B.shape[1], inputs.shape[1]), changes),
+        (control.breakpoints, gains @ pieces) if gains.size else None,
+        moving,
+    )
+
+
+def _of_known(worst: WorstRow, row: Row, tolerance: float, notify: Notify, deadline: Deadline | None) -> BoundedRow:
+    cuts, window = worst.cuts(), np.array([row.start, row.stop])
+    cuts = np.unique(np.concatenate([window, cuts[(cuts > row.start) & (cuts < row.stop)]]))
+    cells = (cuts[:-1], cuts[1:]) if cuts.size > 1 else (cuts, cuts)
+    family = ConstraintFamily(
+        name=row.constraint,
+        index_set=Box(window[:1], window[1:]),
+        rows=lambda times: (np.zeros((times.shape[0], 1, 1)), -worst.at(times[:, 0])[0][:, None]),
+        enclosure=lambda _, lower, upper: Enclosure(
+            worst.enclosed(lower[:, 0], upper[:, 0]), np.zeros(lower.shape[0], dtype=int)
+        ),
+        cells=(cells[0][:, None], cells[1][:, None]),
+    )
+    looked = worst.at(np.linspace(row.start, row.stop, LOOKS))[0]
+    found = supremum(family, np.zeros(1), tolerance, LEAST * float(np.abs(looked).max()), notify, deadline=deadline)
+    tidied = float(tidy(found.index, float(worst.grid[-1]))[0])
+    time = tidied if row.start <= tidied <= row.stop else float(found.index[0])
+    state, changes, disturbance = worst.witness(time)
+    edges, middles = _bins(row)
+    lost = LOST * max(float(np.abs(looked).max()), abs(found.lower)) + worst.lost
+    return BoundedRow(
+        row,
+        worst.reached(time, state, changes, disturbance) - lost,
+        found.upper + lost,
+        time,
+        np.zeros(0),
+        state,
+        changes,
+        disturbance,
+        edges,
+        worst.at(middles)[0] - worst.lost,
+        _over(edges, found),
+        found.cells,
+        found.reason,
+    )
+
+
+def _bins(row: Row) -> tuple[Array, Array]:
+    """The ends of equal parts of a window, and their middles; nothing of a window of one time."""
+    if row.stop <= row.start:
+        return np.zeros(0), np.zeros(0)
+    edges = np.linspace(row.start, row.stop, BINS + 1)
+    return edges, (edges[:-1] + edges[1:]) / 2
+
+
+def _over(edges: Array, found: Supremum) -> Array:
+    """The largest bound of the cells that meet each part."""
+    lower, upper, bounds = found.leaves[0][:, 0], found.leaves[1][:, 0], found.leaves[2]
+    return np.array([bounds[(lower < b) & (upper > a)].max(initial=-np.inf) for a, b in pairwise(edges.tolist())])
+
+
+def _of_program(
+    problem: OptimalControlProblem,
+    dictionaries: tuple[Dictionary, Dictionary],
+    theta: Array,
+    row: Row,
+    tolerance: float,
+    notify: Notify,
+    deadline: Deadline | None,
+) -> BoundedRow:
+    """By the enclosures of the program that the row alone would make, whose wall is 0."""
+    from sparserob_core.control.transcription.transcribe import prepare
+
+    d = problem.system.states
+    path: list[PathConstraint | MixedConstraint] = []
+    end: list[ConvexSet] = []
+    wall = np.zeros(1)
+    if row.direction.size > d:
+        path = [MixedConstraint(row.direction[None, :d], row.direction[None, d:], wall, row.start, row.stop)]
+    elif row.start == row.stop == problem.horizon:
+        end = [Polytope(row.direction[None], wall)]
+    else:
+        path = [PathConstraint(Polytope(row.direction[None], wall), row.start, row.stop, relative_to=row.relative_to)]
+    alone = replace(problem, path=path, terminal=end, control_step=None, repeat=False)
+    model = prepare(alone, *dictionaries)
+    own = model.program.own_units
+    assert own is not None
+    family, decision = own.program.families[0], theta.ravel() / own.decision
+    units, unit = np.asarray(family.index_units), family.row_unit(0)
+    middle = (family.index_set.lower + family.index_set.upper) / 2
+    times = np.linspace(family.index_set.lower[0], family.index_set.upper[0], LOOKS)
+    looked = family.violations(decision, np.hstack([times[:, None], np.tile(middle[1:], (LOOKS, 1))]))
+    size = float(np.abs(looked).max())
+    try:
+        found = supremum(family, decision, tolerance, LEAST * size, notify, deadline=deadline)
+    except NotEnclosable as error:
+        index = np.append(times[looked[:, 0].argmax()], middle[1:])
+        nowhere = (family.index_set.lower[None], family.index_set.upper[None], np.full(1, np.inf))
+        found = Supremum(float(looked.max()), np.inf, index, 0, 0, nowhere, str(error))
+    index, functionals, bound = found.index * units, model.functionals, problem.system.parameters
+    time, parameter = float(index[0]), model.parameters.clamp(index[None, 1:])[0]
+    parameter = parameter if bound is None else within(bound, parameter)
+    at = np.array([time]), row.direction[None, :d], parameter[None]
+    deviation, begun = functionals.worst_deviations(*at)[0], problem.initial_set
+    disturbance = functionals.worst_disturbance(time, row.direction[:d], parameter)
+    if disturbance is not None and problem.disturbance is not None:
+        disturbance = within(problem.disturbance, disturbance.T).T
+    edges, middles = _bins(row)
+    low = np.full(middles.size, -np.inf)
+    for p in (found.index[1:], middle[1:]):
+        tried = np.hstack([(middles / units[0])[:, None], np.tile(p, (middles.size, 1))])
+        low = np.maximum(low, family.violations(decision, tried)[:, 0] if middles.size else low)
+    lost = LOST * max(size, abs(found.lower))
+    own_edges = edges / units[0]
+    return BoundedRow(
+        row,
+        unit * (found.lower - lost),
+        unit * (found.upper + lost),
+        time,
+        parameter,
+        deviation if begun is None else within(begun, deviation),
+        functionals.response.grid.breakpoints,
+        disturbance,
+        edges,
+        unit * (low - lost),
+        unit * (_over(own_edges, found) + lost),
+        found.cells,
+        found.reason,
+    )
+
+
+Told: TypeAlias = Callable[[str, int, int], None]
+
+
+def bound_rows(
+    problem: OptimalControlProblem,
+    dictionaries: tuple[Dictionary, Dictionary],
+    theta: Array,
+    tolerance: float,
+    told: Told,
+    notify: Notify = ignore,
+    deadline: Deadline | None = None,
+) -> list[BoundedRow]:
+    """`bound_row` of all `rows_of` a problem; ``told`` what is bounded next, its number, and of how many."""
+    rows, found = rows_of(problem), []
+    for i, row in enumerate(rows):
+        told(f"{row.constraint}: {row.sense} of {row.quantity(problem)}", i, len(rows))
+        found.append(bound_row(problem, dictionaries, theta, row, tolerance, notify, deadline))
+    return found

@@ -1,0 +1,152 @@
+"""``sparserob bound``: the worst case of each row over all uncertainty, enclosed from both sides."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sparserob_core.control.policies.policy import answers_of
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.studies.suprema import bound_rows
+from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.experiment.assemble import build, dictionaries_of, name_of, problem_of
+from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case
+from sparserob_core.experiment.config.load import Loaded, load_config
+from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
+from sparserob_core.experiment.directory.finished import read_arrays
+from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.experiment.run.given import GivenConfig, as_config, as_run
+from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.program import SemiInfiniteProgram
+
+__all__ = ["Bound", "WorstCase", "bound", "summary_of_bound"]
+
+NARROWEST = 1e-7  # of a worst case: a tenth of it and rounding would have a part in it
+
+
+def bound(
+    config: GivenConfig,
+    overrides: Mapping[str, object] | Iterable[str] | None = None,
+    *,
+    tolerance: float = 1e-6,
+    seconds: float | None = None,
+    out: str | Path | None = None,
+    write: bool = False,
+    notify: Notify = ignore,
+) -> Bound:
+    """The worst case of each row of an experiment over all uncertainty: what ``sparserob bound CONFIG key=value ...``
+    does, of a config or a problem without any control, of a run (`as_run`) with its control.
+
+    Rows are those of path, mixed and terminal constraints with flat sides. Where a problem has no such constraint they
+    are the outputs that it measures, and without these its states, each way over the whole horizon. ``tolerance``: how
+    close the two sides are to be, relative to the worst case, or to a thousandth of the largest value of the row where
+    that is larger. ``seconds``: when to stop, ``limits.seconds`` of the config unless given; what is known then holds.
+    ``out``: a new or empty directory for the config, ``bound.json``, ``envelopes.npz`` and ``bound.png``, which `check`
+    verifies; with ``write`` and none given it is ``runs/NAME-bound/STAMP-HASH``. ``notify`` receives `StudyProgress`.
+    Raises `InputError` when an argument, the config or the run is at fault, among these a run whose control answers
+    what it measures.
+    """
+    if not hasattr(tolerance, "__float__") or not NARROWEST <= float(tolerance) <= 0.1:
+        raise InputError(f"tolerance: expected a number from {NARROWEST:g} to 0.1, got {tolerance!r}")
+    if seconds is not None and (not hasattr(seconds, "__float__") or not float(seconds) > 0.0):
+        raise InputError(f"seconds: expected a positive number, got {seconds!r}")
+    started = time.perf_counter()
+    given = _control(config)
+    loaded = load_config(as_config(config), overrides)
+    problem = problem_of(loaded)
+    if isinstance(problem, SemiInfiniteProgram):
+        raise InputError(
+            "config: expected a control problem, whose rows have worst cases, got a semi-infinite program of another"
+            " kind"
+        )
+    dictionaries = dictionaries_of(loaded, problem.horizon)
+    shape = problem.system.controls, dictionaries[0].functions
+    if given is not None:
+        _require_fitting(given, shape, loaded, _answers(loaded, problem, dictionaries[0]))
+    deadline = Deadline(loaded.config.limits.seconds if seconds is None else float(seconds))
+
+    def told(text: str, done: int, total: int) -> None:
+        notify(StudyProgress(text=text, done=done, total=total))
+
+    def found() -> Bound:
+        theta = np.zeros(shape) if given is None else given
+        try:
+            every = bound_rows(problem, dictionaries, theta, float(tolerance), told, notify, deadline)
+        except InputError as error:
+            raise loaded.located(("problem",), error) from error
+        rows = tuple(worst_case(problem, one) for one in every)
+        return Bound(
+            loaded.config.title or name_of(loaded),
+            "undecided" if any(row.reason for row in rows) else "certified",
+            rows,
+            float(tolerance),
+            given,
+            time.perf_counter() - started,
+            remarks=tuple(f"{row.constraint}: {row.sense} {row.quantity}: {row.reason}" for row in rows if row.reason),
+        )
+
+    if out is None and not write:
+        return found()
+    with create_directory(out, f"{name_of(loaded)}-bound", loaded.config.digest()) as directory:
+        directory.write_text(
+            "config.yaml", write_yaml(loaded.config.plain(), "The experiment whose worst cases were bounded.")
+        )
+        return _written(directory, found(), loaded)
+
+
+def _answers(loaded: Loaded, problem: OptimalControlProblem, control: Dictionary) -> bool:
+    """Whether the policy of a config answers anything that it measures."""
+    policy = build(loaded, "policy", loaded.config.policy)
+    return bool(answers_of(policy, control.breakpoints, problem.measurements).any())
+
+
+def _require_fitting(theta: Array, shape: tuple[int, int], loaded: Loaded, answering: bool) -> None:
+    """Raise `InputError` unless a run's control is one that can be bounded, and is of the config."""
+    if answering:
+        expected = "open_loop, for worst cases with the control of a run"
+        raise loaded.located((), InputError(path="policy.name", expected=expected, got=loaded.config.policy.name))
+    if theta.shape != shape or theta.dtype.kind != "f" or not np.isfinite(theta).all():
+        raise InputError(
+            f"solution.npz: theta: expected finite numbers of shape {shape}, as the config says, got shape"
+            f" {theta.shape}"
+        )
+
+
+def _control(config: object) -> Array | None:
+    """The coefficients of the control of a run; ``None`` where no run was given."""
+    if isinstance(config, Outcome | SolvedProblem):
+        path = as_run(config)[0]
+    elif isinstance(config, str | Path) and (Path(config) / "result.json").is_file():
+        path = Path(config)
+    else:
+        return None
+    solution = read_arrays(path / "solution.npz")
+    if "theta" not in solution:
+        raise InputError(f"{path}: there is no control in it; a config bounds worst cases without any")
+    return solution["theta"]
+
+
+def _written(directory: RunDirectory, found: Bound, loaded: Loaded) -> Bound:
+    """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
+    from sparserob_core.experiment.bound.figure import write_bound_figure
+
+    directory.write_arrays(
+        "envelopes.npz",
+        {f"{name}{i}": getattr(row, name) for i, row in enumerate(found.rows) for name in ("edges", "low", "high")},
+    )
+    if any(row.edges.size for row in found.rows):
+        try:
+            write_bound_figure(directory.path / "bound.png", found)
+        except SparseRobError as error:
+            found = replace(found, remarks=(*found.remarks, str(error)))
+    directory.write_json("bound.json", {**summary_of_bound(found), "config": loaded.config.digest()})
+    return replace(found, directory=directory.path)

@@ -1,0 +1,71 @@
+"""The picture of worst cases: between its two bounds the envelope of every quantity over time, with its walls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.experiment.figures import style as look
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from sparserob_core.experiment.bound.record import Bound, WorstCase
+
+MOST = 8  # panels: more are too small to be read on a page
+ROOM = 0.12  # of what is drawn, above and below it
+
+
+def write_bound_figure(file: Path, found: Bound) -> None:
+    """Draw worst cases into a file (.png, .pdf, .svg), which is complete or not there.
+
+    Raises `InputError` when matplotlib is missing, and when the file cannot be written.
+    """
+    look.require_matplotlib()
+    with look.style():
+        look.write_figure(file, draw_bound(found))
+
+
+def draw_bound(found: Bound) -> Figure:
+    """A panel for every quantity that has a window of some length, `MOST` at most: the largest and the smallest value
+    over all uncertainty, each as a band between the side that is reached and the one that is proven, and the walls."""
+    panels: dict[tuple[str, bool], list[WorstCase]] = {}
+    for row in found.rows:
+        if row.edges.size:
+            panels.setdefault((row.quantity, row.direction.size > row.deviation.size), []).append(row)
+    shown = list(panels.values())[:MOST]
+    figure, axes = look.panels(len(shown), 1.9, extra=0.3)
+    for ax, rows in zip(axes, shown, strict=True):
+        _panel(ax, rows)
+    axes[0].set_title(found.title)
+    axes[-1].set_xlabel("time $t$")
+    look.draw_legend(figure, axes)
+    return figure
+
+
+def _panel(ax: Axes, rows: list[WorstCase]) -> None:
+    finite = np.concatenate([band[np.isfinite(band)] for row in rows for band in (row.low, row.high)])
+    walls = [row.wall for row in rows if row.wall is not None]
+    low, high = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
+    near = [wall for wall in walls if low - 2.0 * (high - low) <= wall <= high + 2.0 * (high - low)]
+    low, high = min([low, *near]), max([high, *near])
+    room = ROOM * max(high - low, 1e-300)
+    ax.set_ylim(low - room, high + room)
+    for row in rows:
+        colour = look.BLUE if row.sense == "sup" else look.ORANGE
+        name = "largest value" if row.sense == "sup" else "smallest value"
+        below, above = (np.where(np.isfinite(band), band, np.nan) for band in (row.low, row.high))
+        ax.stairs(above, row.edges, baseline=below, fill=True, color=colour, alpha=0.35, linewidth=0)
+        reached = row.low if row.sense == "sup" else row.high
+        ax.stairs(reached, row.edges, baseline=None, color=colour, linewidth=1.2, label=f"{name}, reached and proven")
+        ax.plot(row.time, row.reached, "o", color=colour, markersize=4, zorder=4)
+        if row.wall is not None:
+            ends = (row.wall, ax.get_ylim()[1]) if row.sense == "sup" else (ax.get_ylim()[0], row.wall)
+            if ends[0] < ends[1]:
+                spanned = [row.start, row.stop]
+                ax.fill_between(spanned, *ends, **look.EXCLUDED, label="beyond the wall")
+    unit = f" [{rows[0].unit}]" if rows[0].unit else ""
+    ax.set_ylabel(f"{rows[0].quantity}{unit}")

@@ -1,0 +1,171 @@
+"""Worst cases as they are told: in the user's terms, with what is left to the wall."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, final
+
+import numpy as np
+
+from sparserob_core.brief import brief
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.studies.suprema import BoundedRow, Sense
+from sparserob_core.experiment.directory.artefacts import finite
+from sparserob_core.shapes import sealed
+from sparserob_core.sip.convex_set import Array
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class WorstCase:
+    """The supremum or infimum of a ``quantity`` over every disturbance, initial state, parameter and time ``start`` to
+    ``stop``: from ``lower`` to ``upper``.
+
+    Of a supremum ``lower`` is reached, at ``time`` with ``parameter (nu,)``, from the centre of the initial states plus
+    ``deviation (d,)``, under ``disturbance (mw, M)``, which is constant between the times ``changes (M + 1,)``
+    (``None``: there is none); ``upper`` is proven over the continuum. Of an infimum it is the other way round.
+    ``wall``: where the ``constraint`` ends, whose normal ``direction`` points outwards; ``margin``: how far the proven
+    side is from it at least, negative where it is beyond; both are ``None`` where nothing bounds the quantity. A bound
+    that is not known is infinite.
+
+    ``edges (n + 1,)``: parts of the window, on each of which the worst case lies between ``low`` and ``high (n,)``.
+    ``cells``: how many were examined; ``reason``: what hindered the two sides from being as close as was asked for.
+    """
+
+    constraint: str
+    quantity: str
+    unit: str
+    sense: Sense
+    lower: float
+    upper: float
+    time: float
+    wall: float | None
+    margin: float | None
+    start: float
+    stop: float
+    direction: Array
+    parameter: Array
+    deviation: Array
+    changes: Array
+    disturbance: Array | None
+    cells: int
+    reason: str
+    edges: Array = field(repr=False)
+    low: Array = field(repr=False)
+    high: Array = field(repr=False)
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        sealed(self)
+
+    @property
+    def reached(self) -> float:
+        """The side that is reached."""
+        return self.lower if self.sense == "sup" else self.upper
+
+    @property
+    def proven(self) -> float:
+        """The side that is proven."""
+        return self.upper if self.sense == "sup" else self.lower
+
+
+def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
+    """A bounded row in the user's terms: of a row that bounds a quantity from below, its infimum."""
+    row, sign = found.row, found.row.sign
+    sides = [sign * found.lower, sign * found.upper]
+    bands = [sign * found.low, sign * found.high]
+    if row.sense == "inf":
+        sides, bands = sides[::-1], bands[::-1]
+    wall = sign * row.wall if np.isfinite(row.wall) else None
+    return WorstCase(
+        constraint=row.constraint,
+        quantity=row.quantity(problem),
+        unit=row.unit(problem),
+        sense=row.sense,
+        lower=sides[0],
+        upper=sides[1],
+        time=found.time,
+        wall=wall,
+        margin=None if wall is None else row.wall - found.upper,
+        start=row.start,
+        stop=row.stop,
+        direction=row.direction,
+        parameter=found.parameter,
+        deviation=found.deviation,
+        changes=found.changes,
+        disturbance=found.disturbance,
+        cells=found.cells,
+        reason=found.reason,
+        edges=found.edges,
+        low=bands[0],
+        high=bands[1],
+    )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """The worst cases ``rows`` of a problem: without any control, or with that of a run, whose coefficients are
+    ``decision (m, N)``.
+
+    ``status``: ``certified`` (the two sides of every row are as close as the ``tolerance`` asks, relative to the worst
+    case, or to a thousandth of the largest value that is met where that is larger), ``undecided`` (some are farther
+    apart, and hold all the same). ``directory``: where it was written to, if it was.
+    """
+
+    title: str
+    status: Literal["certified", "undecided"]
+    rows: tuple[WorstCase, ...]
+    tolerance: float
+    decision: Array | None
+    seconds: float
+    directory: Path | None = None
+    remarks: tuple[str, ...] = ()
+
+    __repr__ = brief
+
+
+ENVELOPE = ("edges", "low", "high")
+
+
+def summary_of_bound(found: Bound) -> dict[str, Any]:
+    """``bound.json``: every field but the directory and the envelopes; numbers that are not finite become null."""
+    rows = [{name: _plain(value) for name, value in vars(row).items() if name not in ENVELOPE} for row in found.rows]
+    summary: dict[str, Any] = finite(asdict(replace(found, directory=None, rows=())))
+    decision = None if found.decision is None else found.decision.tolist()
+    summary = {**summary, "rows": [finite(row) for row in rows], "decision": decision}
+    return {"format": 1} | {name: value for name, value in summary.items() if name != "directory"}
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
+    """What a user wants to know of every worst case, as rows of a table."""
+
+    def number(value: float | None, towards: float = 0.0) -> str:
+        if value is None or not np.isfinite(value):
+            return "-"
+        if towards:  # so that what is shown holds too
+            size = 10.0 ** (np.floor(np.log10(abs(value))) - 8.0) if value else 0.0
+            value += 0.0 if (float(f"{value:.9g}") - value) * towards >= 0.0 else towards * 0.5 * size
+        return f"{value:.9g}"
+
+    return [
+        (
+            row.constraint,
+            f"{row.sense} {row.quantity}" + (f" [{row.unit}]" if row.unit else ""),
+            number(row.lower, -1.0),
+            number(row.upper, 1.0),
+            f"{row.time:.6g}",
+            number(row.wall),
+            "-" if row.margin is None or not np.isfinite(row.margin) else f"{row.margin:.4g}",
+        )
+        for row in found.rows
+    ]
+
+
+COLUMNS = ("constraint", "worst case", "at least", "at most", "at t", "wall", "margin")

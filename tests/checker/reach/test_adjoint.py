@@ -1,0 +1,108 @@
+"""Guards checker/reach/adjoint: rows and integrals against others with more digits, cells against dense samples, and a
+witness that is neither more nor less than it is."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from flint import arb, arb_mat, ctx
+
+from sparserob_core.checker.outcome import Clock, Unchecked
+from sparserob_core.checker.reach.adjoint import Adjoint, Worst
+from sparserob_core.checker.sets.polynomials import Enclosed
+from sparserob_core.control.sets.sets import Box, Polytope
+
+A = [[0.0, 1.0, 0.0], [-9.0, -0.4, 2.0], [0.3, 0.0, -1.5]]
+F = [[0.0, 0.2], [1.0, 0.0], [0.0, 1.0]]
+C, HORIZON = np.array([1.0, 0.3, -0.5]), 4.0
+GRID = np.array([0.0, 0.7, 1.9, 3.1, 4.0])
+TIMES = np.array([0.0, 0.3, 1.0, 2.2, 3.99, 4.0])
+
+
+def adjoint() -> Adjoint:
+    return Adjoint.of(arb_mat(A), arb_mat(F), C, HORIZON, Clock())
+
+
+def worst(kind: str) -> Worst:
+    changes = None if kind == "measurable" else GRID
+    drives = Enclosed(np.array([[0.3, -1.0, 0.0, 0.8]]), np.zeros((1, 4)))
+    begun = Polytope([[1, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], [0.1, 0.1, 0.1, 0.05, 0.05])
+    return Worst(adjoint(), np.array([0.2, -1.0, 0.4]), begun, GRID, drives, Box([-0.2], [0.5]), changes)
+
+
+def exact(t: float) -> tuple[list[float], list[float]]:
+    """``l(t)`` and ``int_0^t l'F`` by one exponential of twice the digits."""
+    with ctx.workprec(400):
+        both = arb_mat([[*a, *f] for a, f in zip(A, F, strict=True)] + [[0.0] * 5] * 2)
+        row = arb_mat([[*C.tolist(), 0.0, 0.0]]) * (both * arb(t)).exp()
+        return [float(x.mid()) for x in row.entries()[:3]], [float(x.mid()) for x in row.entries()[3:]]
+
+
+def test_rows_and_integrals_hold_the_truth_and_are_close() -> None:
+    known = adjoint()
+    rows, (sums, rounded) = known.at(TIMES), known.integrals(TIMES)
+    for i, t in enumerate(TIMES.tolist()):
+        row, moved = exact(t)
+        assert (np.abs(rows.mid[i] - row) <= rows.rad[i] + 1e-16).all()
+        assert (np.abs(sums.mid[i] - moved) <= sums.rad[i] + rounded[i] + 1e-16).all()
+    assert max(rows.rad.max(), sums.rad.max()) < 1e-12
+    assert (adjoint().reversed().at(TIMES).mid == -rows.mid).all()
+
+
+def test_what_an_input_adds_between_two_times_is_known_better_than_the_sums() -> None:
+    known = adjoint()
+    part = known.between(np.array([3.5]), 1.25, 1.5)
+    late, early = exact(2.25)[1], exact(2.0)[1]
+    assert (np.abs(part.mid[0] - (np.array(late) - early)) <= part.rad[0] + 1e-16).all()
+    off = known.between(np.array([0.3]), 0.1, 0.2)  # differences that are rounded
+    assert (off.rad >= known.between(np.array([0.5]), 0.25, 0.375).rad * 0.1).all()
+
+
+@pytest.mark.parametrize("kind", ["constant", "measurable"])
+def test_cells_bound_every_value_in_them_closely(kind: str) -> None:
+    row = worst(kind)
+    times = row.cuts([])
+    times = times[times <= HORIZON]
+    bounds = row.over(times[:-1], times[1:])
+    inside = times[:-1, None] + np.diff(times)[:, None] * np.linspace(0.0, 1.0, 17)
+    tops, wide = (part.reshape(inside.shape) for part in row.most(inside.ravel()))
+    values = tops - wide
+    assert wide.max() < 1e-11
+    assert (bounds[:, None] >= values).all()
+    assert (bounds - values.max(axis=1)).max() <= 40.0 * np.diff(times).max() ** 2
+    chords = np.maximum(values[:, 0], values[:, -1])
+    above = values.max(axis=1) - chords
+    assert above.max() > 0.1 * (bounds - chords)[above.argmax()]
+
+
+@pytest.mark.parametrize("kind", ["constant", "measurable"])
+def test_a_signal_reaches_no_more_than_the_worst_and_its_value_is_known(kind: str) -> None:
+    row, rng = worst(kind), np.random.default_rng(0)
+    best = -np.inf
+    for _ in range(40):
+        signal = rng.choice([-0.2, 0.5], size=(1, 4))
+        deviation = np.array([0.0, 0.1, 0.05]) * rng.choice([-1.0, 1.0])
+        low, high = row.along(3.5, deviation, GRID, signal)
+        assert high - low < 1e-12
+        best = max(best, low)
+    assert best <= row.most(np.array([3.5]))[0][0]
+
+
+def test_the_measurable_worst_is_that_of_ever_shorter_pieces() -> None:
+    whole = worst("measurable").most(np.array([HORIZON]))[0][0]
+    row = worst("constant")
+    short = [
+        Worst(row.adjoint, row.centre, row.begun, GRID, row.drives, row.pushed, np.linspace(0.0, HORIZON, n + 1)).most(
+            np.array([HORIZON])
+        )[0][0]
+        for n in (4, 64, 512)
+    ]
+    assert all(a < b for a, b in pairwise(short))
+    assert short[-1] <= whole <= short[-1] + 1e-4
+
+
+def test_a_system_that_is_too_fast_is_not_followed() -> None:
+    with pytest.raises(Unchecked):
+        Adjoint.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), np.ones(1), 1.0, Clock())
