@@ -12,7 +12,13 @@ import numpy as np
 from sparserob_core.brief import brief
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint, Return
+from sparserob_core.control.problem.problem import (
+    Accumulated,
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+    Return,
+)
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Equality, Polytope
@@ -84,10 +90,11 @@ class Row:
 
 
 def rows_of(problem: OptimalControlProblem) -> list[Row]:
-    """The rows of the constraints with flat sides, on the path and at the end; of a problem that has none the outputs
-    that are measured, each way, and where there are none the states. Fixed final states are no rows. Raises
-    `InputError` where all constraints are curved."""
+    """The rows of the constraints with flat sides, on the path and at the end, integrals being states; of a problem
+    that has none the outputs that are measured, each way, and where there are none the states. Fixed final states are
+    no rows. Raises `InputError` where all constraints are curved."""
     path = [one for one in problem.path if not isinstance(one, Return)]
+    own = sum(not isinstance(one, Accumulated) for one in path)
     ends = [one for one in problem.terminal if not isinstance(one, Equality)]
     found: list[Row] = []
     curved: list[str] = []
@@ -105,7 +112,7 @@ def rows_of(problem: OptimalControlProblem) -> list[Row]:
     for i, entry in enumerate(path):
         assert isinstance(entry, PathConstraint | MixedConstraint) and entry.stop is not None
         moved = entry.relative_to if isinstance(entry, PathConstraint) else None
-        add(entry.name or (f"path[{i}]" if len(path) > 1 else "path"), entry.set, entry.start, entry.stop, moved)
+        add(entry.name or (f"path[{i}]" if own > 1 else "path"), entry.set, entry.start, entry.stop, moved)
     for i, end in enumerate(ends):
         add(f"terminal[{i}]" if len(ends) > 1 else "terminal", end, problem.horizon, problem.horizon)
     if found:

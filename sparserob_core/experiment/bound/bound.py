@@ -13,6 +13,7 @@ from sparserob_core.control.policies.policy import answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.suprema import bound_rows
+from sparserob_core.control.transcription.accumulated import accumulated
 from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import build, dictionaries_of, name_of, problem_of
 from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case
@@ -69,7 +70,7 @@ def bound(
             " kind"
         )
     dictionaries = dictionaries_of(loaded, problem.horizon)
-    shape = problem.system.controls, dictionaries[0].functions
+    problem, shape = accumulated(problem), (problem.system.controls, dictionaries[0].functions)
     if given is not None:
         _require_fitting(given, shape, loaded, _answers(loaded, problem, dictionaries[0]))
     deadline = Deadline(loaded.config.limits.seconds if seconds is None else float(seconds))

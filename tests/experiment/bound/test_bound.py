@@ -119,7 +119,7 @@ def test_a_run_is_bounded_with_its_control_and_stays_within_its_walls(tmp_path: 
         pieces=5, initial_state=[0.5, 0.0], disturbance={"box": [0.0, 0.02]}, terminal=[{"box": [0.1, 0.2]}],
         path=[{"mixed": {"H": [[0, 1]], "G": [[0.5]], "h": [2.0]}}],
     )  # fmt: skip
-    outcome = sr.run(stated, out=tmp_path / "run")
+    outcome = sr.run(stated, out=tmp_path / "run", figures=False)
     assert outcome.result.status == "certified"
     free = sr.bound(stated)
     held = sr.bound(outcome, out=tmp_path / "out")
@@ -148,6 +148,16 @@ def test_pieces_of_the_system_are_bounded_and_checked(tmp_path: Path) -> None:
     pieces = [{"until": 1.0, "A": [[1]], "B": [[1]]}, {"until": 2.0, "A": [[-1]], "B": [[1]]}]
     found = sr.bound(config(system={"pieces": pieces}, initial_state=[1], path=[{"box": 5.0}]), out=tmp_path / "out")
     assert_encloses(found.rows[0], math.e)
+    assert sr.check(tmp_path / "out").status == "verified"
+
+
+def test_an_integral_is_bounded_and_checked(tmp_path: Path) -> None:
+    """The integral of x1 of the double integrator to 2, from (1, 0) under w2: 2 + 0.05 2^3 / 6 at most."""
+    found = sr.bound(
+        config(disturbance={"box": [0.0, 0.05]}, integral=[{"H": [[1, 0]], "upper": [3.0]}]), out=tmp_path / "out"
+    )
+    assert [(row.constraint, row.sense) for row in found.rows] == [("integral", "sup")]
+    assert_encloses(found.rows[0], 2.0 + 0.05 * 8.0 / 6.0)
     assert sr.check(tmp_path / "out").status == "verified"
 
 
@@ -264,7 +274,7 @@ def test_bad_input_is_named(stated: object, arguments: dict, named: str) -> None
 @pytest.mark.slow
 def test_a_run_that_answers_what_it_measures_is_refused(tmp_path: Path) -> None:
     stated = config(pieces=4, initial_state=[0.1, 0], disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [0.4, 0.4]}])
-    outcome = sr.run({**stated, "policy": {"name": "affine", "cost": "nominal"}}, out=tmp_path / "run")
+    outcome = sr.run({**stated, "policy": {"name": "affine", "cost": "nominal"}}, out=tmp_path / "run", figures=False)
     with pytest.raises(sr.InputError, match="policy"):
         sr.bound(outcome)
 
