@@ -18,9 +18,9 @@ from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import build, dictionaries_of, name_of, problem_of
 from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case
 from sparserob_core.experiment.config.load import Loaded, load_config
+from sparserob_core.experiment.config.matrices.arrays import read_arrays
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
-from sparserob_core.experiment.directory.finished import read_arrays
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.run.given import GivenConfig, as_config, as_run
 from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
