@@ -21,7 +21,7 @@ from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import Response, merge_grids
-from sparserob_core.control.response.varying.expansion import Expansion
+from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from tests.support.plants import indicators, uniform, walsh
@@ -157,8 +157,8 @@ def test_derivatives_in_time_are_differences(plant):
 def test_what_bends_within_a_cell_is_counted(part, start, width):
     # the second derivative is 1 - t times what bends: 0 where a cell begins, or all that there is on a short one
     A = [[0, 1], ["1 - t" if part == "initial" else 0, 0]]
-    drift = [0, "1 - t"] if part == "state" else None
-    system = VaryingSystem.of(A, [[0], [0]], HORIZON, [[0], ["1 - t"]], drift).forced
+    drift = ["t - t^2/2", 0] if part == "state" else None  # of a speed whose slope is all that bends
+    system = VaryingSystem.of(A, [[0], [0]], HORIZON, [["t - t^2/2"], [0]], drift).forced
     whole = uniform(1, HORIZON)
     grid = merge_grids(whole.breakpoints, whole.breakpoints, constants=system.controls - 1, varying=True)
     noise = disturbance_model("piecewise_constant", Box([-1.0], [1.0]), whole, grid) if part == "disturbance" else None
@@ -172,3 +172,27 @@ def test_what_bends_within_a_cell_is_counted(part, start, width):
     bounds = constraint.enclosure(x, times[:1], times[1:]).bounds
     assert above.max() > 1e-6 and (inside <= bounds).all()
     assert bounds[0] - chord.max() >= above.max()
+
+
+def test_what_every_step_is_off_by_is_carried_on(monkeypatch):
+    # a state that stays, by steps that each make a little more of it, and say so
+    flow, off = Expansion.flow, 1e-6
+
+    def more(self: Expansion, starts: Array, stops: Array) -> Flow:
+        found, lasts = flow(self, starts, stops), stops > starts
+        state = found.state * (1.0 + off * lasts)[:, None, None]
+        return found._replace(state=state, error=found.error + off * lasts)
+
+    monkeypatch.setattr(Expansion, "flow", more)
+    system, many = VaryingSystem.of([["0*t"]], [[0]], HORIZON), uniform(50, HORIZON)
+    grid = merge_grids(many.breakpoints, many.breakpoints, varying=True)
+    for begun in (None, Box([-1.0], [1.0])):
+        start = np.array([1.0 if begun is None else 0.0])
+        worst = WorstCase(Response(system, grid, start), many, None, initial=begun)
+        sides = np.array([[-1.0], [1.0]]), np.zeros(2)
+        path = FlatConstraint("path", worst, *sides, 0.0, HORIZON, ParameterIndex(None))
+        legs = path.functionals.legs(np.zeros(0), np.zeros(0))
+        support = path.samples.support_over(legs, np.zeros(0), np.zeros(0))[0]
+        lost = legs[0].along(np.zeros((1, 50)), np.ones((1, 1)), np.zeros((1, 1)))[0, -1]
+        lost = lost if support is None else support.neglected[0, -1]
+        assert (1.0 + off) ** 50 - 1.0 <= lost <= 500 * off
