@@ -128,6 +128,7 @@ BAD: dict[str, tuple[dict[str, np.ndarray], str]] = {
     "too few pointers": (changed(A_indptr=np.array([0, 4])), "plant.npz.A_indptr"),
     "pointers that are no whole numbers": (changed(A_indptr=np.array([0.0, 1, 3, 4])), "plant.npz.A_indptr"),
     "a column that is not there": (changed(A_indices=np.array([1, 0, 1, 7])), "plant.npz.A_indptr"),
+    "a column just beyond": (changed(A_indices=np.array([1, 0, 1, 3])), "plant.npz.A_indptr"),
     "a negative column": (changed(A_indices=np.array([-1, 0, 1, 2])), "plant.npz.A_indptr"),
     "ragged": (changed(A_indices=np.array([1, 0, 1])), "plant.npz.A_indptr"),
     "a huge shape": (changed(A_shape=np.array([10**9, 10**9])), "plant.npz.A_shape"),
