@@ -110,6 +110,7 @@ FEATURES: dict[str, Callable[[Config], object]] = {
         integral=[{"H": [[1, 0]], "G": [[0, 0.1]], "from": 0, "to": 2.5, "lower": [-0.05], "upper": [0.3]}]
     ),
     "entries in t": changing_with_time,
+    "execution": in_problem(execution=0.03),
 }
 SIGNS = {
     ("proven", "verified"): "●",

@@ -56,9 +56,11 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
     total, slopes = case.duality.summed(rows, pieces)
     ranges = _ranges(case)
     counts = [[arb(float(c)) * length for c in case.price.counts] for length in _lengths(case)]
-    for count, slope in zip(counts, slopes, strict=True):
+    none = [[case.duality.nothing] * case.problem.system.controls] * len(slopes)
+    charged = case.duality.charged(rows, none)
+    for count, slope, sizes in zip(counts, slopes, charged, strict=True):
         case.clock.check()
-        total = total + _least(case, ranges, count, slope)
+        total = total + _least(case, ranges, count, slope, sizes=sizes)
     return _whole(case, total)
 
 
@@ -103,10 +105,15 @@ def _whole(case: Case, total: arb) -> float:
 
 
 def _least(
-    case: Case, ranges: list[tuple[arb, arb]], count: list[arb], slope: list[arb], off: Sequence[bool] = ()
+    case: Case,
+    ranges: list[tuple[arb, arb]],
+    count: list[arb],
+    slope: list[arb],
+    off: Sequence[bool] = (),
+    sizes: Sequence[arb] = (),
 ) -> arb:
-    """At most the minimum of what one piece counts and the slopes add, over the controls in the set that are 0 in the
-    channels that are ``off``."""
+    """At most the minimum of what one piece counts and the slopes, and ``sizes`` of absolute values, add, over the
+    controls in the set that are 0 in the channels that are ``off``."""
     from flint import arb
 
     ups, downs, certain = [], [], arb(0)
@@ -117,6 +124,8 @@ def _least(
         down = arb(0) if always or not low < 0 else one / -low
         ups.append(up if high > 0 else down)
         downs.append(down if low < 0 else up)
+    for i, size in enumerate(sizes):
+        ups[i], downs[i] = ups[i] + size, downs[i] + size
     for i, zero in enumerate(off):
         if zero:  # what a value that is not 0 there would bring is outweighed
             ups[i] = downs[i] = abs(slope[i])

@@ -17,6 +17,7 @@ from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.integrals import integrating
 from sparserob_core.checker.reach.varying import VaryingFlow
@@ -25,7 +26,7 @@ from sparserob_core.control.policies.policy import Charge, Cost, Policy, Written
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import Accumulated, MixedConstraint, OptimalControlProblem, Return
-from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.sip.convex_set import Array
 
@@ -266,9 +267,23 @@ class Case:
 
     def beside(self, window: Window, basis: Array, gains: Array) -> Beside | None:
         """What stands beside the state in the rows of a constraint; ``None``: nothing."""
-        if window.reference is None and not window.is_mixed:
+        if window.reference is None and not window.is_mixed and self.execution is None:
             return None
-        return Beside(window, basis, gains, self.scene, self.control.breakpoints.tolist(), self.pieces)
+        ends = self.control.breakpoints.tolist()
+        return Beside(window, basis, gains, self.scene, ends, self.pieces, self.execution)
+
+    @cached_property
+    def execution(self) -> Execution | None:
+        """How exactly the control is delivered, ``None`` where that is as it is commanded; of no control where the
+        certificate has none."""
+        shares = self.problem.execution
+        if shares is None:
+            return None
+        system = self.problem.system
+        if not isinstance(system, LinearSystem) or system.parameter_count or system.delay or self.policy is not None:
+            raise Unchecked("the checker knows errors of execution of one known system, undelayed and without feedback")
+        pieces = [] if self.certificate.get("decision") is None else self.pieces
+        return Execution(self.problem, np.asarray(shares, dtype=float), self.control.breakpoints, pieces)
 
     def at(self, time: float) -> str:
         """A time in words."""

@@ -419,6 +419,7 @@ def _row(case: Case, entry: object) -> tuple[float, Row]:
     row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.measurable)
     if case.measurable:
         row = replace(row, constant=_feedback(case).disturbed(c, time, limit))
+    row = replace(row, sizes=None if case.execution is None else case.execution.least(c, time))
     if window.is_mixed:
         piece = _piece(case, window, entry, time)
         row.slope[piece] = [a + balls([g])[0] for a, g in zip(row.slope[piece], gain, strict=True)]
@@ -579,6 +580,9 @@ def _witness(case: Case) -> str:
     if window.is_mixed:
         state = state + case.pieces[_piece(case, window, data, time)].entries()
     over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), -height)
+    if case.execution is not None:
+        low, high = case.execution.added(window.split(direction)[0], time)
+        over = over + balls([low])[0].union(balls([high])[0])
     return _exceeded(case, over, case.units(window).slack(direction, height), data)
 
 

@@ -37,11 +37,12 @@ LEAPS = 64  # times in a row that a lag is carried on from the one before
 @final
 @dataclass(frozen=True, eq=False)
 class Row:
-    """``constant + sum_k slope_k u_k <= 0`` for every feasible control; ``slope`` is a list of ``m`` balls per piece of
-    the control."""
+    """``constant + sum_k slope_k u_k + sizes_k |u_k| <= 0`` for every feasible control; ``slope`` is a list of ``m``
+    balls per piece of the control, ``sizes (K, m)`` are numbers that are not negative, or there are none."""
 
     constant: arb
     slope: list[list[arb]]
+    sizes: Array | None = None
 
 
 @final
@@ -54,6 +55,11 @@ class Duality:
     control: Dictionary
     changes: list[float] | None
     varying: VaryingFlow | None = None
+
+    @property
+    def nothing(self) -> arb:
+        """0."""
+        return _exact(0.0)
 
     def control_row(self, direction: Array, time: float) -> Row:
         """``c'u(t) <= h(c)`` for a curved set of controls."""
@@ -194,7 +200,8 @@ class Duality:
         constant, slopes = self.summed(rows, pieces, tangent)
         groups = [] if price is None else [block for block in price.blocks if len(block) > 1]
         free = [[_exact(0.0)] * self.problem.system.controls] * len(slopes)
-        for k, (costs, slope) in enumerate(zip(free if price is None else price.costs, slopes, strict=True)):
+        charged = self.charged(rows, free if price is None else price.costs)
+        for k, (costs, slope) in enumerate(zip(charged, slopes, strict=True)):
             if groups and touched is not None:
                 constant = constant + self._least_of_groups(costs, slope, groups, touched[k].entries())
             else:
@@ -252,6 +259,16 @@ class Duality:
             slopes, slip = self._moved(slopes, pieces)
             constant = constant - slip
         return constant, slopes
+
+    def charged(self, rows: Sequence[tuple[float, Row]], costs: list[list[arb]]) -> list[list[arb]]:
+        """What absolute values cost on every piece, ``m`` balls each, with what ``rows`` times their multipliers say of
+        them."""
+        found = costs
+        for y, row in rows:
+            if row.sizes is not None:
+                pairs = zip(found, row.sizes.tolist(), strict=True)
+                found = [[c + _exact(y) * _exact(v) for c, v in zip(one, two, strict=True)] for one, two in pairs]
+        return found
 
     def _moved(self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]) -> tuple[list[list[arb]], arb]:
         """With fewer functions than pieces, slopes that act alike on every control of the dictionary are as good: those

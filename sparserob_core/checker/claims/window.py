@@ -11,6 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
@@ -99,6 +100,7 @@ class Beside:
     scene: Scene
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
+    delivered: Execution | None = None
 
     def added(
         self, found: Sequence[Polynomial], start: float, stop: float, z: Array, piece: int | None = None
@@ -119,7 +121,26 @@ class Beside:
         enclosed = Enclosed.all(terms, (len(terms), self.basis.shape[0]))
         mid = enclosed.mid @ z.T
         lost = (enclosed.rad + rounding(z.shape[1]) * np.abs(enclosed.mid)) @ np.abs(z).T
-        return [_plus(poly, mid[:, i], float(lost[:, i].sum())) for i, poly in enumerate(found)]
+        found = [_plus(poly, mid[:, i], float(lost[:, i].sum())) for i, poly in enumerate(found)]
+        if self.delivered is None:
+            return found
+        return [
+            _plus(poly, *self._erring(self.delivered, c, start, stop))
+            for poly, c in zip(found, z @ self.basis, strict=True)
+        ]
+
+    def _erring(self, delivered: Execution, c: Array, start: float, stop: float) -> tuple[Array, float]:
+        """What errors of execution add to ``c'x`` on ``[start, stop]``, ``c`` one of the basis or its opposite: the
+        terms of a polynomial, and how far it may be off."""
+        ends = [delivered.added(c, time) for time in ([start] if start == stop else [start, stop])]
+        level, off = ends[0][0] + (ends[0][1] - ends[0][0]) / 2.0, max(high - low for low, high in ends)
+        if len(ends) == 1:
+            return np.array([level]), off
+        length = self.scene.duration(self.scene.ticks(start, stop)) / (_exact(stop) - _exact(start))
+        rise = (ends[1][0] + ends[1][1] - ends[0][0] - ends[0][1]) / 2.0
+        slope = rise * float(length.mid())
+        off += delivered.bent(c, start, stop) + rounding(8) * (abs(slope) + abs(ends[0][1]) + abs(ends[1][1]))
+        return np.array([level, slope]), off
 
 
 def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:

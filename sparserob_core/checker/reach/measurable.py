@@ -108,14 +108,21 @@ class Kernel:
         """How many parts there are."""
         return int(self.coefficients.shape[0])
 
-    def most(self, a: Enclosed, sides: list[Side], share: float = 1.0) -> Enclosed:
-        """The integral of the support function of ``K(r)'a`` for ``a (N, d)``, over the first ``share`` of the length:
-        between bounds, as a middle and a radius ``(N,)``."""
-        size, count = np.abs(a.mid), self.count
+    def along(self, a: Enclosed) -> tuple[Array, Array]:
+        """``K(r)'a`` for ``a (N, d)``: polynomials ``(N, S, p + 1, mw)``, off by at most ``(N, S, mw)``."""
+        size = np.abs(a.mid)
         plain = np.einsum("nd,spdw->nspw", a.mid, self.coefficients)
         large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
         off = rounding(size.shape[1] + 1) * large + np.einsum("nd,sdw->nsw", size + a.rad, self.off)
         off = (off + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
+        return plain, off
+
+    def most(self, a: Enclosed, sides: list[Side], share: float = 1.0) -> Enclosed:
+        """The integral of the support function of ``K(r)'a`` for ``a (N, d)``, over the first ``share`` of the length:
+        between bounds, as a middle and a radius ``(N,)``."""
+        size, count = np.abs(a.mid), self.count
+        large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
+        plain, off = self.along(a)
         place = share * count
         last = min(int(place), count - 1)
         ends = np.where(np.arange(count) < last, 1.0, 2.0 * min(place - last, 1.0) - 1.0)[: last + 1]

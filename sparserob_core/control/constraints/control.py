@@ -36,7 +36,8 @@ class ControlConstraint:
 
     ``values (N, q)``: what every function of the dictionary is at the ``q`` places; ``offset (q, m)`` is added.
     ``starts (q,)``: from when on a time stands for each place, until the next, or the end, ``stop``. ``times (q,)``:
-    the time of each place that is told. ``words``: what is in the set, with a place for the time.
+    the time of each place that is told. ``words``: what is in the set, with a place for the time. ``beside``: how many
+    entries of the decision come after the coefficients of the control.
     """
 
     name: str
@@ -47,6 +48,7 @@ class ControlConstraint:
     stop: float
     times: Array
     words: str
+    beside: int = 0
 
     @staticmethod
     def of_values(convex: ConvexSet, dictionary: Dictionary, name: str = CONTROL) -> ControlConstraint:
@@ -98,6 +100,7 @@ class ControlConstraint:
         """``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + m)``."""
         directions, places = unit(self.set, indices[:, 1:]), self._places(indices[:, 0])
         G = np.einsum("kc,kn->kcn", directions, self.values[:, places].toarray().T).reshape(indices.shape[0], 1, -1)
+        G = np.pad(G, ((0, 0), (0, 0), (0, self.beside)))
         return G, (self.set.support(directions) - (directions * self.offset[places]).sum(axis=1))[:, None]
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
@@ -136,7 +139,8 @@ class ControlConstraint:
 
     def _points(self, x: Array) -> Array:
         """What the control does at every place, ``(q, m)``."""
-        answer: Array = (x.reshape(self.set.dimension, -1) @ self.values).T + self.offset
+        coefficients = x[: x.size - self.beside].reshape(self.set.dimension, -1)
+        answer: Array = (coefficients @ self.values).T + self.offset
         return answer
 
     def _places(self, times: Array) -> np.ndarray:

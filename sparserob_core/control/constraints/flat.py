@@ -26,6 +26,8 @@ from sparserob_core.control.problem.problem import MixedConstraint
 from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.response.functional import LEGS_KEPT, Leg, WorstCase
 from sparserob_core.control.response.initial_support import Supports
+from sparserob_core.control.response.lifted import LiftedSystem
+from sparserob_core.control.response.measurable import Execution, ExecutionCellSupport
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Direct, Moving, Reference
 from sparserob_core.control.response.response import LONG, Outputs, Response, distinct_times
@@ -239,7 +241,7 @@ class FlatConstraint(StateConstraint):
     def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k r"]:
         added = self.moved(times)
         if self.gains is not None:
-            control = self.functionals.dictionary.control(x)[:, self.commanded(times)]
+            control = self.functionals.control(x)[:, self.commanded(times)]
             added = added + np.einsum("rm,mkr->kr", self.gains, control)
         return added
 
@@ -248,7 +250,8 @@ class FlatConstraint(StateConstraint):
         if self.gains is None:
             return None
         values = self.functionals.dictionary.at(self.commanded(times))
-        return np.asarray(np.einsum("rm,nkr->krmn", self.gains, values).reshape(times.size * self.h.size, -1))
+        rows = np.einsum("rm,nkr->krmn", self.gains, values).reshape(times.size * self.h.size, -1)
+        return np.pad(rows, ((0, 0), (0, self.functionals.variables - rows.shape[1])))
 
     @shaped
     def moved(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
@@ -366,13 +369,19 @@ class FlatConstraint(StateConstraint):
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
             legs = self.functionals.legs(low, high)
-            control, cuts = self.functionals.dictionary.control(x), self.parameters.cuts(low, high)
+            control, cuts = self.functionals.control(x), self.parameters.cuts(low, high)
             rows = self.samples.proven
             rhs, H = np.zeros((rows, legs[0].space.size)), self.H[:rows]
             rhs[:, 0] = self.h[:rows]
             moving = None if self.reference is None else Moving(self.reference, H)
             direct = None if self.gains is None else Direct(self.gains[:rows], self.functionals.dictionary, control)
-            supports = iter(self.samples.support_over(legs, low, high))
+            known = self.samples.support_over(legs, low, high)
+            if self.functionals.execution is not None:  # of a known system, which has one leg
+                (leg,) = legs
+                assert isinstance(leg, LiftedSystem)
+                mine = ExecutionCellSupport(self.functionals.execution, control, H, leg)
+                known = [Supports((*(() if known[0] is None else known[0].parts), mine))]
+            supports = iter(known)
             made = over_legs(
                 legs,
                 lambda leg: CellEnclosure(
@@ -408,10 +417,19 @@ class FlatConstraint(StateConstraint):
     @shaped
     def on_lattice(self, x: Float[Array, " n"]) -> Float[Array, "v r t"]:
         """Violations ``(v, r, times)`` at every lattice point and sampled time."""
-        along = self.samples.along(self.functionals.response, self.functionals.dictionary.control(x))
+        along = self.samples.along(self.functionals.response, self.functionals.control(x))
         answer: Array = along - self.samples.margins
+        if self.functionals.execution is not None:
+            answer = answer + self._executed(self.functionals.execution, x)
         beside = self.reference is not None or self.gains is not None
         return answer + self.beside(x, self.times).T if beside else answer
+
+    def _executed(self, execution: Execution, x: Array) -> Array:
+        """What errors of execution add to all rows at every sampled time, ``(r, times)``."""
+        rows, copies = self.H[: self.samples.proven], self.h.size // max(1, self.samples.proven)
+        k, r = self.times.size, rows.shape[0]
+        added = execution.added(self.functionals.control(x), np.repeat(self.times, r), np.tile(rows, (k, 1)))
+        return np.tile(added.reshape(k, r).T, (copies, 1))
 
     @shaped
     def _refined(

@@ -151,6 +151,10 @@ class Sensitivity:
         if closed:
             sigma = self._sigma_slopes(times[:, 0], parameters, at)
             in_time, in_parameters, states = in_time + sigma[0], in_parameters + sigma[1], states + sigma[2]
+        execution = self.constraint.functionals.execution
+        if execution is not None:
+            control = self.constraint.functionals.control(x)
+            in_time = in_time + execution.slope(control, times[:, 0], at.direction)[:, None]
         reference = self.constraint.reference
         if reference is not None:
             in_time = (

@@ -154,6 +154,11 @@ class OptimalControlProblem:
     horizon as its period. Final states stay inside by `WITHIN` of the set, so that what is proven to a tolerance is
     proven for ever; coordinates of which there is one value are fixed at the end, to rounding.
 
+    ``execution``: a share of the control, from 0 to 1, one for each: what is delivered differs from the command by at
+    most that share of it, any function of time, and every constraint on the state holds nonetheless; of nothing
+    nothing is missing. What a mixed constraint says of the control, the set of the control, that of its steps and the
+    cost are about the command. ``None``: what is commanded is delivered.
+
     ``weights``: a positive number, one for each control, or rows of a time and the weights from then on, which are not
     negative: prices, or a supply that is free for a while. The first time is 0.
 
@@ -182,6 +187,7 @@ class OptimalControlProblem:
     disturbances: Sequence[Disturbance] = ()
     measurements: Measurements | None = None
     repeat: bool | Repeating = False
+    execution: npt.ArrayLike | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem | SwitchedSystem | VaryingSystem):
@@ -228,6 +234,7 @@ class OptimalControlProblem:
             self._check_varying(self.system)
         if self.repeat is not Repeating.IMPOSED:
             self._return()
+        self._set("execution", self._executed())
         sealed(self)
 
     def _set(self, name: str, value: object) -> None:
@@ -264,6 +271,41 @@ class OptimalControlProblem:
         for key, given in refused.items():
             if given:
                 raise _unproven(key)
+
+    def _executed(self) -> Array | None:
+        """The errors of execution, ``None`` where there are none; raises `InputError` for what they are not proven
+        with yet."""
+        if self.execution is None:
+            return None
+        m = self.system.controls
+        shares = np.atleast_1d(as_bound("execution", self.execution))
+        if shares.shape != (m,) or not ((shares >= 0.0) & (shares <= 1.0)).all():
+            raise InputError(
+                path="execution", expected=f"{m} numbers from 0 to 1, one per control", got=f"{shares.tolist()}"
+            )
+        if not shares.any():
+            return None
+        ends = any(isinstance(end, Equality) for end in self.terminal)
+        sets = [
+            e if isinstance(e, ConvexSet) else e.set
+            for e in (*self.path, *self.terminal)
+            if not isinstance(e, Equality)
+        ]
+        refused = {
+            "fixed final values, which an error of execution misses: a terminal set such as box": ends,
+            "a system in t": isinstance(self.system, VaryingSystem),
+            "pieces of the system": isinstance(self.system, SwitchedSystem),
+            "uncertain parameters": bool(self.system.parameter_count),
+            "a delay": self.system.delay > 0.0,
+            "measurable disturbances": self.disturbance is not None and self.disturbance_class == "measurable",
+            "integrals of state and control": bool(self.integral),
+            "curved sets of states": any(one.halfspaces() is None for one in sets),
+            "a cost other than the L1 norm": not self.cost.is_linear,
+        }
+        for beside, given in refused.items():
+            if given:
+                raise InputError(path="execution", expected=f"none beside {beside}", got=f"{shares.tolist()}")
+        return shares
 
     def _state(self) -> Array:
         d = self.system.states

@@ -72,6 +72,7 @@ class Units:
                 None if problem.measurements is None else problem.measurements.in_units(self.states, self.time)
             ),
             repeat=problem.repeat,
+            execution=problem.execution,
         )
 
     def _window(self, entry: PathConstraint | MixedConstraint) -> PathConstraint | MixedConstraint:

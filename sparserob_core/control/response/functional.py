@@ -28,7 +28,7 @@ from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
-    from sparserob_core.control.response.measurable import MeasurableSupport
+    from sparserob_core.control.response.measurable import Execution, MeasurableSupport
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
@@ -59,7 +59,9 @@ class WorstCase:
     the set's support function of ``e^{A't} c``.
 
     Indices are given as ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``; the decision is ``theta``
-    raveled, ``(m N,)``. ``names``: what the states are called where a functional is explained.
+    raveled, ``(m N,)``. ``names``: what the states are called where a functional is explained. ``execution``: the
+    errors with which the control is delivered; the decision then goes on with a bound of the absolute value of every
+    channel on every piece, ``(m K,)``, in which rows are linear.
     """
 
     response: Response
@@ -68,6 +70,7 @@ class WorstCase:
     shared: MeasurableSupport | None = field(default=None, repr=False)
     names: Names = UNNAMED
     initial: ConvexSet | None = None
+    execution: Execution | None = None
 
     @shaped
     def from_state(self, initial_state: Float[Array, " d"]) -> WorstCase:
@@ -88,7 +91,18 @@ class WorstCase:
 
     @cached_property
     def variables(self) -> int:
+        """Entries of the decision."""
+        return self.coefficients + (0 if self.execution is None else self.execution.size)
+
+    @property
+    def coefficients(self) -> int:
+        """Entries ``m N`` of the decision that are those of the control."""
         return self.channels * self.dictionary.functions
+
+    @shaped
+    def control(self, decision: Float[Array, " n"]) -> Float[Array, "m K"]:
+        """The control on the pieces of its dictionary."""
+        return self.dictionary.control(decision[: self.coefficients])
 
     @cached_property
     def known(self) -> Array:
@@ -103,7 +117,7 @@ class WorstCase:
         if self.initial is not None:
             response = response.from_state(response.initial_state + nominal_point(self.initial))
         held = None if model is None else model.held(nominal_point(model.bound))
-        return replace(self, response=response, disturbance=held, shared=None, initial=None)
+        return replace(self, response=response, disturbance=held, shared=None, initial=None, execution=self._exactly)
 
     def nominal(self) -> WorstCase:
         """The functionals of the system at an interior point of its parameters, from the centre of the initial states,
@@ -123,7 +137,12 @@ class WorstCase:
         ends = (*system.switches, float(self.response.grid.breakpoints[-1]))
         known = modes[0] if len(modes) == 1 else SwitchedSystem(list(zip(ends, modes, strict=True)))
         response = Response(known, self.response.grid, self.response.initial_state)
-        return WorstCase(response, self.dictionary, model, names=self.names)
+        return WorstCase(response, self.dictionary, model, names=self.names, execution=self._exactly)
+
+    @property
+    def _exactly(self) -> Execution | None:
+        """The same decisions, of a control that is delivered as it is commanded."""
+        return None if self.execution is None else self.execution.none()
 
     def coarser(self, pieces: int) -> WorstCase:
         """The same functionals where about so many equal pieces are the whole horizon, of a known system on many equal
@@ -189,7 +208,9 @@ class WorstCase:
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
         for part in self._chunks(parameters):
             known = self.response.weights(times[part], directions[part], parameters[part])
-            G[part] = self.on_decision(known.control)
+            G[part, : self.coefficients] = self.on_decision(known.control)
+            if self.execution is not None:
+                G[part, self.coefficients :] = self.execution.lengths(times[part], directions[part])
             offset[part] = known.free @ self.response.initial_state + self.given(known.control) + pushed(part, known)
         return G, offset
 
@@ -218,6 +239,8 @@ class WorstCase:
             driven = np.einsum("klm,ml->k", known.control, control)
             support = self._support(known, times[part], directions[part], parameters[part])
             result[part] = known.free @ self.response.initial_state + driven + support
+            if self.execution is not None:
+                result[part] += self.execution.added(self.control(theta), times[part], directions[part])
         return result
 
     def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
@@ -372,7 +395,7 @@ class WorstCase:
             every = np.zeros((weights.shape[0], self.dictionary.pieces, self.channels))
             every[:, acting] = on_pieces
             on_pieces = every
-        return self.dictionary.gathered(on_pieces).swapaxes(1, 2).reshape(-1, self.variables)
+        return self.dictionary.gathered(on_pieces).swapaxes(1, 2).reshape(-1, self.coefficients)
 
     @cached_property
     def _acting(self) -> tuple[np.ndarray, np.ndarray]:
@@ -408,7 +431,7 @@ class WorstCase:
     def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "mc L"]:
         """What acts through the columns of ``B`` on the pieces of the merged grid, ``(m + constants, L)``: the control,
         and all that is not decided."""
-        return self.response.grid.inputs(self.dictionary.control(theta))
+        return self.response.grid.inputs(self.control(theta))
 
     @shaped
     def _support(

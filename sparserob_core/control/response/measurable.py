@@ -1,22 +1,29 @@
 """Support of the reachable set when the disturbance may be any measurable function with values in a set.
 
 ``sigma(t) = int_0^t h_W(E' e^{A' s} c) ds``: the integral and the maximum commute (Aumann 1965).
+
+Errors of execution are such disturbances: what is delivered of a control differs from the command by at most a share of
+it, any function of time. What the worst of them adds to ``c'x(t)`` is ``sum_jk share_j |u_jk| int |c'e^{A(t-s)} B_j|
+ds``, the integral over piece ``k`` up to ``t``: convex in the command, and 0 where that is 0.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import comb
+from typing import final
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import exponential, rounding
+from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response
 from sparserob_core.shapes import Float, Int, shaped
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
 # Gauss-Lobatto: the ends are nodes, so that no kink hides beside them
@@ -32,6 +39,9 @@ BEZIER = np.array([[comb(k, j) / comb(ORDER, j) for k in range(ORDER + 1)] for j
 """From powers on ``[0, 1]`` to the coefficients of Bernstein's form, ``(ORDER + 1, ORDER + 1)``."""
 MOST_SHORT = 4096  # intervals that one is cut into before any is halved
 HALVINGS = 48  # of an interval across a kink of the integrand: what is left of it is below rounding
+# Of the horizon: ages that differ by less are one where nothing is proven. Ten times as much would be seen in a
+# violation of 1e-9, a tenth of it is below what the difference of two times rounds to.
+ALIKE = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,3 +334,174 @@ class MeasurableCellSupport:
     def _drive(self) -> Array:
         norms = block_norms(np.linalg.norm(self.lifted.W[0], axis=1), self.lifted.starts)
         return np.asarray(self.support.bound.radius_bound * norms)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Execution:
+    """The ``shares (m,)`` of the commanded control by which what is delivered may differ; ``breakpoints (K + 1,)`` are
+    the command's, ``response`` is that of a known system."""
+
+    response: Response
+    breakpoints: Array
+    shares: Array
+
+    def none(self) -> Execution:
+        """The same of a control that is delivered as it is commanded."""
+        return replace(self, shares=np.zeros(self.shares.size))
+
+    @property
+    def size(self) -> int:
+        """How many absolute values there are, one for every channel and piece."""
+        return int(self.shares.size * (self.breakpoints.size - 1))
+
+    @cached_property
+    def matrices(self) -> tuple[Array, Array]:
+        """``A (d, d)``, ``B (d, m)``."""
+        A, B, _ = self.response.system.modes[0].matrices(np.zeros((1, 0)))
+        return A[0], B[0][:, : self.shares.size]
+
+    @cached_property
+    def _supports(self) -> list[MeasurableSupport | None]:
+        """``int_0^t |c'e^{A s} B_j| ds`` of every channel, ``None`` where it is delivered as it is commanded."""
+        A, B = self.matrices
+        unit, grid, start = Box([-1.0], [1.0]), self.response.grid, self.response.initial_state
+        made = [Response(LinearSystem(A, B, B[:, [j]]), grid, start) for j in range(self.shares.size)]
+        return [MeasurableSupport(one, unit) if s > 0.0 else None for one, s in zip(made, self.shares, strict=True)]
+
+    @shaped
+    def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
+        """What a command of size 1 on every piece of every channel adds at most, ``(k, m K)``, channel by channel."""
+        ages = np.clip(times[:, None] - self.breakpoints, 0.0, None)
+        found = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1))
+        for j, integral in enumerate(self._integrals(ages, directions)):
+            found[:, j] = self.shares[j] * np.maximum(integral[:, :-1] - integral[:, 1:], 0.0)
+        return found.reshape(times.size, -1)
+
+    @shaped
+    def added(
+        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
+    ) -> Float[Array, " k"]:
+        """What the worst errors of a command add to ``c'x(t)``, ``(k,)``."""
+        which, jumps = self.jumps(control)
+        if not which.size:
+            return np.zeros(times.size)
+        ages = np.clip(times[:, None] - self.breakpoints[which], 0.0, None)
+        every = zip(self._integrals(ages, directions), jumps, strict=True)
+        return np.asarray(sum(integral @ change for integral, change in every))
+
+    @shaped
+    def slope(
+        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
+    ) -> Float[Array, " k"]:
+        """The derivative ``(k,)`` of `added` in the time, from the left where that jumps."""
+        (A, B), (which, jumps) = self.matrices, self.jumps(control)
+        ages = times[:, None] - self.breakpoints[which]
+        at = np.einsum("kd,kqde,em->kqm", directions, exponential(A * np.maximum(ages, 0.0)[..., None, None]), B)
+        return np.asarray(np.einsum("kqm,mq,kq->k", np.abs(at), jumps, ages > 0.0))
+
+    @shaped
+    def jumps(self, control: Float[Array, "m K"]) -> tuple[np.ndarray, Float[Array, "m q"]]:
+        """The pieces ``(q,)`` with which the size of the largest error changes, and by how much, ``(m, q)``: by parts,
+        ``sum_k r_k int_k = sum_k (r_k - r_{k-1}) int_{t_k}^t``, of which a sparse control needs few."""
+        jumps = np.diff(self.shares[:, None] * np.abs(control), axis=1, prepend=0.0)
+        which = np.flatnonzero(jumps.any(axis=0))
+        return which, jumps[:, which]
+
+    def _integrals(self, ages: Array, directions: Array) -> list[Array]:
+        """``int_0^age |c'e^{A s} B_j| ds`` for ages ``(k, q)`` of directions ``(k, d)``, of every channel; of ages that
+        are alike once."""
+        alike = ALIKE * float(self.breakpoints[-1])
+        c, owner = np.unique(directions, axis=0, return_inverse=True)
+        keys = np.stack([np.repeat(owner.reshape(-1), ages.shape[1]), np.rint(ages.ravel() / alike)])
+        (who, _), first, which = np.unique(keys, axis=1, return_index=True, return_inverse=True)
+        times, rows = ages.ravel()[first], c[who.astype(int)]
+        none = np.zeros((times.size, 0))
+        return [
+            np.zeros(ages.shape) if one is None else one(times, rows, none)[which.reshape(-1)].reshape(ages.shape)
+            for one in self._supports
+        ]
+
+    @shaped
+    def enclosed(
+        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
+    ) -> Float[Array, "k 2"]:
+        """What `added` is at least and at most, ``(k, 2)``."""
+        which, jumps = self.jumps(control)
+        total, size = np.zeros((times.size, 2)), np.zeros(times.size)
+        ages = np.clip(times[:, None] - self.breakpoints[which], 0.0, None).ravel()
+        # a difference of times is rounded, and an integral grows with its length
+        last, rows = float(self.breakpoints[-1]), np.repeat(directions, which.size, axis=0)
+        around = np.nextafter(ages, 0.0), np.minimum(np.nextafter(ages, np.inf), last)
+        for one, change in zip(self._supports, jumps, strict=True):
+            if one is None or not change.any():
+                continue
+            low, high = (one.enclosed(at, rows)[:, side] for side, at in enumerate(around))
+            ends = np.stack([low, high], axis=1).reshape(times.size, which.size, 2)
+            total += np.einsum("kqe,q->ke", ends, np.maximum(change, 0.0))
+            total += np.einsum("kqe,q->ke", ends[..., ::-1], np.minimum(change, 0.0))
+            size += np.abs(ends).max(axis=2) @ np.abs(change)
+        return np.asarray(total + (rounding(4 * which.size + 8) * size)[:, None] * [-1.0, 1.0])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ExecutionCellSupport:
+    """What errors of execution of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time, in the
+    form of `MeasurableCellSupport`; ``lifted`` is the known system."""
+
+    execution: Execution
+    control: Array
+    rows: Array
+    lifted: LiftedSystem
+
+    @shaped
+    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r 0"]:
+        """No parameters, no steepness: ``(k, r, 0)``."""
+        return np.zeros((times.size, self.rows.shape[0], 0))
+
+    @shaped
+    def at(
+        self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
+    ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
+        """What is added ``(k, r, 1)`` and how far it may be from that, ``(k, r)``; ``ends (k, r, 0)``."""
+        k, r = times.size, self.rows.shape[0]
+        bounds = self.execution.enclosed(self.control, np.repeat(times, r), np.tile(self.rows, (k, 1)))
+        bounds = bounds.reshape(k, r, 2)
+        return bounds.mean(axis=2)[..., None], (bounds[..., 1] - bounds[..., 0]) / 2 * (1.0 + rounding(4))
+
+    @shaped
+    def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
+        """Bounds ``(k, r)`` of how far it is from its chord on ``[start, start + width]``, each inside one piece: its
+        slope is a sum of ``|c'e^{A s} B_j|`` at the ages of the jumps, of which each changes no faster than
+        ``|c'e^{A s} A B_j|``."""
+        which, jumps = self.execution.jumps(self.control)
+        if not which.size:
+            return np.zeros((start.size, self.rows.shape[0]))
+        comparison, lifted = self.lifted.comparison, self.lifted
+        ages = start[:, None] - self.execution.breakpoints[which]
+        begun = ages + widths[:, None] > 0.0  # the others begin after the cell
+        ages, width = np.where(begun, np.maximum(ages, 0.0), 0.0).ravel(), np.repeat(widths, which.size)
+        rows, drive = self.rows @ lifted.transform, lifted.B[0][:, : jumps.shape[0]]
+        slopes = rows @ lifted.forward.flows(ages)[0] @ lifted.A[0]  # (k q, r, d)
+        departure = comparison.over(width).departure
+        bent = np.abs(slopes @ drive)  # (k q, r, m)
+        norms = block_norms(slopes, lifted.starts)
+        for j in range(drive.shape[1]):
+            pushed = np.broadcast_to(block_norms(np.abs(drive[:, j]), lifted.starts), (width.size, norms.shape[2]))
+            bent[..., j] += np.einsum("nrq,nq->nr", norms, departure.on(pushed))
+        total = np.einsum("kqrj,jq,kq->kr", bent.reshape(start.size, which.size, *bent.shape[1:]), np.abs(jumps), begun)
+        return np.asarray((widths**2 / 8)[:, None] * total * (1.0 + rounding(16 * (lifted.states + which.size))))
+
+    @property
+    def neglected(self) -> Array:
+        """Nothing beside what `at` says, ``(r, L)``."""
+        return np.zeros((self.rows.shape[0], self.lifted.grid.pieces))
+
+    @property
+    def reached(self) -> Array:
+        """As in `DisturbanceSupport`, ``(L, q)``."""
+        far = self.execution.shares * np.abs(self.control).max(axis=1)
+        norms = block_norms(np.abs(self.lifted.B[0][:, : far.size]) @ far, self.lifted.starts)
+        reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
+        return reach.integral.on(np.broadcast_to(norms, (self.lifted.grid.pieces, norms.size)))

@@ -104,7 +104,8 @@ def _neglected(model: Transcription, result: Result) -> float:
     lost = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))
     steps = Steps.of(model.problem, model.control)
     if steps.count:
-        table, far = others.reshape(steps.upper.size, steps.times.size), 2.0 * np.abs(steps.H) @ _far(bound)
+        own = others[: steps.upper.size * steps.times.size]  # what follows bounds sizes from both sides
+        table, far = own.reshape(steps.upper.size, steps.times.size), 2.0 * np.abs(steps.H) @ _far(bound)
         wrong = np.where(np.isfinite(steps.upper), 0.0, np.maximum(table, 0.0).sum(axis=1))
         wrong += np.where(np.isfinite(steps.lower), 0.0, np.maximum(-table, 0.0).sum(axis=1))
         lost += float((wrong + SHARE * np.abs(table).sum(axis=1)) @ far)

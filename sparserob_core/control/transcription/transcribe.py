@@ -107,6 +107,9 @@ def prepare(
     if policy is not None and mask.any() and isinstance(problem.system, VaryingSystem):
         expected = "open_loop where the system changes with time, of which feedback is not proven yet"
         raise InputError(path="policy", expected=expected, got="one that answers what is measured")
+    if problem.execution is not None and mask.any():
+        expected = "none under feedback, where the size of the control, and with it that of its error, answers too"
+        raise InputError(path="execution", expected=expected, got=f"{np.asarray(problem.execution).tolist()}")
     if policy is not None and mask.any():
         from sparserob_core.control.transcription.feedback import refuse
 
@@ -159,7 +162,12 @@ def _functionals(
     if problem.disturbance is not None:
         model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
     response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
-    functionals = WorstCase(response, control, model, names=problem.names, initial=begun)
+    execution = None
+    if problem.execution is not None:
+        from sparserob_core.control.response.measurable import Execution
+
+        execution = Execution(response, control.breakpoints, np.asarray(problem.execution))
+    functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)
 
 
@@ -188,12 +196,17 @@ def _assembled(
     if rows is not None:
         A, b = rows.equalities(A, b)
         b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
+    if functionals.execution is not None:
+        S, lower, upper, weights = _with_sizes(S, lower, upper, weights, functionals)
     families = [family_of(constraint) for constraint in constraints]
+    held = []
     if problem.control.halfspaces() is None:
-        families.append(ControlConstraint.of_values(problem.control, control, of_control(problem)).family())
+        held.append(ControlConstraint.of_values(problem.control, control, of_control(problem)))
     step, first = problem.control_step, before(problem)
     if step is not None and step.halfspaces() is None and (control.pieces > 1 or first is not None):
-        families.append(ControlConstraint.of_steps(step, control, first, seam(problem, control)).family())
+        held.append(ControlConstraint.of_steps(step, control, first, seam(problem, control)))
+    beside = functionals.variables - functionals.coefficients
+    families += [replace(one, beside=beside).family() for one in held]
     if formulation == "literal":
         families = [family.literal or family for family in families]
     program = SemiInfiniteProgram(
@@ -286,9 +299,13 @@ def _in_own_units(model: Transcription, wide: bool = False) -> OwnUnits:
     steps, mine = Steps.of(model.problem, model.control), Steps.of(own.problem, own.control).divided(rows.steps)
     pieces = np.repeat(np.concatenate([units.controls, sides]), own.control.pieces)
     image = np.concatenate([pieces, np.repeat(_ratio(steps.H, mine.H, units.controls), steps.times.size)])
+    decision = np.repeat(units.controls, own.control.functions)
+    if own.functionals.execution is not None:
+        sizes = np.repeat(units.controls, own.control.pieces)
+        decision, image = np.concatenate([decision, sizes]), np.concatenate([image, sizes, sizes])
     return OwnUnits(
         program=replace(own.program, activity=model.program.activity, image_units=image),
-        decision=np.repeat(units.controls, own.control.functions),
+        decision=decision,
         image=image,
         equalities=_fixed(model.problem) @ units.states * rows.fixed,
         cost=units.cost,
@@ -512,6 +529,27 @@ def _image(
     )
 
 
+def _with_sizes(
+    S: csc_array | None, lower: Array, upper: Array, weights: Array, functionals: WorstCase
+) -> tuple[csc_array, Array, Array, Array]:
+    """The images of `_image` where the decision goes on with a bound ``a`` of the size of every value ``s`` of the
+    control, and those that make it one: ``0 <= a - s``, ``0 <= a + s``, neither more than twice as far as ``s`` goes,
+    which ``a = |s|`` is not."""
+    from scipy.sparse import block_array, csc_array, eye_array
+
+    assert functionals.execution is not None
+    known = eye_array(functionals.coefficients, format="csc") if S is None else S
+    values, one = known[: functionals.execution.size], eye_array(functionals.execution.size, format="csc")
+    far = 2.0 * np.maximum(np.abs(lower), np.abs(upper))[: functionals.execution.size]
+    none = np.zeros(far.size)
+    return (
+        csc_array(block_array([[known, None], [-values, one], [values, one]])),
+        np.concatenate([lower, none, none]),
+        np.concatenate([upper, far, far]),
+        np.concatenate([weights, none, none]),
+    )
+
+
 def _blocks(problem: OptimalControlProblem, dictionary: Dictionary, images: int) -> Array | None:
     """The number of the group and piece of every image; ``None`` where every channel counts alone."""
     if not problem.cost.blocks:
@@ -633,6 +671,8 @@ def family_of(constraint: StateConstraint) -> ConstraintFamily:
             raise InputError(
                 f"method: scenario: the constraint {constraint.name} has a curved set; expected sets with flat sides"
             )
+        if constraint.functionals.execution is not None:
+            raise InputError("method: scenario: expected no problem.execution, whose errors are not sampled")
         from sparserob_core.control.constraints.scenario import (
             ScenarioConstraint,
             sample_disturbances,

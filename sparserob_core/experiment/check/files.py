@@ -411,6 +411,11 @@ def _same(said: object, value: object, figures: float = FIGURES) -> bool:
 STORED = ("theta", "control", "breakpoints", "decision")
 
 
+def _sizes(case: Case) -> int:
+    """How many bounds of the sizes of the control's values follow its coefficients in a decision."""
+    return 0 if case.problem.execution is None else case.problem.system.controls * case.control.pieces
+
+
 def _solution(stored: StoredRun, case: Case) -> Verdicts:
     """``solution.npz`` must hold the certificate's decision."""
     if case.certificate.get("decision") is None:
@@ -424,7 +429,7 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         same = (
             np.array_equal(theta, decision)
             and np.array_equal(flat[: decision.size], decision.ravel())
-            and (case.policy is not None or flat.size == decision.size)
+            and (case.policy is not None or flat.size == decision.size + _sizes(case))
             and all(np.array_equal(arrays[k], np.array(case.certificate.get(k, []), dtype=float)) for k in answered)
             and np.array_equal(breakpoints, case.control.breakpoints)
             and control.shape == size.shape

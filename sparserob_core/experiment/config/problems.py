@@ -572,6 +572,10 @@ class ControlKeys(ProblemKeys):
     """What a policy measures and answers: ``{C: ..., noise: ..., latency: ...}``; all states, without noise and at
     once, unless given."""
 
+    execution: OneOrMore | None = None
+    """Share of the control, from 0 to 1, by which what is delivered may differ from the command, one number per control
+    or one for all of them, such as 0.02; what is commanded is delivered unless given."""
+
     repeat: bool = False
     """Whether the plan begins again at the horizon, for ever: every final state is then one of the initial states, and
     ``control_step`` holds from the last control to the first one too. Not with a delay."""
@@ -606,6 +610,7 @@ class ControlKeys(ProblemKeys):
             names=self.names.build() if names is None else names,
             measurements=None if self.measurements is None else self.measurements.build(),
             repeat=self.repeat,
+            execution=None if self.execution is None else broadcast("execution", self.execution, system.controls),
         )
 
     def _control_before(self, controls: int) -> list[float] | None:

@@ -149,7 +149,8 @@ def _fewest(experiment: ControlExperiment, activity: Activity | None) -> dict[st
     own = None if activity.dual is None else _multipliers(experiment, activity.dual)
     other: dict[str, Any] = {}
     if activity.decision is not None:
-        theta = np.asarray(activity.decision).reshape(program.channels, experiment.control.functions)
+        theta = experiment.transcription.nominal(activity.decision)
+        theta = theta.reshape(program.channels, experiment.control.functions)
         other = {"decision": theta, "proof": _proofs(experiment, activity.proofs)}
     return {"fewest_active": {"lower": activity.lower, "upper": activity.upper, "multipliers": own, **other}}
 
@@ -164,7 +165,8 @@ def _proofs(experiment: ControlExperiment, proofs: Sequence[Proof]) -> dict[str,
 def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | None:
     """``None`` unless every constraint can be stated in numbers: a sampled one, of the scenario approach, cannot. Under
     feedback a constraint is one at a disturbance, on its own pieces ``(mw, pieces)``."""
-    problem, program, z = experiment.problem, experiment.program, dual.z
+    problem, program = experiment.problem, experiment.program
+    z = dual.z if problem.execution is None or dual.z is None else _without_sizes(program, dual.z)
     steps = Steps.of(problem, experiment.control)
     pairs = zip(dual.cuts, experiment.transcription.explained(dual.cuts), strict=True)
     explained = [(cut, said) for cut, said in pairs if said is not None]
@@ -193,6 +195,14 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
         "pieces": _on_pieces(problem, z, experiment.control.pieces),
         **({} if dual.at is None else {"tangent": dual.at.reshape(problem.system.controls, -1)}),
     }
+
+
+def _without_sizes(program: SemiInfiniteProgram, z: Array) -> Array:
+    """Multipliers of the images without those that bound the size of every value of the control: of a value from both
+    sides, with opposite signs."""
+    size = program.image_size
+    above, below = z[-2 * size : -size], z[-size:]
+    return np.concatenate([z[:size] - above + below, z[size : -2 * size]])
 
 
 def _on_pieces(problem: OptimalControlProblem, z: Array | None, pieces: int) -> Array | None:

@@ -77,6 +77,11 @@ def initial_states(
     if isinstance(model.problem.system, VaryingSystem):
         expected = "a system that stays the same with time: of another one no set of initial states is proven yet"
         raise InputError(path="problem.system", expected=expected, got="one in t")
+    if model.problem.execution is not None:
+        expected = "none: with errors of execution no set of initial states is proven yet"
+        raise InputError(
+            path="problem.execution", expected=expected, got=f"{np.asarray(model.problem.execution).tolist()}"
+        )
     if about is not None:
         begun = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
         model = from_state(model, np.append(_about(about, model.stated), begun))

@@ -35,7 +35,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
     "path", "terminal", "integral", "title", "initial_control", "control_step", "names", "cost", "disturbances",
-    "measurements", "repeat",
+    "measurements", "repeat", "execution",
 }  # fmt: skip
 """The fields of a problem that are written; one that is added and not named here is refused, not lost."""
 MANY = 2500  # entries of a matrix that nobody reads: of ten times more a config has as many values as it may have
@@ -74,6 +74,8 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         keys["initial_control"] = np.asarray(problem.initial_control).tolist()
     if problem.repeat:
         keys["repeat"] = True
+    if problem.execution is not None:
+        keys["execution"] = np.asarray(problem.execution).tolist()
     return keys
 
 

@@ -1,0 +1,90 @@
+"""Guards checker/reach/execution: errors of execution in the checker: integrals of absolute values, and their bends."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+import sparserob_core as sr
+from sparserob_core.checker.reach.execution import Execution
+from sparserob_core.checker.reach.flow import stacked
+
+A = np.array([[0.0, 1.0], [-4.0, -0.3]])
+B = np.array([[0.2, 0.0], [1.0, -0.7]])
+SHARES = np.array([0.1, 0.03])
+CONTROL = np.array([[0.0, 0.8, -0.8, 0.0, 0.3, 0.0], [0.5, 0.0, 0.0, -0.2, 0.0, 1.0]])
+POINTS = np.linspace(0.0, 3.0, 7)
+C = np.array([1.0, -0.4])
+
+
+@pytest.fixture(scope="module")
+def execution() -> Execution:
+    from flint import arb, ctx
+
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(A, B), horizon=3.0, initial_state=[0.0, 0.0], control=sr.Box([-1.0, -1.0], [1.0, 1.0])
+    )
+    with ctx.workprec(128):
+        pieces = [stacked([[arb(float(v))] for v in u]) for u in CONTROL.T]
+        found = Execution(problem, SHARES, POINTS, pieces)
+        _ = found.kernel
+    return found
+
+
+def weight(j: int, begin: float, end: float) -> float:
+    """``int |c'e^{A s} B_j| ds`` from one age to another."""
+    if end <= begin:
+        return 0.0
+    ages = np.linspace(begin, end, 200)
+    heights = [_height(age, j) for age in ages]
+    crossed = [i for i in range(199) if heights[i] * heights[i + 1] < 0.0]
+    turns = [float(brentq(_height, ages[i], ages[i + 1], args=(j,), xtol=1e-15)) for i in crossed]
+    parts = pairwise([begin, *turns, end])
+    return sum(abs(float(quad(_height, low, high, args=(j,), epsabs=1e-13)[0])) for low, high in parts)
+
+
+def _height(age: float, j: int) -> float:
+    return float(C @ expm(A * age) @ B[:, j])
+
+
+@pytest.mark.parametrize("age", [0.0, 1e-9, 0.41, 1.5])
+def test_integrals_are_enclosed_closely(execution: Execution, age: float) -> None:
+    low, high = execution.integrals(C, np.array([age]))
+    for j in range(2):
+        assert low[0, j] - 1e-12 <= weight(j, 0.0, age) <= high[0, j] + 1e-12  # what quadrature is worth
+        assert 0.0 <= high[0, j] - low[0, j] <= 1e-12
+
+
+def test_what_a_command_adds_at_least_is_hardly_less_than_it_adds(execution: Execution) -> None:
+    least = execution.least(C, 1.7)
+    for k in range(6):
+        for j in range(2):
+            true = SHARES[j] * weight(j, max(1.7 - POINTS[k + 1], 0.0), max(1.7 - POINTS[k], 0.0))
+            assert true - 1e-9 <= least[k, j] <= true + 1e-9
+    assert not least[4:].any()
+
+
+@pytest.mark.parametrize("time", [0.0, 0.5, 1.7, 3.0])
+def test_the_errors_of_a_control_add_up(execution: Execution, time: float) -> None:
+    low, high = execution.added(C, time)
+    true = sum(
+        SHARES[j] * abs(CONTROL[j, k]) * weight(j, max(time - POINTS[k + 1], 0.0), max(time - POINTS[k], 0.0))
+        for k in range(6) for j in range(2)
+    )  # fmt: skip
+    assert low <= high <= low + 1e-12
+    assert low - 1e-9 <= true <= high + 1e-9
+
+
+def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(execution: Execution) -> None:
+    ratios = []
+    for start, stop in [(0.0, 0.5), (0.6, 0.8), (1.0, 1.1), (2.05, 2.45), (2.5, 2.51)]:
+        share = np.linspace(0.0, 1.0, 41)
+        path = np.array([execution.added(C, start + (stop - start) * s)[0] for s in share])
+        off = (path - (1 - share) * path[0] - share * path[-1]).max()
+        ratios.append(off / execution.bent(C, start, stop))
+    assert 0.5 < max(ratios) <= 1.0

@@ -1,0 +1,140 @@
+"""Guards control/response/measurable: what errors of execution add to the state, exact, and enclosed on cells of
+time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.response.measurable import Execution, ExecutionCellSupport
+from sparserob_core.control.transcription.transcribe import Transcription, prepare
+
+A = np.array([[0.0, 1.0], [-4.0, -0.3]])
+B = np.array([[0.2, 0.0], [1.0, -0.7]])
+SHARES = np.array([0.1, 0.03])
+CONTROL = np.array([[0.0, 0.8, -0.8, 0.0, 0.3, 0.0], [0.5, 0.0, 0.0, -0.2, 0.0, 1.0]])
+HORIZON, PIECES = 3.0, 6
+
+
+def model(**changes: object) -> Transcription:
+    dictionary = sr.Dictionary.indicators(np.linspace(0.0, HORIZON, PIECES + 1))
+    problem = sr.OptimalControlProblem(
+        **{
+            "system": sr.LinearSystem(A, B),
+            "horizon": HORIZON,
+            "initial_state": [-1.0, 0.3],
+            "control": sr.Box([-1.0, -1.0], [1.0, 1.0]),
+            "path": [sr.PathConstraint(sr.Box([-0.6, -2.0], [0.7, 2.0]), start=0.4)],
+            "terminal": [sr.Box([-0.4, -0.4], [0.4, 0.4])],
+            "execution": SHARES,
+            **changes,
+        }  # type: ignore[arg-type]
+    )
+    return prepare(problem, dictionary, dictionary)
+
+
+@pytest.fixture(scope="module")
+def execution() -> Execution:
+    found = model().functionals.execution
+    assert found is not None
+    return found
+
+
+def by_sums(c: np.ndarray, time: float, count: int = 6000) -> np.ndarray:
+    """``int |c'e^{A(t-s)} B_j| ds`` over every piece up to ``time``, ``(m, K)``, by the midpoint rule."""
+    values, vectors = np.linalg.eig(A)
+    found = np.zeros((2, PIECES))
+    for k, (begin, end) in enumerate(zip(np.arange(PIECES) / 2, np.arange(1, PIECES + 1) / 2, strict=True)):
+        if begin < time:
+            step = (min(end, time) - begin) / count
+            ages = time - begin - step * (np.arange(count) + 0.5)
+            flows = np.einsum(
+                "i,nij->nj", c, (vectors * np.exp(values * ages[:, None])[:, None]) @ np.linalg.inv(vectors)
+            )
+            found[:, k] = np.abs((flows @ B).real).sum(axis=0) * step
+    return found
+
+
+@pytest.mark.parametrize("time", [0.0, 0.5, 1.23, 3.0])
+def test_what_a_command_adds_is_the_integral_of_an_absolute_value(execution: Execution, time: float) -> None:
+    c = np.array([1.0, -0.4])
+    weights = by_sums(c, time) * SHARES[:, None]
+    at = np.array([time]), c[None]
+    np.testing.assert_allclose(execution.lengths(*at)[0].reshape(2, -1), weights, atol=3e-7)
+    assert execution.added(CONTROL, *at)[0] == pytest.approx((weights * np.abs(CONTROL)).sum(), abs=1e-6)
+    assert execution.added(CONTROL, *at)[0] == pytest.approx(
+        execution.lengths(*at)[0] @ np.abs(CONTROL).ravel(), abs=1e-13
+    )
+    low, high = execution.enclosed(CONTROL, *at)[0]
+    assert low <= execution.added(CONTROL, *at)[0] <= high <= low + 1e-12
+
+
+def test_nothing_is_missing_of_nothing(execution: Execution) -> None:
+    assert execution.added(np.zeros((2, PIECES)), np.array([2.0]), np.ones((1, 2)))[0] == 0.0
+    assert not execution.none().lengths(np.array([2.0]), np.ones((1, 2))).any()
+
+
+def test_its_slope_is_a_difference(execution: Execution) -> None:
+    times, c, h = np.array([0.3, 1.1, 2.6]), np.tile([0.3, 1.0], (3, 1)), 1e-6
+    about = [execution.added(CONTROL, times + sign * h, c) for sign in (1.0, -1.0)]
+    np.testing.assert_allclose(execution.slope(CONTROL, times, c), (about[0] - about[1]) / (2 * h), rtol=1e-5)
+
+
+def constraint(found: Transcription) -> FlatConstraint:
+    assert isinstance(found.constraints[0], FlatConstraint)
+    return found.constraints[0]
+
+
+def test_it_is_nowhere_above_its_chord_by_more_than_is_said_and_hardly_less() -> None:
+    functionals = model().functionals
+    legs, H = functionals.legs(np.zeros(0), np.zeros(0)), np.array([[1.0, -0.4], [0.3, 1.0]])
+    assert functionals.execution is not None
+    support = ExecutionCellSupport(functionals.execution, CONTROL, H, legs[0])
+    share, ratios = np.linspace(0.0, 1.0, 41), []
+    for start, width in [(0.0, 0.5), (0.6, 0.2), (1.0, 0.1), (2.05, 0.4), (2.5, 0.01)]:
+        said = support.deviation(np.array([start]), np.array([width]))[0]
+        for row, bound in zip(H, said, strict=True):
+            path = functionals.execution.added(CONTROL, start + width * share, np.tile(row, (41, 1)))
+            off = (path - (1 - share) * path[0] - share * path[-1]).max()
+            assert off <= bound * (1 + 1e-9)
+            ratios.append(off / bound)
+    assert max(ratios) > 0.5  # an enclosure that is a little smaller would be wrong
+
+
+def test_the_bound_of_a_constraint_holds_on_every_cell_and_closes() -> None:
+    one = constraint(model())
+    x = np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()])
+    lower, upper = one.cells
+    for halvings in range(4):
+        bounds = one.enclosure(x, lower, upper).bounds
+        for low, high, bound in zip(lower[:, 0], upper[:, 0], bounds, strict=True):
+            highest = one.at(x, np.linspace(low, high, 5)[:, None]).max()
+            assert highest <= bound + 1e-12
+            if halvings == 3:
+                assert bound <= highest + 0.02
+        middle = (lower + upper) / 2
+        lower, upper = np.vstack([lower, middle]), np.vstack([middle, upper])
+
+
+def test_rows_at_the_sizes_of_the_control_are_its_worst_case() -> None:
+    one = constraint(model())
+    x = np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()])
+    indices = np.array([[0.4], [0.9], [1.7], [3.0]])
+    G, h = one.rows(indices)
+    np.testing.assert_allclose(G @ x - h, one.at(x, indices), atol=1e-13)
+    assert one.worst(x).violations[0] == pytest.approx(one.at(x, np.linspace(0.4, 3.0, 301)[:, None]).max(), abs=2e-4)
+
+
+@pytest.mark.parametrize("units", [1.0, 1e-3, 1e4])
+def test_a_constraint_is_the_same_in_any_units(units: float) -> None:
+    scaled = model(
+        system=sr.LinearSystem(A, B / units),
+        control=sr.Box([-units, -units], [units, units]),
+    )
+    x = np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()])
+    indices = np.array([[0.9], [3.0]])
+    np.testing.assert_allclose(
+        constraint(scaled).at(x * units, indices), constraint(model()).at(x, indices), atol=1e-12
+    )

@@ -1,0 +1,179 @@
+"""Guards known answers: errors of execution, against independent linear programs and the worst errors themselves; what
+is refused beside them; forgeries."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import linprog
+
+import sparserob_core as sr
+from sparserob_core.experiment.check.check import check
+from tests.known_answers.test_checks import pieces, verified
+from tests.support import tampering
+
+SHARE, PIECES, HORIZON = np.array([0.1, 0.05]), 12, 3.0
+A, B = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.0, 0.4], [1.0, 0.0]])
+PROBLEM: dict[str, Any] = {
+    "name": "linear",
+    "system": {"A": A.tolist(), "B": B.tolist()},
+    "horizon": HORIZON,
+    "initial_state": [-1.0, 0.5],
+    "control": {"box": 1.0},
+    "weights": [1.0, 0.2],
+    "execution": SHARE.tolist(),
+    "path": [{"box": [0.5, None], "from": 1.0}],
+    "terminal": [{"box": [0.2, 0.3]}],
+}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run."""
+    directory = tmp_path_factory.mktemp("execution") / "run"
+    verified(directory, PROBLEM, pieces(PIECES))
+    return directory
+
+
+def independent() -> float:
+    """The cost by a linear program in ``u = a - b``, its rows by sums over fine steps and at many times."""
+    fine = 240
+    step, K = HORIZON / PIECES / fine, PIECES
+    flow = expm(A * step)
+    pushed = np.linalg.solve(A, expm(A * step) - np.eye(2)) @ B
+    back = [np.eye(2)]
+    for _ in range(K * fine):
+        back.append(back[-1] @ flow)
+    powers = np.array(back)
+    G, h = [], []
+    windows = [(np.array([1.0, 0.0]), 0.5, range(K * fine // 3, K * fine + 1))]
+    windows += [(np.array([1.0, 0.0]), 0.2, [K * fine]), (np.array([0.0, 1.0]), 0.3, [K * fine])]
+    for c, bound, times in windows:
+        for n in times:
+            each = np.zeros((2, K * fine))
+            each[:, :n] = (c @ powers[:n] @ pushed)[::-1].T
+            on, off = each.reshape(2, K, fine).sum(axis=2), np.abs(each).reshape(2, K, fine).sum(axis=2)
+            size = SHARE[:, None] * off
+            for sign in (1.0, -1.0):
+                G.append(np.concatenate([(sign * on + size).ravel(), (-sign * on + size).ravel()]))
+                h.append(bound - sign * float(c @ powers[n] @ [-1.0, 0.5]))
+    prices = np.tile(np.repeat([1.0, 0.2], K), 2) * HORIZON / K
+    return float(linprog(prices, A_ub=G, b_ub=h, bounds=(0, 1), method="highs").fun)
+
+
+def test_the_cost_is_that_of_an_independent_linear_program(finished: Path) -> None:
+    assert json.loads((finished / "result.json").read_text())["cost"] == pytest.approx(independent(), rel=2e-6)
+
+
+def test_a_push_that_may_fall_short_is_stronger(tmp_path: Path) -> None:
+    # x' = u, from -1 to at most 0.1 away from 0: the mean of u is at least 0.9 / (1 - 0.05)
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0]], "B": [[1]]},
+        "horizon": 2.0,
+        "initial_state": [-1],
+        "control": {"box": 1.0},
+        "terminal": [{"box": 0.1}],
+        "execution": 0.05,
+    }
+    assert verified(tmp_path / "run", problem, pieces(4))["cost"] == pytest.approx(0.9 / 0.95, rel=1e-9)
+
+
+def test_the_worst_errors_reach_the_walls_and_no_others_pass_them(finished: Path) -> None:
+    control = np.load(finished / "solution.npz")["control"]
+    fine, rng = 200, np.random.default_rng(5)
+    step = HORIZON / PIECES / fine
+    flow, pushed = expm(A * step), np.linalg.solve(A, expm(A * step) - np.eye(2)) @ B
+    command = np.repeat(control, fine, axis=1)
+
+    def highest(errors: np.ndarray) -> np.ndarray:
+        state, seen = np.array([-1.0, 0.5]), []
+        for k in range(command.shape[1]):
+            state = flow @ state + pushed @ (command[:, k] * (1.0 + SHARE * errors[:, k]))
+            seen.append(state)
+        found = np.array(seen)
+        late = np.abs(found[command.shape[1] // 3 :, 0]).max() / 0.5
+        return np.array([late, *np.abs(found[-1]) / [0.2, 0.3]])
+
+    for _ in range(40):
+        errors = np.repeat(rng.uniform(-1, 1, (2, PIECES * 8)), fine // 8, axis=1)
+        assert (highest(np.sign(errors)) <= 1.0 + 1e-9).all()
+    reached = []
+    for axis, worst in ((0, 1), (1, 2)):
+        c = np.eye(2)[axis]
+        rows = np.array([c @ np.linalg.matrix_power(flow, k) @ pushed for k in range(command.shape[1])])
+        reached += [highest(sign * np.sign(rows[::-1].T * command))[worst] for sign in (1.0, -1.0)]
+    assert max(reached) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_more_than_can_be_made_up_for_is_proven_to_be_infeasible(tmp_path: Path) -> None:
+    problem = {**PROBLEM, "execution": 0.9, "initial_state": [-2.0, 0.5], "terminal": [{"box": 0.05}]}
+    out = tmp_path / "run"
+    sr.run({"problem": problem, "dictionaries": {"control": pieces(PIECES)}, "observers": []}, out=out, figures=False)
+    found = check(out)
+    assert found.status == "verified" and "infeasibility" in {claim.name for claim in found.claims}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        tampering.problem(execution=[0.10001, 0.05]),
+        tampering.problem(execution=[0.0999, 0.05]),
+        tampering.problem(execution=[0.1, 0.0501]),
+        tampering.problem(execution=[0.0, 0.0]),
+        tampering.scaled(0.9999),
+        tampering.heaviest(multiplier=1.0),
+    ],
+    ids=["more", "less", "more of another", "none", "control", "multiplier"],
+)
+def test_what_is_changed_afterwards_is_found(change: tampering.Change, finished: Path, tmp_path: Path) -> None:
+    assert check(tampering.forged(finished, tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
+def test_a_control_that_is_refuted_shows_by_how_much(tmp_path: Path) -> None:
+    config = {
+        "problem": PROBLEM,
+        "dictionaries": {"control": pieces(PIECES)},
+        "observers": [],
+        "method": {"name": "nominal"},
+    }
+    outcome = sr.run(config, out=tmp_path / "run", figures=False)
+    assert outcome.result.status == "refuted"
+    assert {one.name: one.verdict for one in check(tmp_path / "run").claims}["violation"] == "holds"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"execution": 1.5}, "numbers from 0 to 1"),
+        ({"execution": [-0.1, 0.1]}, "numbers from 0 to 1"),
+        ({"execution": [0.1, 0.1, 0.1]}, "2"),
+        ({"terminal": [{"equals": [0, 0]}]}, "fixed final values"),
+        ({"system": {"A": [["-t", 1], [0, 0]], "B": B.tolist()}, "path": [], "terminal": []}, "a system in t"),
+        ({"system": {"A": A.tolist(), "B": B.tolist(), "delay": 0.1}}, "a delay"),
+        ({"disturbance": {"box": 0.01}, "disturbance_class": "measurable"}, "measurable"),
+        ({"terminal": [{"norm": {"p": 2, "radius": 0.3}}]}, "curved sets of states"),
+        ({"cost": {"control": {"R": [[1, 0], [0, 1]]}}}, "a cost other than the L1 norm"),
+        ({"cost": {"group": "all"}, "weights": None}, "a cost other than the L1 norm"),
+    ],
+)
+def test_what_is_not_proven_beside_them_is_refused_by_name(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+    config = {"problem": {**PROBLEM, **changes}, "dictionaries": {"control": pieces(4)}, "observers": []}
+    with pytest.raises(sr.InputError, match=rf"problem\.execution.*{said}"):
+        sr.run(config, out=tmp_path / "run", figures=False)
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [{"policy": {"name": "affine"}}, {"method": {"name": "sparsest"}}],
+    ids=["feedback", "sparsest"],
+)
+def test_methods_that_do_not_know_them_refuse(beside: dict[str, Any], tmp_path: Path) -> None:
+    config = {"problem": PROBLEM, "dictionaries": {"control": pieces(4)}, "observers": [], **beside}
+    with pytest.raises(sr.InputError, match=r"execution|sparsest"):
+        sr.run(config, out=tmp_path / "run", figures=False)
