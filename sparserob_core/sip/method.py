@@ -16,7 +16,7 @@ from typing import ClassVar, TypeAlias, final
 import numpy as np
 from pydantic import Field, model_validator
 
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.options import Options
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.maximiser import Maximiser
@@ -138,13 +138,25 @@ class Deadline:
             yield
             return
 
+        rung = False
+
         def ring(number: int, frame: FrameType | None) -> None:
+            nonlocal rung
+            rung = True
             raise OutOfTime(self.reason)
 
         signal.signal(alarm, ring)
         signal.setitimer(signal.ITIMER_REAL, max(0.0, self._ends - time.monotonic()) + GRACE)
         try:
             yield
+        except SparseRobError:
+            raise
+        except Exception as error:
+            # A library in which the alarm rang may tell of an error of its own instead: numpy, which asks Python code
+            # how two records compare, says that they cannot be compared.
+            if rung:
+                raise OutOfTime(self.reason) from error
+            raise
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(alarm, signal.SIG_DFL)

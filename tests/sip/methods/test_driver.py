@@ -3,6 +3,7 @@ imposed; a driver ends with the first result, or with what is known."""
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +15,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble, tools_of
 from sparserob_core.experiment.config.load import load_config
+from sparserob_core.sip import method
 from sparserob_core.sip.method import Deadline, OutOfTime, Tools
 from sparserob_core.sip.methods import driver, exchange
 from sparserob_core.sip.methods.driver import drive
@@ -89,3 +91,29 @@ def test_what_is_known_is_the_answer_where_the_time_is_over(when: str) -> None:
 
     assert drive(deadline, step, stopped) is RESULT
     assert [isinstance(error, OutOfTime) for error in errors] == [when == "before a step"]
+
+
+def test_a_library_that_makes_another_error_of_the_alarm_ends_the_run_like_the_alarm(monkeypatch: Any) -> None:
+    monkeypatch.setattr(method, "GRACE", 0.0)
+
+    def step(number: int) -> Result:
+        try:
+            signal.pause()
+        except OutOfTime:
+            raise TypeError("cannot compare") from None
+        return RESULT
+
+    heard: list[KeyboardInterrupt] = []
+
+    def stopped(error: KeyboardInterrupt) -> Result:
+        heard.append(error)
+        return RESULT
+
+    assert drive(Deadline(0.01), step, stopped) is RESULT
+    assert [type(error) for error in heard] == [OutOfTime] and isinstance(heard[0].__cause__, TypeError)
+
+    def broken(number: int) -> Result:
+        raise TypeError("cannot compare")
+
+    with pytest.raises(TypeError):
+        drive(Deadline(60.0), broken, stopped)
