@@ -183,6 +183,9 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 FORGED = {
     "upper side narrowed": lambda row: row.update(upper=row["upper"] - 3e-6, margin=row["margin"] + 3e-6),
+    "upper side narrowed, and a calm witness": lambda row: row.update(
+        upper=1.2999, margin=2.0 - 1.2999, lower=0.999, deviation=[0.0, 0.0], disturbance=[[0.0], [0.0]]
+    ),
     "lower side narrowed": lambda row: row.update(lower=row["upper"]),
     "witness too early": lambda row: row.update(time=1.0),
     "witness outside its window": lambda row: row.update(time=2.5),
