@@ -17,9 +17,9 @@ from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.integrals import integrating
+from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.varying import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of

@@ -11,8 +11,8 @@ import numpy as np
 
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding

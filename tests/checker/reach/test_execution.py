@@ -1,4 +1,4 @@
-"""Guards checker/reach/execution: errors of execution in the checker: integrals of absolute values, and their bends."""
+"""Guards checker/reach/measurable: errors of execution: integrals of absolute values, and their bends,."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 import sparserob_core as sr
-from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.measurable import Execution
 
 A = np.array([[0.0, 1.0], [-4.0, -0.3]])
 B = np.array([[0.2, 0.0], [1.0, -0.7]])
