@@ -242,3 +242,10 @@ def test_every_public_name_can_be_imported() -> None:
     import sparserob_core
 
     assert not [name for name in sparserob_core.__all__ if getattr(sparserob_core, name) is None]
+
+
+def test_every_decision_has_a_number_of_its_own() -> None:
+    numbers = [page.name[:4] for page in sorted((ROOT / "docs" / "decisions").glob("0*.md"))]
+    assert len(numbers) > 50 and len(set(numbers)) == len(numbers)
+    for page in (ROOT / "docs" / "decisions").glob("0*.md"):
+        assert page.read_text().startswith(f"# {int(page.name[:4])}. "), page.name
