@@ -110,7 +110,7 @@ def test_what_a_series_leaves_out_is_in_the_error(name: str, monkeypatch: pytest
 
 
 def test_entries_that_are_ever_other_than_0_are_links() -> None:
-    # sin(64 pi t / 3) is 0 at all of the times that the size of a system is looked at
+    # sin(64 pi t / 3) is 0 at 65 times that are evenly spaced
     system = VaryingSystem.of([["0*t", "sin(67.02064327658225*t)"], [0, 1]], [[0], ["t"]], 3.0, [[0], ["t - t"]])
     with ctx.workprec(128):
         links = {name: part[0].tolist() for name, part in VaryingFlow(system, 3.0).links.items()}
