@@ -177,3 +177,24 @@ def test_methods_that_do_not_know_them_refuse(beside: dict[str, Any], tmp_path: 
     config = {"problem": PROBLEM, "dictionaries": {"control": pieces(4)}, "observers": [], **beside}
     with pytest.raises(sr.InputError, match=r"execution|sparsest"):
         sr.run(config, out=tmp_path / "run", figures=False)
+
+
+def test_the_tube_of_a_result_holds_every_error_and_no_more() -> None:
+    plant = sr.LinearSystem([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    problem = sr.OptimalControlProblem(
+        system=plant,
+        horizon=2.0,
+        initial_state=[0.3, 0.0],
+        control=sr.Box([-2.0], [2.0]),
+        terminal=[sr.Box([-0.2, -0.2], [0.2, 0.2])],
+        execution=[0.1],
+    )
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
+    assert result.status == "certified"
+    tube, ends = result.tube([1.0, 2.0]), 0.5 * np.arange(5)
+    size = 0.1 * np.abs(result.control.values[0])
+    assert size.any()
+    left = np.clip(np.array([1.0, 2.0])[:, None] - ends, 0.0, None)  # what is left of the time at every breakpoint
+    moved = np.stack([-np.diff(left**2 / 2, axis=1) @ size, -np.diff(left, axis=1) @ size])
+    assert tube.upper - tube.nominal == pytest.approx(moved, abs=1e-12)
+    assert tube.nominal - tube.lower == pytest.approx(moved, abs=1e-12)
