@@ -140,8 +140,9 @@ def test_no_causal_policy_is_better_than_one_that_begins_in_the_middle_of_the_in
         assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
         assert "causal" in {claim.name for claim in found.claims}
         lower[name] = outcome.summary["causal_lower_bound"]
-        assert 0.0 < lower[name] <= outcome.result.lower_bound + 1e-9
-    assert lower["set"] == pytest.approx(lower["one"], rel=0.05)
+        # a search begins at one of the policies that cost as little: how near it comes differs, not what it proves
+        assert 0.9 * outcome.result.lower_bound < lower[name] <= outcome.result.lower_bound + 1e-9
+    assert max(lower.values()) > 0.95 * outcome.result.lower_bound
 
 
 def test_larger_initial_states_than_any_policy_can_take_are_infeasible_with_their_reason(tmp_path: Path) -> None:
