@@ -267,8 +267,28 @@ def _flows(A: Float[Array, "d d"], durations: Float[Array, " *k"]) -> Float[Arra
     return np.asarray(exponential(A * distinct[:, None, None])[which.reshape(durations.shape)])
 
 
+class KnownCellSupport:
+    """A part of the uncertainty on functionals ``rows (r, d)`` of a *known* system, in the form of `Support`."""
+
+    rows: Array
+
+    @shaped
+    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r 0"]:
+        """No parameters, no steepness: ``(k, r, 0)``."""
+        return np.zeros((times.size, self.rows.shape[0], 0))
+
+    def repeated(self, times: Array) -> tuple[Array, Array]:
+        """Every time with every row: ``(k r,)``, ``(k r, d)``."""
+        return np.repeat(times, self.rows.shape[0]), np.tile(self.rows, (times.size, 1))
+
+    def between(self, bounds: Array) -> tuple[Array, Array]:
+        """The middle ``(k, r, 1)`` of bounds ``(k r, 2)``, and how far they are from it, ``(k, r)``."""
+        bounds = bounds.reshape(-1, self.rows.shape[0], 2)
+        return bounds.mean(axis=2)[..., None], (bounds[..., 1] - bounds[..., 0]) / 2 * (1.0 + rounding(4))
+
+
 @dataclass(frozen=True, eq=False)
-class MeasurableCellSupport:
+class MeasurableCellSupport(KnownCellSupport):
     """The support function of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form
     of `DisturbanceSupport`; ``lifted`` is that system.
 
@@ -281,20 +301,14 @@ class MeasurableCellSupport:
     lifted: LiftedSystem
 
     @shaped
-    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r 0"]:
-        """No parameters, no steepness: ``(k, r, 0)``."""
-        return np.zeros((times.size, self.rows.shape[0], 0))
-
-    @shaped
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
         """The support function ``(k, r, 1)`` and how far it may be from that, ``(k, r)``; ``ends (k, r, 0)``."""
-        k, r = times.size, self.rows.shape[0]
         if self.support.is_enclosed:
-            bounds = self.support.enclosed(np.repeat(times, r), np.tile(self.rows, (k, 1))).reshape(k, r, 2)
-            return bounds.mean(axis=2)[..., None], (bounds[..., 1] - bounds[..., 0]) / 2 * (1.0 + rounding(4))
-        sigma = self.support(np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0))).reshape(k, r)
+            return self.between(self.support.enclosed(*self.repeated(times)))
+        k, r = times.size, self.rows.shape[0]
+        sigma = self.support(*self.repeated(times), np.zeros((k * r, 0))).reshape(k, r)
         return sigma[..., None], MISSED * np.abs(sigma)
 
     @shaped
@@ -446,7 +460,7 @@ class Execution:
 
 @final
 @dataclass(frozen=True, eq=False)
-class ExecutionCellSupport:
+class ExecutionCellSupport(KnownCellSupport):
     """What errors of execution of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time, in the
     form of `MeasurableCellSupport`; ``lifted`` is the known system."""
 
@@ -456,19 +470,11 @@ class ExecutionCellSupport:
     lifted: LiftedSystem
 
     @shaped
-    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r 0"]:
-        """No parameters, no steepness: ``(k, r, 0)``."""
-        return np.zeros((times.size, self.rows.shape[0], 0))
-
-    @shaped
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
         """What is added ``(k, r, 1)`` and how far it may be from that, ``(k, r)``; ``ends (k, r, 0)``."""
-        k, r = times.size, self.rows.shape[0]
-        bounds = self.execution.enclosed(self.control, np.repeat(times, r), np.tile(self.rows, (k, 1)))
-        bounds = bounds.reshape(k, r, 2)
-        return bounds.mean(axis=2)[..., None], (bounds[..., 1] - bounds[..., 0]) / 2 * (1.0 + rounding(4))
+        return self.between(self.execution.enclosed(self.control, *self.repeated(times)))
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:

@@ -13,7 +13,6 @@ from sparserob_core.brief import brief
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import (
-    Accumulated,
     MixedConstraint,
     OptimalControlProblem,
     PathConstraint,
@@ -21,8 +20,9 @@ from sparserob_core.control.problem.problem import (
 )
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.response.response import merge_grids
-from sparserob_core.control.sets.sets import Equality, Polytope
+from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
+from sparserob_core.control.transcription.transcribe import prepare, windows_of
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -93,28 +93,23 @@ def rows_of(problem: OptimalControlProblem) -> list[Row]:
     """The rows of the constraints with flat sides, on the path and at the end, integrals being states; of a problem
     that has none the outputs that are measured, each way, and where there are none the states. Fixed final states are
     no rows. Raises `InputError` where all constraints are curved."""
-    path = [one for one in problem.path if not isinstance(one, Return)]
-    own = sum(not isinstance(one, Accumulated) for one in path)
-    ends = [one for one in problem.terminal if not isinstance(one, Equality)]
     found: list[Row] = []
     curved: list[str] = []
 
-    def add(name: str, bound: ConvexSet, start: float, stop: float, moved: object = None) -> None:
-        flat = bound.halfspaces()
-        if flat is None:
+    for name, entry in windows_of(problem):
+        if isinstance(entry, Return):
+            continue
+        sides, moved = entry.set.halfspaces(), entry.relative_to if isinstance(entry, PathConstraint) else None
+        if sides is None:
             curved.append(name)
-            return
+            continue
         reference = None if moved is None else np.asarray(moved, dtype=float)
-        for direction, wall in zip(*flat, strict=True):
-            if np.isfinite(wall):
-                found.append(Row(name, direction, float(wall), start, stop, reference))
-
-    for i, entry in enumerate(path):
-        assert isinstance(entry, PathConstraint | MixedConstraint) and entry.stop is not None
-        moved = entry.relative_to if isinstance(entry, PathConstraint) else None
-        add(entry.name or (f"path[{i}]" if own > 1 else "path"), entry.set, entry.start, entry.stop, moved)
-    for i, end in enumerate(ends):
-        add(f"terminal[{i}]" if len(ends) > 1 else "terminal", end, problem.horizon, problem.horizon)
+        stop = problem.horizon if entry.stop is None else entry.stop
+        found += [
+            Row(name, direction, float(wall), entry.start, stop, reference)
+            for direction, wall in zip(*sides, strict=True)
+            if np.isfinite(wall)
+        ]
     if found:
         return found
     if curved:
@@ -287,8 +282,6 @@ def _of_program(
     deadline: Deadline | None,
 ) -> BoundedRow:
     """By the enclosures of the program that the row alone would make, whose wall is 0."""
-    from sparserob_core.control.transcription.transcribe import prepare
-
     d = problem.system.states
     path: list[PathConstraint | MixedConstraint] = []
     end: list[ConvexSet] = []

@@ -452,19 +452,11 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
 def _state_constraints(
     problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex
 ) -> tuple[StateConstraint, ...]:
-    """The path and terminal constraints, named as the families of the program; equalities are not among them."""
-    end = problem.horizon
-    path = [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
-    ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
-    windows: list[tuple[str, PathConstraint | MixedConstraint]] = [
-        (name, entry) for name, entry in zip(path_names(problem), path, strict=True)
-    ]
-    windows += [
-        (_name("terminal", i, len(ends)), PathConstraint(terminal, end, end)) for i, terminal in enumerate(ends)
-    ]
+    """The path and terminal constraints as they stand in the program; equalities are not among them."""
     found: list[StateConstraint] = []
-    for name, entry in windows:
-        stop, sides = end if entry.stop is None else entry.stop, entry.set.halfspaces()
+    for name, entry in windows_of(problem):
+        stop = problem.horizon if entry.stop is None else entry.stop
+        sides = entry.set.halfspaces()
         if isinstance(entry, MixedConstraint):
             found.append(FlatConstraint.twofold(name, functionals, entry, stop, parameters))
             continue
@@ -477,6 +469,14 @@ def _state_constraints(
         elif sides[1].size:
             found.append(FlatConstraint(name, functionals, *sides, entry.start, stop, parameters, reference=moved))
     return tuple(found)
+
+
+def windows_of(problem: OptimalControlProblem) -> list[tuple[str, PathConstraint | MixedConstraint]]:
+    """The path and terminal constraints with the names of their families; a terminal one has the window of one time."""
+    end, path = problem.horizon, [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
+    ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
+    finals = [(_name("terminal", i, len(ends)), PathConstraint(one, end, end)) for i, one in enumerate(ends)]
+    return [*zip(path_names(problem), path, strict=True), *finals]
 
 
 def path_names(problem: OptimalControlProblem) -> list[str]:

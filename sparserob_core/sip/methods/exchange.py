@@ -71,16 +71,14 @@ class Exchange(Method, Options):
 
     def _init(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover, start: Violated) -> Rounds:
         close = self.model_copy(update={"exact": True}).close
+        regulariser = tools.regulariser if program.spread is None else None
+        relaxed = RelaxedProgram(program, tools.solver, regulariser, deadline=tools.deadline)
+        ledger = Ledger(program, relaxed, tools, self.tolerance)
         if program.spread is None:
-            relaxed = RelaxedProgram(program, tools.solver, tools.regulariser, deadline=tools.deadline)
-            ledger = Ledger(program, relaxed, tools, self.tolerance)
             working: Working = PlainRows.start(program, tools, self.exact, close)
         else:
             from sparserob_core.sip.working.robust import RobustRows
 
-            ledger = Ledger(
-                program, RelaxedProgram(program, tools.solver, deadline=tools.deadline), tools, self.tolerance
-            )
             working = RobustRows.start(program, ledger, close)
         working.impose(start)
         return Rounds(self, ledger, working, prover)
