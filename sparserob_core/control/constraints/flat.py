@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -27,13 +27,15 @@ from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, en
 from sparserob_core.control.response.functional import LEGS_KEPT, Leg, WorstCase
 from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.lifted import LiftedSystem
-from sparserob_core.control.response.measurable import Execution, ExecutionCellSupport
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Direct, Moving, Reference
 from sparserob_core.control.response.response import LONG, Outputs, Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
+
+if TYPE_CHECKING:
+    from sparserob_core.control.response.measurable import Execution
 
 SURE = 1e-8  # a vertex that is predicted to this accuracy is one
 NEARER, LOOKS = 8, 4  # an unsure vertex is predicted from samples so many times nearer, and so often
@@ -379,8 +381,8 @@ class FlatConstraint(StateConstraint):
             if self.functionals.execution is not None:  # of a known system, which has one leg
                 (leg,) = legs
                 assert isinstance(leg, LiftedSystem)
-                mine = ExecutionCellSupport(self.functionals.execution, control, H, leg)
-                known = [Supports((*(() if known[0] is None else known[0].parts), mine))]
+                errors = self.functionals.execution.over(control, H, leg)
+                known = [Supports((*(() if known[0] is None else known[0].parts), errors))]
             supports = iter(known)
             made = over_legs(
                 legs,

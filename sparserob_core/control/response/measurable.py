@@ -360,6 +360,10 @@ class Execution:
     breakpoints: Array
     shares: Array
 
+    def over(self, control: Array, rows: Array, lifted: LiftedSystem) -> ExecutionCellSupport:
+        """What the worst errors of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time."""
+        return ExecutionCellSupport(self, control, rows, lifted)
+
     def none(self) -> Execution:
         """The same of a control that is delivered as it is commanded."""
         return replace(self, shares=np.zeros(self.shares.size))
