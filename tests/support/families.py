@@ -1,6 +1,7 @@
 """Families of every kind that problems make: flat, moving, mixed and curved path sets, terminal sets, steps and the
-control's own set, of known and of uncertain systems, under disturbances that jump or are measurable, with and without a
-control that answers what it measures."""
+control's own set, of known and of uncertain systems and of those that change with time, with integrals, under
+disturbances that jump or are measurable and errors of execution, with and without a control that answers what it
+measures."""
 
 from __future__ import annotations
 
@@ -9,8 +10,13 @@ from functools import cache
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.problem import (
+    IntegralConstraint,
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+)
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.plants import uniform
@@ -49,6 +55,20 @@ def problem(kind):
             SwitchedSystem([(0.9, first), (HORIZON, second)]),
             Box([-0.05, -0.02], [0.05, 0.02]),
         )
+    if kind == "varying":
+        path, terminal = [*FLAT, CURVED[0]], terminal[:1]
+        system = VaryingSystem.of(
+            [[0, 1], ["-(2 - 0.5*cos(3*t))", "-0.3"]], [[0], ["1/(3 - t)"]], HORIZON, [[0.3], ["1 + t"]]
+        )
+        more["initial_set"] = Box([-0.05, -0.02], [0.05, 0.02])
+    if kind == "execution":
+        path, terminal = FLAT, terminal[:1]
+        more |= {"execution": [0.05], "control_step": Box([-0.4], [0.4])}
+    if kind.endswith("integrals"):
+        more["integral"] = [
+            IntegralConstraint(H=[[1.0, 0.3]], G=[[0.5]], lower=-0.4, upper=0.7, start=0.3, stop=1.7),
+            IntegralConstraint(G=[[1.0]], upper=0.9),
+        ]
     if kind.endswith("measurable"):
         path, terminal = FLAT, terminal[:1]
         more["disturbance_class"] = "measurable"
@@ -66,7 +86,8 @@ def problem(kind):
     ), policy
 
 
-KINDS = ("known", "parametric", "taking turns", "measurable", "feedback", "feedback, measurable")
+FIRST = ("known", "parametric", "taking turns", "measurable", "feedback", "feedback, measurable")
+KINDS = (*FIRST, "varying", "execution", "integrals", "feedback, integrals")
 
 
 @cache

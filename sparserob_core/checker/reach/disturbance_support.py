@@ -175,7 +175,7 @@ class DisturbanceSupports:
         ``sharp``: less of it where the set is round, which takes longer."""
         assert self.scene.disturbance is not None
         shape = known(self.scene.disturbance)
-        if self.before is None and (not sharp or shape.round is None):
+        if not sharp or shape.round is None:
             found = self._of_equal_pieces(shape, start, ticks, z)
             if found is not None:
                 return found

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from sparserob_core.errors import InputError
-from tests.support.families import KINDS, program
+from tests.support.families import FIRST, KINDS, program
+
+STAGED = [kind if kind in FIRST else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
 
 
 def drawn(family, rng, share, count=8):
@@ -27,7 +29,7 @@ def highest(family, x, low, high, rng, count=40):
     return family.violations(x, indices).reshape(len(low), count, -1).max(axis=(1, 2))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", STAGED)
 def test_no_cell_is_bounded_below_what_is_met_in_it_and_narrow_ones_hardly_above(kind):
     rng, made = np.random.default_rng(2), program(kind)
     for family in made.families:
@@ -47,7 +49,7 @@ def test_no_cell_is_bounded_below_what_is_met_in_it_and_narrow_ones_hardly_above
                 assert (found.bounds - top)[inside].max(initial=0.0) <= 1e-2, (kind, family.name)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", STAGED)
 def test_a_separation_is_no_less_than_what_samples_meet_and_is_met_where_it_says(kind):
     rng, made = np.random.default_rng(3), program(kind)
     for family in made.families:
@@ -64,7 +66,7 @@ def test_a_separation_is_no_less_than_what_samples_meet_and_is_met_where_it_says
         assert real[np.arange(len(real)), found.rows[few]] == pytest.approx(found.violations[few], abs=1e-9)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.startswith("feedback")])
+@pytest.mark.parametrize("kind", [kind for kind in FIRST if kind.startswith("feedback")])
 def test_rows_for_every_deviation_are_violated_by_what_the_family_says(kind):
     rng, made = np.random.default_rng(4), program(kind)
     for family in made.families:

@@ -63,7 +63,7 @@ def test_five_billionths_too_much_are_never_proven_and_a_little_room_is(kind):
     for family in made.families:
         x, most = rng.normal(size=made.n), -1.0
         while most <= 0.0:  # below 0 the scale of a row of directions is its own affair
-            x = 1.5 * x
+            x = -1.5 * x  # of a bound on one side, to that side
             most = met(family, x, rng)
         proof = prove_family(moved(family, SMALL - most), x, cells=1500)
         assert proof.verdict != "proven", (kind, family.name, proof)
