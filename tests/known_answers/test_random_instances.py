@@ -2,8 +2,8 @@
 delay and two modes, in any units, against programs that share no code with the package (tests/support/instances.py);
 and `check` of every fifth run.
 
-The instances are those of fixed numbers. ``SPARSEROB_INSTANCES`` is how many the second stage takes (300 unless given),
-``SPARSEROB_FIRST_INSTANCE`` the number of the first.
+The instances are those of fixed numbers, 300 in all, of which the second stage takes a share (tests/support/draws.py);
+``SPARSEROB_FIRST_INSTANCE`` is the number of the first.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from tests.support.draws import taken
 from tests.support.instances import TOGETHER, config, instance, largest_violation, truth
 
 QUICK = 2
-COUNT = int(os.environ.get("SPARSEROB_INSTANCES", "300"))
+COUNT = taken(300)
 FIRST = int(os.environ.get("SPARSEROB_FIRST_INSTANCE", "300000"))
 ALL_AT_ONCE = range(TOGETHER, TOGETHER + COUNT // 10)
 # problems whose honest runs `check` once refused, or did not check: taken whatever the numbers are
