@@ -54,7 +54,8 @@ FILES = {
     "solution.npz": (
         "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`,"
         " `families`, `formulations`, `multipliers`; under feedback the same of the constraints that prove the lower"
-        " bound, each at its deviation, as `bound_indices`, ..., and `bound_equalities`"
+        " bound, each at its deviation, as `bound_indices`, ..., and `bound_equalities`; with fixed final values these"
+        " also of a control that answers nothing"
     ),
     "evaluations.npz": (
         "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound,"
@@ -67,7 +68,7 @@ FILES = {
     ),
     "adversary.npz": "per constraint its worst time, parameter, disturbance and the states that these cause",
     "simulation-LAW.json": "written by `sparserob simulate`: how often trajectories under a law break each constraint",
-    "figures/": "`control`, `states`, `plane` (where `names.plane` says one), `convergence`, `adversary`, each as PDF"
+    "figures/": "`control`, `switching` (why it acts), `states`, `plane` (where `names.plane` says one), `convergence`, `adversary`, each as PDF"
     " and PNG; `clash` when infeasible; of a"
     " search `climb` and `landscape`; an extra: where they cannot be drawn a line says so, and the status of the run"
     " stays as it is",

@@ -164,4 +164,5 @@ from sparserob_core.experiment.run.landscape import deciding_pair as deciding_pa
 from sparserob_core.experiment.run.landscape import deciding_slots as deciding_slots
 from sparserob_core.experiment.figures.figure_data import FigureData as FigureData
 from sparserob_core.experiment.figures.figure_data import Wall as Wall
+from sparserob_core.experiment.figures.switching import Switching as Switching
 from sparserob_core.experiment.figures.clash import Strip as Strip

@@ -198,3 +198,60 @@ def test_the_tube_of_a_result_holds_every_error_and_no_more() -> None:
     moved = np.stack([-np.diff(left**2 / 2, axis=1) @ size, -np.diff(left, axis=1) @ size])
     assert tube.upper - tube.nominal == pytest.approx(moved, abs=1e-12)
     assert tube.nominal - tube.lower == pytest.approx(moved, abs=1e-12)
+
+
+STRAIGHT: dict[str, Any] = {  # x' = u: what is delivered must be from 0.9 to 1.1, so that a share of 0.1 is the largest
+    "name": "linear",
+    "system": {"A": [[0]], "B": [[1]]},
+    "horizon": 2.0,
+    "initial_state": [-1],
+    "control": {"box": 1.0},
+    "terminal": [{"box": 0.1}],
+    "execution": 0.05,
+}
+
+
+def test_the_largest_share_that_a_plan_survives_is_found() -> None:
+    config = {"problem": STRAIGHT, "dictionaries": {"control": pieces(4)}, "observers": []}
+    found = sr.margin(config, "execution", tolerance=1e-4)
+    assert found.status == "certified"
+    assert found.lower <= 2.0 <= found.upper <= found.lower + 2e-4
+    assert found.amounts == pytest.approx((0.1, 0.1), rel=1e-4)
+
+
+@pytest.mark.parametrize("none", [0.0, None])
+def test_a_share_that_is_not_there_cannot_be_varied(none: float | None) -> None:
+    config = {"problem": {**STRAIGHT, "execution": none}, "dictionaries": {"control": pieces(4)}, "observers": []}
+    with pytest.raises(sr.InputError, match="the problem has no execution"):
+        sr.margin(config, "execution")
+
+
+@pytest.mark.parametrize("law", ["iid", "vertices", "slow", "neighbours"])
+def test_draws_deliver_something_else_than_the_command_and_never_more_than_the_share(law: str, tmp_path: Path) -> None:
+    config = {"problem": STRAIGHT, "dictionaries": {"control": pieces(4)}, "observers": []}
+    sr.run(config, out=tmp_path / "run", figures=False)
+    effort = 0.5 * np.abs(np.load(tmp_path / "run" / "solution.npz")["control"]).sum()
+    found = sr.simulate(tmp_path / "run", 200, law)
+    ends = np.array([found.lower[0, -1], found.upper[0, -1]])
+    assert ends[0] < effort - 1.0 < ends[1] or law == "neighbours"
+    assert np.ptp(ends) > 0.0 and (np.abs(ends - (effort - 1.0)) <= 0.05 * effort + 1e-12).all()
+    assert not found.constraints[0].violated
+
+
+def test_the_worst_errors_are_replayed_and_a_plan_that_does_not_know_them_fails(tmp_path: Path) -> None:
+    config = {"problem": STRAIGHT, "dictionaries": {"control": pieces(4)}, "observers": []}
+    sr.run(config, out=tmp_path / "run", figures=False)
+    (row,) = sr.simulate(tmp_path / "run", law="adversary").constraints
+    assert row.largest == pytest.approx(row.worst, abs=1e-12)
+    plain = {**config, "method": {"name": "nominal"}}
+    sr.run(plain, out=tmp_path / "plain", figures=False)
+    assert sr.simulate(tmp_path / "plain", 100, "vertices").constraints[0].violated > 20
+
+
+def test_the_push_counts_what_errors_do_in_the_rows_as_a_price(tmp_path: Path) -> None:
+    config = {"problem": STRAIGHT, "dictionaries": {"control": pieces(4)}, "observers": []}
+    outcome = sr.run(config, out=tmp_path / "run", figures=False)
+    view = sr.Inspection.read(tmp_path / "run")
+    push = sr.Switching(view.program, view.row).push(outcome.result.dual.cuts, outcome.result.dual.mu)
+    # of a command 0.95 arrive for sure, at the multiplier 1 / 0.95: what pushes is 1 / 0.95, the price 1 + 0.05 / 0.95
+    assert push is not None and push == pytest.approx(np.ones((1, 4)), abs=1e-6)

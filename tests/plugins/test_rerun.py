@@ -196,11 +196,9 @@ def test_the_signals_are_the_control_and_the_tube_of_the_figures(exchanged: sr.O
 
 
 def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_the_band(exchanged: sr.Outcome) -> None:
-    from sparserob_rerun.physics.switching import Switching
-
     view = sr.Inspection.read(exchanged.directory)
     assert exchanged.control is not None
-    push = Switching(view).push(exchanged.result.indices, None)
+    push = sr.Switching(view.program, view.row).push(exchanged.result.indices, None)
     _acts_beyond(push, exchanged.control)
 
 
@@ -215,10 +213,9 @@ def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_t
 def test_of_policies_and_scenarios_too_the_push_says_why_the_control_switches(
     config: str, changes: dict[str, object]
 ) -> None:
-    from sparserob_rerun.physics.switching import Switching
-
     outcome = sr.run(CONFIGS / config, changes, None, quiet=True, figures=False)
-    switching = Switching(inspection(config, changes))
+    view = inspection(config, changes)
+    switching = sr.Switching(view.program, view.row)
     cuts = outcome.result.dual.cuts if outcome.program.spread is not None else outcome.result.indices
     assert outcome.result.decision is not None
     _acts_beyond(switching.push(cuts, None), outcome.result.decision[: switching.pieces].reshape(1, -1))

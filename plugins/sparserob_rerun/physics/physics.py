@@ -12,7 +12,6 @@ from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.physics.pages import pages
-from sparserob_rerun.physics.switching import Switching
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,7 +32,7 @@ class Physics:
 
     def __init__(self, rr: Any, stream: Any, view: sr.Inspection) -> None:
         self.rr, self.stream, self.view = rr, stream, view
-        self.switching = Switching(view)
+        self.switching = sr.Switching(view.program, view.row)
         assert view.problem is not None
         self.problem = view.problem
 

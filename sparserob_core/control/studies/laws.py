@@ -14,6 +14,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.studies.simulate import worst_errors
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 LawName: TypeAlias = Literal["iid", "vertices", "slow", "neighbours"]
@@ -50,6 +51,28 @@ class Uncertainty:
         # slow is a law of signals; a state that is there at once is drawn as those of `iid`
         points = _extreme if law == "vertices" else _uniform
         return disturbances, parameters, self.functionals.response.initial_state + points(bound, count, rng)
+
+    def errors(self, law: LawName, count: int, command: Array, rng: np.random.Generator) -> Array | None:
+        """``count`` errors ``(L, m, count)`` of what is delivered of a ``command (m + constants, L)``, as shares of it on
+        the pieces of the merged grid; ``None`` where it is delivered as it is commanded. Neighbours are the worst errors
+        of some functional, of the other sign on a few pieces."""
+        execution = self.functionals.execution
+        if execution is None or not execution.shares.any():
+            return None
+        pieces, m = command.shape[1], execution.shares.size
+        if law == "neighbours":
+            base = rng.integers(0, self._bases[2].shape[0], size=count)
+            found = worst_errors(self.functionals.response, execution, command, self._bases)[:, :, base]
+            return np.asarray(found * np.where(rng.uniform(size=found.shape) < FLIPPED / pieces, -1.0, 1.0))
+        if law == "slow":
+            breaks = self.functionals.response.grid.breakpoints
+            hats = _hats((breaks[:-1] + breaks[1:]) / (2 * breaks[-1]), KNOTS)
+            shares = np.einsum("lk,kmn->lmn", hats, rng.choice([-1.0, 1.0], size=(KNOTS, m, count)))
+        elif law == "vertices":
+            shares = rng.choice([-1.0, 1.0], size=(pieces, m, count))
+        else:
+            shares = rng.uniform(-1.0, 1.0, size=(pieces, m, count))
+        return np.asarray(execution.shares[:, None] * shares)
 
     def _drawn(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
         """Disturbances and parameters of `draw`."""

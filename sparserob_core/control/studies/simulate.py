@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response, TimeGrid, distinct_times
 from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from sparserob_core.control.response.measurable import Execution
 
 MANY = 10_000  # pieces, from which no times inside are looked at where the system hardly moves on one
 HELD = 2_000_000  # numbers of signals, or of transition matrices, that are held at once
@@ -107,6 +111,25 @@ def _walk_varying(
             drive = drive + E @ disturbances[:, :, grid.disturbance_piece[piece]].T
         state = steps.Phi[0, piece] @ state + steps.Gamma[0, piece] @ drive
         yield state
+
+
+def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:
+    """What `walk` drives a system with where a ``command (m + constants, L)`` is missed by ``errors (L, m, n)``, as
+    shares of it, in ``n`` trajectories."""
+
+    def acting(piece: int, state: Array) -> Array:
+        now = np.repeat(command[:, piece, None], state.shape[1], axis=1)
+        now[: errors.shape[1]] *= 1.0 + errors[piece]
+        return now
+
+    return acting
+
+
+def worst_errors(response: Response, execution: Execution, command: Array, at: tuple[Array, Array, Array]) -> Array:
+    """The errors ``(L, m, k)``, constant on the pieces of a response, that raise functionals ``c'x(t)`` the most, ``at``
+    times ``(k,)``, directions ``(k, d)`` and parameters, of a ``command (m + constants, L)`` as shares of it."""
+    weights = response.weights(*at).control[:, :, : execution.shares.size].transpose(1, 2, 0)
+    return np.asarray(execution.shares[:, None] * np.sign(weights * command[: execution.shares.size].T[:, :, None]))
 
 
 def trajectories_at_once(response: Response, uncertain: bool) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
-from sparserob_core.control.studies.simulate import fine_times, finer, walk
+from sparserob_core.control.studies.simulate import delivered, fine_times, finer, walk, worst_errors
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
@@ -65,6 +65,15 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
     noises = arrays["noises"].transpose(1, 2, 0) if "noises" in arrays else None
     acting, begun = controlled(model, theta, grid.control_piece, noises), arrays["initial_states"]
+    execution = model.functionals.execution
+    if execution is not None and not callable(acting):
+        inner = finer(grid, times)  # an error changes its sign within a piece
+        command = acting[:, inner.control_piece]
+        held = Response(response.system, inner, response.initial_state)
+        fine = Response(response.system, finer(inner, times), response.initial_state)
+        at = (arrays["times"], arrays["directions"], arrays["parameters"])
+        acting = delivered(command, worst_errors(held, execution, command, at))
+        disturbances = None if disturbances is None else disturbances[:, :, inner.disturbance_piece]
     states = np.stack(list(walk(fine, acting, arrays["parameters"], disturbances, begun)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))
 

@@ -137,7 +137,8 @@ def arrays_of(
     ``families``, ``formulations`` (what its index says) and ``multipliers``; ``worst_disturbance (mw, pieces)`` where
     the worst constraint has one; under feedback the ``answers``: ``gains (K, K, m, p)``, and of outputs the
     ``observer (K, d, p)``, and as ``bound_indices``, ``bound_rows``, ... the constraints that prove the lower bound,
-    each at the deviation behind its index, and as ``bound_equalities`` the multipliers of the equalities."""
+    each at the deviation behind its index, and as ``bound_equalities`` the multipliers of the equalities; where there
+    are equalities these too of a control that answers nothing."""
     told = _told(result.indices)
     count, width = told["indices"].shape
     arrays = {
@@ -145,7 +146,7 @@ def arrays_of(
         "times": told["indices"][:, 0] if dictionary is not None and width else np.full(count, np.nan),
         **told,
     }
-    if answers:
+    if answers or result.dual.mu.size:
         proving = {**_told(result.dual.cuts), "equalities": result.dual.mu}
         arrays |= {f"{BOUND}{name}": column for name, column in proving.items()}
     if dictionary is not None:

@@ -45,16 +45,19 @@ def draw_experiment(
     cost: float | None,
     worst: Mapping[str, Array],
     status: str,
+    push: Array | None = None,
 ) -> list[Path]:
     """Draw the figures of a decision (``theta (m, N)``, or whole) into ``directory/figures``; raises `InputError` when
     there is nothing to draw. Where the ``status`` claims no proof, their titles say so.
 
-    ``worst``: the arrays of `adversaries`, empty when there is no constraint to be driven against.
+    ``worst``: the arrays of `adversaries`, empty when there is no constraint to be driven against. ``push``: the
+    switching function, where it is known.
     """
     from sparserob_core.experiment.figures.adversary_figure import write_adversary
     from sparserob_core.experiment.figures.run_figures import write_figures
 
     data = figure_data(experiment, theta, active_times, history, cost, draws=DRAWS, status=status)
+    data = replace(data, push=push)
     files = write_figures(directory / "figures", data)
     if worst:
         files += write_adversary(directory / "figures" / "adversary", worst, data)

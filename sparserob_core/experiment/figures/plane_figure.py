@@ -22,6 +22,9 @@ MARGIN = (
 SLIM = 0.25  # of the larger side, the smaller one at least: of a tenth nothing is seen, at 1 all is a square
 NEAR = 0.3  # of the larger side: a wall that is nearer to the path is within the view; of all walls one sees no path
 PALE = "#BEE1F6"  # SKY at 45 % on white
+POINT = 0.01  # of the larger side: a smaller goal is drawn as a mark; at a tenth boxes that one sees become marks
+IDLE = 1e-7  # of the largest control: less than that is no action but rounding
+BESIDE = 0.08  # of the width: a mark nearer to an earlier one has its time below; of a tenth of it both are one blot
 MARKS = 4  # parts of the horizon whose ends are marked
 
 
@@ -41,7 +44,7 @@ def draw_plane(data: FigureData) -> Figure:
     ax = figure.subplots()
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-    colour = iter((look.GREEN, look.ORANGE, look.PURPLE, look.INK))
+    colour = iter((look.GREEN, look.PURPLE, look.INK))
     whole = [limit for limit in plane.limits if limit.is_wall]
     _hatched(ax, frame, whole)
     for limit in plane.limits:
@@ -49,14 +52,20 @@ def draw_plane(data: FigureData) -> Figure:
             allowed = clipped(frame, limit.normals, limit.bounds[-1])
             goal = Polygon(allowed, fill=False, edgecolor=look.VERMILLION, linewidth=2.0, zorder=4)
             goal.set_label("terminal set")
-            ax.add_patch(goal)
+            if len(allowed) and np.ptp(allowed, axis=0).max() <= POINT * sides.max():
+                ax.plot(*allowed.mean(axis=0), "s", color=look.VERMILLION, fillstyle="none", markeredgewidth=2.0,
+                        markersize=9, zorder=4, label="terminal set")  # fmt: skip
+            else:
+                ax.add_patch(goal)
         elif not limit.is_wall:
             _gate(ax, data, limit, path, frame, next(colour, look.INK))
-    if np.ptp(places, axis=1).max() > 0.0:
+    pair = list(plane.states)
+    if (data.tube_upper[pair] > data.tube_lower[pair]).any():
         said = "worst case" if data.gains is None else "worst case, with feedback"
         for number, place in enumerate(places):  # they overlap: one opaque colour, that of the tube of a state
             ax.fill(*place.T, color=PALE, linewidth=0.4, zorder=2, label="" if number else said)
     ax.plot(*path.T, color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
+    _arcs(ax, data, path)
     _marks(ax, data, path)
     ax.set_xlabel(data.state_label(plane.states[0]))
     ax.set_ylabel(data.state_label(plane.states[1]))
@@ -145,6 +154,21 @@ def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, frame: Array, c
         ax.plot(*beside.T, color=colour, linewidth=1.1, zorder=1.5)
 
 
+def _arcs(ax: Axes, data: FigureData, path: Array) -> None:
+    """The parts of the path on which the control acts, where there are others."""
+    size = np.abs(data.control)
+    acts = (size > IDLE * np.maximum(size.max(axis=1, initial=0.0), np.finfo(float).tiny)[:, None]).any(axis=0)
+    if acts.all() or not acts.any():
+        return
+    turns = np.diff(np.concatenate([[False], acts, [False]]).astype(int))
+    burns = zip(data.breakpoints[np.flatnonzero(turns > 0)], data.breakpoints[np.flatnonzero(turns < 0)], strict=True)
+    for number, (begin, end) in enumerate(burns):
+        times = np.unique(np.concatenate([[begin, end], data.times[(data.times > begin) & (data.times < end)]]))
+        arc = [np.interp(times, data.times, coordinate) for coordinate in path.T]
+        ax.plot(*arc, color=look.ORANGE, linewidth=4.0, zorder=3.5, solid_capstyle="round",
+                label="" if number else "the control acts")  # fmt: skip
+
+
 def _marks(ax: Axes, data: FigureData, path: Array) -> None:
     """Times along the path, and those of the active constraints."""
     from matplotlib.patheffects import withStroke
@@ -153,11 +177,13 @@ def _marks(ax: Axes, data: FigureData, path: Array) -> None:
     marked = np.stack([np.interp(at, data.times, coordinate) for coordinate in path.T], axis=1)
     ax.plot(*marked.T, "o", color="white", markeredgecolor=look.BLUE, markersize=4.5, zorder=5)
     unit = f" {plain(data.names.time)}" if data.names.time else ""
-    for time, place in zip(at, marked, strict=True):
+    near = BESIDE * (ax.get_xlim()[1] - ax.get_xlim()[0])
+    for number, (time, place) in enumerate(zip(at, marked, strict=True)):
+        crowded = (np.abs(marked[:number] - place).max(axis=1) < near).any()
         ax.annotate(
             f"{time:.4g}{unit}",
             place,
-            xytext=(5, 5),
+            xytext=(5, -13) if crowded else (5, 5),
             textcoords="offset points",
             fontsize=8.5,
             color=look.GREY,

@@ -22,12 +22,16 @@ if TYPE_CHECKING:
     from sparserob_core.sip.convex_set import Array
 
 MOST_GAINS = 16  # pictures of gains in one figure
+FLAT = (
+    1.5  # prices, half the height of a picture of the push at least: at 15 the band is a line, at 1 it hides its edge
+)
+HEADROOM = 1.15  # of the largest push, above it: at 1 it is on the frame, at 10 the band is a line
 IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
 
 
 def write_figures(directory: Path, data: FigureData) -> list[Path]:
-    """Draw ``control``, ``states``, ``plane`` where the system moves in one, under feedback ``outputs`` where these are
-    measured, ``gains``, ``effort`` and ``answers``, and when there is a history ``convergence`` into ``directory``,
+    """Draw ``control``, where that is known ``switching``, ``states``, ``plane`` where the system moves in one, under
+    feedback ``outputs`` where these are measured, ``gains``, ``effort`` and ``answers``, and when there is a history ``convergence`` into ``directory``,
     each as PDF and PNG.
 
     Returns the files. Raises `InputError` when matplotlib is missing.
@@ -41,6 +45,7 @@ def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
     """The figures that there are of a decision, by name."""
     known: dict[str, tuple[bool, Callable[[FigureData], Figure]]] = {
         "control": (True, draw_control),
+        "switching": (data.push is not None and bool(data.push.any()), draw_switching),
         "states": (True, draw_states),
         "plane": (data.plane is not None, draw_plane),
         "outputs": (data.outputs is not None, draw_outputs),
@@ -79,6 +84,34 @@ def draw_control(data: FigureData) -> Figure:
         ax.set_ylabel(data.control_label(channel))
     draw_time_axis(axes[-1], data)
     _title(axes[0], data.title, _summary(data))
+    draw_legend(figure, axes)
+    return figure
+
+
+def draw_switching(data: FigureData) -> Figure:
+    """How hard the constraints push every channel, in units of what it costs to act there: the control acts where that
+    leaves the band, and nowhere else."""
+    assert data.push is not None
+    figure, axes = panels(len(data.push), 1.9, extra=0.5)
+    ends, edge = data.breakpoints, np.ones(data.breakpoints.size - 1)
+    for channel, ax in enumerate(axes):
+        push, reach = data.push[channel], max(FLAT, HEADROOM * float(np.abs(data.push[channel]).max()))
+        bound = max(abs(float(data.control_lower[channel])), abs(float(data.control_upper[channel])))
+        size = np.abs(data.control[channel])
+        acts = size > IDLE * (bound if np.isfinite(bound) else float(size.max()))
+        ax.stairs(np.where(acts, 2 * reach, 0.0) - reach, ends, baseline=-reach, fill=True, color=look.SKY, alpha=0.35,
+                  linewidth=0, zorder=0, label="acts")  # fmt: skip
+        ax.axhspan(-1.0, 1.0, color=look.MIST, alpha=0.6, linewidth=0, zorder=0.5, label="not worth its price")
+        for side in (1.0, -1.0):
+            ax.stairs(side * edge, ends, baseline=None, color=look.GREY, linewidth=0.8, zorder=1)
+        ax.stairs(
+            push, ends, baseline=None, color=look.PURPLE, linewidth=1.5, zorder=3, label="push of the constraints"
+        )
+        _rug(ax, data.active_times)
+        ax.set_ylim(-reach, reach)
+        ax.set_ylabel(f"push on {data.names.control(channel)}")
+    draw_time_axis(axes[-1], data)
+    _title(axes[0], data.title, "1 is what it costs to act: the control acts where the push leaves the band")
     draw_legend(figure, axes)
     return figure
 

@@ -48,9 +48,9 @@ def margin(
     """The margin of an experiment: what ``sparserob margin CONFIG key=value ... --of OF`` does, of a config, a
     problem, or a run (`as_config`).
 
-    ``of``: ``disturbance``, ``parameters`` or ``initial_state`` (the largest factor that is feasible; sets are scaled
-    about their centre), ``path.0``, ``terminal.0`` or ``control`` (the smallest), ``path.0.from`` (the earliest start
-    of a window, in the unit of time), or ``horizon`` (the shortest that is feasible, up to the config's; the number of
+    ``of``: ``disturbance``, ``parameters``, ``initial_state`` or ``execution`` (the largest factor that is feasible;
+    sets are scaled about their centre), ``path.0``, ``terminal.0`` or ``control`` (the smallest), ``path.0.from`` (the
+    earliest start of a window, in the unit of time), or ``horizon`` (the shortest that is feasible, up to the config's; the number of
     pieces is kept, and feasibility is not monotone, so that horizons are scanned and covered). ``tolerance``: how close
     the two sides are to be, relative to the factor, or to 1 if that is larger (for a window to its end, for the horizon
     to the config's). ``curve``: the cost at so many factors on the feasible side, each by a run of its own; at so many

@@ -65,6 +65,7 @@ def scaling(
         "parameters": problem.system.parameters,
         "path": problem.path,
         "integral": problem.integral,
+        "execution": problem.execution is not None,
         "control_step": problem.control_step,
         "terminal": problem.terminal,
     }
@@ -86,6 +87,7 @@ def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
         "control": joined(names.control_units),
         "control_step": joined(names.control_units),
         "integral": "",
+        "execution": "",
     }.get(chosen.of.split(".")[0], of_states if chosen.relative else joined([names.time])).strip()
     label = chosen.label.replace("[unit of time]", f"[{unit}]") if unit else chosen.label
     return replace(chosen, label=label, quantity=f"{chosen.quantity} [{unit}]" if unit else chosen.quantity)
@@ -102,6 +104,8 @@ def _choices(
     yield "control", lambda: _control(problem)
     if problem.control_step is not None:
         yield "control_step", lambda: _control_step(problem)
+    if problem.execution is not None:
+        yield "execution", lambda: _execution(problem)
     for i, positions in enumerate(members):
         if positions:
             yield f"path.{i}", lambda i=i, positions=positions: _path(problem, f"path.{i}", positions)  # type: ignore[misc]
@@ -202,6 +206,21 @@ def _control_step(problem: OptimalControlProblem) -> Scaling:
         lambda f: replace(problem, control_step=resized(f)),
         "largest step of a control",
         lambda f: _reach(resized(f)),
+    )
+
+
+def _execution(problem: OptimalControlProblem) -> Scaling:
+    shares = np.atleast_1d(np.asarray(problem.execution, dtype=float))
+    most = float(shares.max())
+    return Scaling(
+        "execution",
+        "factor on the errors of execution",
+        "largest",
+        lambda f: replace(problem, execution=np.minimum(f * shares, 1.0)),
+        "largest share of a command",
+        _times(most),
+        affine=False,  # a factor times the sizes of the decision
+        highest=1.0 / most,
     )
 
 

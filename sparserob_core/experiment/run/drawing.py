@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -17,6 +18,7 @@ from sparserob_core.experiment.assemble import ControlExperiment, Experiment, as
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.finished import read_finished, stored_run
 from sparserob_core.experiment.figures.landscape_figure import LandscapeData, write_landscape
+from sparserob_core.experiment.figures.switching import Switching
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
 from sparserob_core.experiment.run.landscape import (
@@ -94,7 +96,15 @@ def drawings(
     elif isinstance(experiment, ControlExperiment) and result.decision is not None:
         active, decision = _active(experiment, result), np.asarray(result.decision, dtype=float).ravel()
         yield lambda: draw_experiment(
-            experiment, decision, active, result.history, directory, result.cost, worst, result.status
+            experiment,
+            decision,
+            active,
+            result.history,
+            directory,
+            result.cost,
+            worst,
+            result.status,
+            switching(experiment, result),
         )
     trace = result.trace
     if trace is not None and np.isfinite(trace.value).any():
@@ -121,7 +131,7 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
         decision = np.asarray(result.decision, dtype=float).ravel()
         active = _active(experiment, result)
         data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status)
-        known |= run_pictures(data)
+        known |= run_pictures(replace(data, push=switching(experiment, result)))
         worst = adversaries(experiment, decision)
         if worst:
             known["adversary"] = lambda: draw_adversary(worst, data)
@@ -179,6 +189,17 @@ def _active(experiment: ControlExperiment, result: Result) -> Array:
     about = {one.name for one in experiment.transcription.constraints}
     kept = [cut for cut in result.indices if cut.family in about or experiment.transcription.feedback is None]
     return np.unique([cut.index[0] for cut in kept if cut.multiplier > 0])
+
+
+def switching(experiment: ControlExperiment, result: Result) -> Array | None:
+    """How hard the constraints push the control, ``(m, K)``, as the multipliers of the lower bound say, or those of the
+    imposed constraints; ``None`` where neither is known."""
+    if result.status not in ("certified", "verified"):
+        return None
+    view, dual = Inspection(experiment.loaded, experiment), result.dual
+    known = Switching(view.program, view.row)
+    found = known.push(dual.cuts, dual.mu) if len(dual.cuts) or dual.mu.size else None
+    return known.push([cut for cut in result.indices if cut.multiplier > 0.0], None) if found is None else found
 
 
 def _landscape(experiment: Experiment, result: Result, directory: Path, notify: Notify) -> list[Path]:

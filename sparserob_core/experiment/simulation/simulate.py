@@ -16,7 +16,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, Uncertainty, noises
-from sparserob_core.control.studies.simulate import fine_times, finer, trajectories_at_once, walk
+from sparserob_core.control.studies.simulate import delivered, fine_times, finer, trajectories_at_once, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.adversary import (
@@ -134,7 +134,10 @@ def _sampled(
         disturbances, drawn, begun = uncertainty.draw(law, size, rng)
         seen = noises(model.noise, law, size, model.control.pieces, rng)
         control = controlled(model, finished.decision, np.arange(response.grid.pieces), seen)
-        control = acting.of(control) if callable(control) else control
+        if callable(control):
+            control = acting.of(control)
+        elif (errors := uncertainty.errors(law, size, control, rng)) is not None:
+            control = delivered(control, errors)
         for one in counts:
             one.begin(size)
         for position, state in enumerate(walk(fine, control, drawn, disturbances, begun)):

@@ -14,6 +14,8 @@ from sparserob_core.control.studies.answer import supports
 from sparserob_core.experiment.figures.drawing import CORNERS, figure_data
 from sparserob_core.experiment.figures.figure_data import Limit
 from sparserob_core.experiment.figures.plane_figure import clipped
+from sparserob_core.experiment.figures.style import ORANGE
+from sparserob_core.experiment.run.drawing import switching
 
 A = [[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0] * 4, [0.0] * 4]
 B = [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
@@ -122,3 +124,25 @@ def test_a_plane_of_a_state_that_is_not_there_is_refused_and_unnamed_states_have
     assert sr.Names().in_plane is None
     with pytest.raises(sr.InputError, match=r"names.plane: expected two of 4 states"):
         puck(names=sr.Names(plane=["x1", "x5"]))
+
+
+def test_the_parts_of_the_path_on_which_the_control_acts_are_drawn_and_a_goal_that_is_a_point_is_a_mark() -> None:
+    problem = puck(disturbance=None, path=[], terminal=[sr.Equality([1.0, 0.5, 0.0, 0.0])])
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 10})
+    axes = result.plot("plane").axes[0]
+    arcs = [line for line in axes.lines if line.get_color() == ORANGE]
+    acts = (np.abs(result.control.values) > 1e-6).any(axis=0)
+    turns = int((np.diff(np.concatenate([[0], acts.astype(int)])) > 0).sum())
+    assert 0 < turns == len(arcs) and not acts.all()
+    assert len(axes.patches) == 0 and "terminal set" in [line.get_label() for line in axes.lines]
+
+
+def test_a_figure_shows_why_the_control_acts_where_it_acts() -> None:
+    problem = puck(disturbance=None, path=[], terminal=[sr.Equality([1.0, 0.5, 0.0, 0.0])])
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 10})
+    push = switching(result.experiment, result)
+    assert push is not None
+    acts = np.abs(result.control.values) > 1e-6
+    assert (np.abs(push[acts]) > 1.0 - 1e-6).all() and (np.abs(push[~acts]) < 1.0 + 1e-6).all()
+    drawn = result.plot("switching").axes
+    assert len(drawn) == 2 and drawn[0].get_ylabel() == "push on u1"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, final
+from collections.abc import Callable, Sequence
+from typing import final
 
 import numpy as np
 
-if TYPE_CHECKING:
-    import sparserob_core as sr
-    from sparserob_rerun.drawing.palette import Floats
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.program import SemiInfiniteProgram
 
 
 @final
@@ -20,24 +20,31 @@ class Switching:
     At an optimiser the control of a piece is zero where it lies between -1 and 1, and acts towards its sign beyond:
     stationarity, ``weights sign(S x) + S'^{-1} G'y = 0`` up to the regulariser. Known only where ``S`` is square and
     regular, and every piece has a cost. Of a policy it is that of the control that answers nothing; where the cost is
-    that of the largest size over all disturbances (``peak``), the band says what this size costs, and no more.
+    that of the largest size over all disturbances (``peak``), the band says what this size costs, and no more. Where
+    an error of execution grows with the command (``erring``), acting costs also what that error does in the rows. Of a
+    rendezvous the function is the primer vector (Lawden 1963).
     """
 
-    def __init__(self, view: sr.Inspection) -> None:
-        self.program, self.row = view.program, view.row
-        program, weights = view.program, np.asarray(view.program.finite.weights)
-        priced = weights if program.spread is None else weights[weights > 0.0]
+    def __init__(self, program: SemiInfiniteProgram, row: Callable[[Cut], Array | None]) -> None:
+        """``row``: the left-hand side ``(n,)`` of an imposed constraint, ``None`` where that is not known."""
+        self.program, self.row = program, row
+        weights = np.asarray(program.finite.weights)
+        acting = weights[weights > 0.0]
+        self.erring = program.spread is None and program.n == 2 * acting.size
+        priced = weights if program.spread is None and not self.erring else acting
         self.weights, self.pieces = priced, priced.size
         self.peak = bool(program.spread is not None and (weights[: priced.size] == 0.0).any())
-        square = priced.size == (program.n if program.spread is None else program.image_size)
+        square = self.erring or priced.size == (program.n if program.spread is None else program.image_size)
         self.known = bool(square and priced.size and (priced > 0).all() and program.G is None)
-        self.dense: Floats | None = None
+        self.dense: Array | None = None
         if self.known and program.finite.S is not None:
             self.dense = np.asarray(program.finite.S.toarray())
+            if self.erring:
+                self.dense = self.dense[: self.pieces, : self.pieces]
             whole = self.dense.shape == (self.pieces, self.pieces)
             self.known = bool(whole and np.linalg.matrix_rank(self.dense) == self.pieces)
 
-    def push(self, cuts: Sequence[sr.Cut], mu: Floats | None) -> Floats | None:
+    def push(self, cuts: Sequence[Cut], mu: Array | None) -> Array | None:
         """The switching function ``(m, K)`` under these constraints with their multipliers, or ``None`` where it is not
         known."""
         program = self.program
@@ -53,6 +60,7 @@ class Switching:
             total += cut.multiplier * row
         if program.A is not None and mu is not None:
             total += mu @ np.atleast_2d(program.A)
+        price = self.weights + (total[self.pieces :] if self.erring else 0.0)
         total = total[: self.pieces]
         on_pieces = total if self.dense is None else np.linalg.solve(self.dense.T, total)
-        return np.asarray(-on_pieces / self.weights).reshape(program.channels, -1)
+        return np.asarray(-on_pieces / price).reshape(program.channels, -1)
