@@ -68,7 +68,8 @@ FILES = {
     ),
     "adversary.npz": "per constraint its worst time, parameter, disturbance and the states that these cause",
     "simulation-LAW.json": "written by `sparserob simulate`: how often trajectories under a law break each constraint",
-    "figures/": "`control`, `switching` (why it acts), `states`, `plane` (where `names.plane` says one), `convergence`, `adversary`, each as PDF"
+    "figures/": "`control`, `switching` (why it acts), `states`, `plane` (where `names.plane` says one), `convergence`,"
+    " `adversary`, each as PDF"
     " and PNG; `clash` when infeasible; of a"
     " search `climb` and `landscape`; an extra: where they cannot be drawn a line says so, and the status of the run"
     " stays as it is",

@@ -53,9 +53,9 @@ class Uncertainty:
         return disturbances, parameters, self.functionals.response.initial_state + points(bound, count, rng)
 
     def errors(self, law: LawName, count: int, command: Array, rng: np.random.Generator) -> Array | None:
-        """``count`` errors ``(L, m, count)`` of what is delivered of a ``command (m + constants, L)``, as shares of it on
-        the pieces of the merged grid; ``None`` where it is delivered as it is commanded. Neighbours are the worst errors
-        of some functional, of the other sign on a few pieces."""
+        """``count`` errors ``(L, m, count)`` of what is delivered of a ``command (m + constants, L)``, as shares of it
+        on the pieces of the merged grid; ``None`` where it is delivered as it is commanded. Neighbours are the worst
+        errors of some functional, of the other sign on a few pieces."""
         execution = self.functionals.execution
         if execution is None or not execution.shares.any():
             return None

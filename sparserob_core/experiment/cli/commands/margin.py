@@ -22,8 +22,8 @@ EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
     default="disturbance",
     show_default=True,
     metavar="WHAT",
-    help="disturbance, parameters, initial_state, execution, path.0, terminal.0, control, path.0.from, or horizon; entries count"
-    " from 0.",
+    help="disturbance, parameters, initial_state, execution, path.0, terminal.0, control, path.0.from, or horizon;"
+    " entries count from 0.",
 )
 @click.option(
     "--tolerance",
