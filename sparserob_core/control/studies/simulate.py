@@ -126,8 +126,8 @@ def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:
 
 
 def worst_errors(response: Response, execution: Execution, command: Array, at: tuple[Array, Array, Array]) -> Array:
-    """The errors ``(L, m, k)``, constant on the pieces of a response, that raise functionals ``c'x(t)`` the most, ``at``
-    times ``(k,)``, directions ``(k, d)`` and parameters, of a ``command (m + constants, L)`` as shares of it."""
+    """The errors ``(L, m, k)``, constant on the pieces of a response, that raise functionals ``c'x(t)`` the most,
+    ``at`` times ``(k,)``, directions ``(k, d)`` and parameters, of a ``command (m + constants, L)`` as shares of it."""
     weights = response.weights(*at).control[:, :, : execution.shares.size].transpose(1, 2, 0)
     return np.asarray(execution.shares[:, None] * np.sign(weights * command[: execution.shares.size].T[:, :, None]))
 

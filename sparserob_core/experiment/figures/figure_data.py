@@ -106,8 +106,8 @@ class FigureData:
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
     the relative gap that was asked for, ``cost_scale`` what is added up to the cost, ``cost_of`` what is
     added up to it, where that is not the L1 norm alone, ``counts`` whether cost means the time that the control acts,
-    ``names`` what everything is called, ``plane`` where the system moves, if the problem says that it does so in one, ``push
-    (m, K)`` the switching function, how hard the constraints push the control, where that is known.
+    ``names`` what everything is called, ``plane`` where the system moves, if the problem says that it does so in one,
+    ``push (m, K)`` the switching function, how hard the constraints push the control, where that is known.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and

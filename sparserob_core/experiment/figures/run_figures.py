@@ -31,8 +31,8 @@ IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
 
 def write_figures(directory: Path, data: FigureData) -> list[Path]:
     """Draw ``control``, where that is known ``switching``, ``states``, ``plane`` where the system moves in one, under
-    feedback ``outputs`` where these are measured, ``gains``, ``effort`` and ``answers``, and when there is a history ``convergence`` into ``directory``,
-    each as PDF and PNG.
+    feedback ``outputs`` where these are measured, ``gains``, ``effort`` and ``answers``, and when there is a history
+    ``convergence`` into ``directory``, each as PDF and PNG.
 
     Returns the files. Raises `InputError` when matplotlib is missing.
     """

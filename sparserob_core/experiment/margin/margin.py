@@ -50,16 +50,16 @@ def margin(
 
     ``of``: ``disturbance``, ``parameters``, ``initial_state`` or ``execution`` (the largest factor that is feasible;
     sets are scaled about their centre), ``path.0``, ``terminal.0`` or ``control`` (the smallest), ``path.0.from`` (the
-    earliest start of a window, in the unit of time), or ``horizon`` (the shortest that is feasible, up to the config's; the number of
-    pieces is kept, and feasibility is not monotone, so that horizons are scanned and covered). ``tolerance``: how close
-    the two sides are to be, relative to the factor, or to 1 if that is larger (for a window to its end, for the horizon
-    to the config's). ``curve``: the cost at so many factors on the feasible side, each by a run of its own; at so many
-    horizons, feasible or not. ``out``: a new or empty directory for ``margin.json`` and ``margin.png``; with ``write``
-    and none given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives `StudyProgress`. ``observers`` watch it as
-    a study of one axis, whose points are found on the way, from `SweepStarted` to `SweepFinished`. An interrupt, and
-    the limit ``limits.seconds`` of the config, end the search with what it has proven by then, ``undecided``. Raises
-    `InputError` when an argument or the config is at fault, and `TimeLimitError` when the limit comes before there is
-    anything to solve.
+    earliest start of a window, in the unit of time), or ``horizon`` (the shortest that is feasible, up to the
+    config's; the number of pieces is kept, and feasibility is not monotone, so that horizons are scanned and covered).
+    ``tolerance``: how close the two sides are to be, relative to the factor, or to 1 if that is larger (for a window
+    to its end, for the horizon to the config's). ``curve``: the cost at so many factors on the feasible side, each by
+    a run of its own; at so many horizons, feasible or not. ``out``: a new or empty directory for ``margin.json`` and
+    ``margin.png``; with ``write`` and none given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives
+    `StudyProgress`. ``observers`` watch it as a study of one axis, whose points are found on the way, from
+    `SweepStarted` to `SweepFinished`. An interrupt, and the limit ``limits.seconds`` of the config, end the search
+    with what it has proven by then, ``undecided``. Raises `InputError` when an argument or the config is at fault, and
+    `TimeLimitError` when the limit comes before there is anything to solve.
     """
     if not hasattr(tolerance, "__float__") or not 1e-9 <= tolerance <= 0.1:
         raise InputError(f"tolerance: expected a number from 1e-9 to 0.1, got {tolerance!r}")
