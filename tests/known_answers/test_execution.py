@@ -211,6 +211,7 @@ STRAIGHT: dict[str, Any] = {  # x' = u: what is delivered must be from 0.9 to 1.
 }
 
 
+@pytest.mark.slow
 def test_the_largest_share_that_a_plan_survives_is_found() -> None:
     config = {"problem": STRAIGHT, "dictionaries": {"control": pieces(4)}, "observers": []}
     found = sr.margin(config, "execution", tolerance=1e-4)
@@ -226,7 +227,9 @@ def test_a_share_that_is_not_there_cannot_be_varied(none: float | None) -> None:
         sr.margin(config, "execution")
 
 
-@pytest.mark.parametrize("law", ["iid", "vertices", "slow", "neighbours"])
+@pytest.mark.parametrize(
+    "law", ["vertices", *(pytest.param(n, marks=pytest.mark.slow) for n in ("iid", "slow", "neighbours"))]
+)
 def test_draws_deliver_something_else_than_the_command_and_never_more_than_the_share(law: str, tmp_path: Path) -> None:
     config = {"problem": STRAIGHT, "dictionaries": {"control": pieces(4)}, "observers": []}
     sr.run(config, out=tmp_path / "run", figures=False)
@@ -238,6 +241,7 @@ def test_draws_deliver_something_else_than_the_command_and_never_more_than_the_s
     assert not found.constraints[0].violated
 
 
+@pytest.mark.slow
 def test_the_worst_errors_are_replayed_and_a_plan_that_does_not_know_them_fails(tmp_path: Path) -> None:
     config = {"problem": STRAIGHT, "dictionaries": {"control": pieces(4)}, "observers": []}
     sr.run(config, out=tmp_path / "run", figures=False)

@@ -104,7 +104,7 @@ def test_every_figure_of_a_run_is_a_figure_of_matplotlib(solved: sr.SolvedProble
     states = solved.plot()
     assert [ax.get_ylabel() for ax in states.axes] == ["$x_{1}(t)$", "$x_{2}(t)$"]
     assert isinstance(saved.plot("adversary"), Figure)
-    with pytest.raises(sr.InputError, match="control, states, convergence, adversary"):
+    with pytest.raises(sr.InputError, match="control, switching, states, convergence, adversary"):
         solved.plot("gains")
 
 
