@@ -9,9 +9,10 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope
 
 
@@ -34,7 +35,7 @@ class Loop:
     """Into how many parts a piece of the grid is cut here for a measurable disturbance."""
 
     @property
-    def system(self) -> LinearSystem:
+    def system(self) -> System:
         return LinearSystem(self.A, self.B, self.E, c=self.c)
 
     @property
@@ -73,12 +74,16 @@ class Loop:
         found = [] if self.bound is None else [(self.bound, self.bound.middle())] * (self.jumps.size - 1)
         return found if self.begun is None else [*found, (self.begun, self.begun.middle())]
 
-    def _step(self, lengths: np.ndarray, X: np.ndarray, drive: np.ndarray) -> np.ndarray:
-        """``X`` after each of ``lengths (n,)`` under a constant drive, ``(n, d, 1 + Q)``."""
+    def _step(self, begin: float, lengths: np.ndarray, X: np.ndarray, drive: np.ndarray) -> np.ndarray:
+        """``X`` after each of ``lengths (n,)`` from ``begin`` on under a constant drive, ``(n, d, 1 + Q)``."""
         d = len(X)
         table = np.block([[self.A, np.eye(d)], [np.zeros((d, 2 * d))]])
         both = exponentials(table * np.atleast_1d(lengths)[:, None, None])
         return both[:, :d, :d] @ X + both[:, :d, d:] @ drive
+
+    def rates(self, times: np.ndarray, X: np.ndarray, drive: np.ndarray) -> np.ndarray:
+        """How fast ``X (n, d, 1 + Q)`` changes at ``times (n,)``."""
+        return self.A @ X + drive
 
     def states(self, v: np.ndarray, M: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The nominal state and every response at ``times (T,)``, ``(T, d, 1 + Q)``, what changes them then, of the
@@ -112,12 +117,12 @@ class Loop:
                     drive[:, at : at + width] += self.E
                 last = b == marks[-1]
                 here = np.flatnonzero((times >= a) & ((times <= b) if last else (times < b)))
-                after = self._step(np.append(times[here] - a, b - a), X, drive)
-                found[here], rates[here] = after[:-1], self.A @ after[:-1] + drive
+                after = self._step(a, np.append(times[here] - a, b - a), X, drive)
+                found[here], rates[here] = after[:-1], self.rates(times[here], after[:-1], drive)
                 X = after[-1]
             guess = self.B @ U
             guess[:, 0] += still
-            innovations.append(X - self._step(np.array([end - begin]), before, guess)[0])
+            innovations.append(X - self._step(begin, np.array([end - begin]), before, guess)[0])
         return found, rates, np.array(controls)
 
     def height(self, along: np.ndarray) -> np.ndarray:
@@ -137,6 +142,44 @@ class Loop:
             axes = np.eye(shape.dimension)
             far.append(np.maximum(shape.support(axes) - middle, shape.support(-axes) + middle))
         return np.concatenate([np.zeros(0), *far])
+
+
+@dataclass(frozen=True, eq=False)
+class Changing(Loop):
+    """``x' = r(t) A x + f(t) (B u + E w + c)``: the transition is the exponential of ``A`` times the integral of ``r``.
+    ``rate``, ``grown``, ``factor``: ``r``, its integral from 0 on and ``f``, as they are written in a config."""
+
+    rate: str = "1"
+    grown: str = "t"
+    factor: str = "1"
+
+    @property
+    def system(self) -> VaryingSystem:
+        def times(factor: str, matrix: np.ndarray) -> list[list[str]]:
+            return [[f"{float(x)!r} * ({factor})" for x in row] for row in np.atleast_2d(matrix)]
+
+        c = None if self.c is None else times(self.factor, self.c)[0]
+        parts = times(self.rate, self.A), times(self.factor, self.B), times(self.factor, self.E)
+        return VaryingSystem.of(parts[0], parts[1], float(self.breakpoints[-1]), parts[2], c)
+
+    def _of(self, text: str, times: np.ndarray) -> np.ndarray:
+        """One of the three functions at times."""
+        names = {"sin": np.sin, "cos": np.cos, "exp": np.exp, "log": np.log, "t": np.asarray(times)}
+        return np.asarray(eval(text.replace("^", "**"), {"__builtins__": {}}, names)) + 0.0 * times
+
+    def _step(self, begin: float, lengths: np.ndarray, X: np.ndarray, drive: np.ndarray) -> np.ndarray:
+        """The inputs by Gauss' rule: pieces are short beside what changes."""
+        points, weights = np.polynomial.legendre.leggauss(16)
+        within = begin + np.atleast_1d(lengths)[:, None] * (1.0 + points) / 2.0
+        until = self._of(self.grown, begin + np.atleast_1d(lengths))
+        whole = exponentials(self.A * (until - self._of(self.grown, np.array(begin)))[:, None, None])
+        onward = exponentials(self.A * (until[:, None] - self._of(self.grown, within))[:, :, None, None])
+        share = np.atleast_1d(lengths)[:, None] / 2.0 * weights * self._of(self.factor, within)
+        return whole @ X + np.einsum("nq,nqij->nij", share, onward) @ drive
+
+    def rates(self, times: np.ndarray, X: np.ndarray, drive: np.ndarray) -> np.ndarray:
+        rate, factor = (self._of(text, times)[:, None, None] for text in (self.rate, self.factor))
+        return rate * (self.A @ X) + factor * drive
 
 
 def exponentials(matrices: np.ndarray) -> np.ndarray:
@@ -193,5 +236,24 @@ LOOPS = {
         measurable=True, fine=40,
     ),
 }  # fmt: skip
-EXACT = [name for name, loop in LOOPS.items() if not loop.measurable]
+CHANGING = {
+    "turning": Changing(
+        SLOW, FORCE, GUST, np.array([0.0, 0.5, 0.7, 1.5, 2.0]), np.array([0.0, 0.4, 1.0, 2.0]), np.array([-1.0, 0.5]),
+        Box(np.array([-0.1, 0.0]), np.array([0.2, 0.1])), c=np.array([0.1, -0.3]),
+        rate="1 + t", grown="t + t^2/2", factor="cos(3*t)",
+    ),
+    "fading": Changing(
+        SLOW, np.eye(2), GUST, np.linspace(0.0, 2.0, 3), np.linspace(0.0, 2.0, 3), np.array([-1.0, 0.5]),
+        NormBall(p=2.0, radius=0.2, centre=np.array([0.1, 0.0])),
+        Ellipsoid(np.zeros(2), np.array([[0.02, 0.01], [0.01, 0.03]])),
+        rate="2*exp(-t)", grown="2 - 2*exp(-t)", factor="exp(-t)",
+    ),
+    "level": Changing(
+        np.array([[0.0, 1.0], [0.0, 0.0]]), FORCE, FORCE, np.linspace(0.0, 2.0, 4), np.linspace(0.0, 2.0, 4),
+        np.array([-1.0, 0.5]), None, TRIANGLE, rate="1 + 0*t", factor="1 + 0*t",
+    ),
+}  # fmt: skip
+LOOPS.update(CHANGING)
+STILL = [name for name, loop in LOOPS.items() if not loop.measurable and name not in CHANGING]
+EXACT = [*STILL, "turning", pytest.param("fading", marks=pytest.mark.slow)]
 MEASURABLE = [name for name, loop in LOOPS.items() if loop.measurable]

@@ -13,7 +13,7 @@ from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.claims.window import Beside
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.tube import Polynomial, Tube
-from sparserob_core.checker.reach.varying_tube import VaryingTube
+from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.sides import Bounded, Sides

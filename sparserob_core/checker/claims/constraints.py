@@ -21,7 +21,7 @@ from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import flows
 from sparserob_core.checker.reach.tube import Tube
-from sparserob_core.checker.reach.varying_tube import VaryingTube
+from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides

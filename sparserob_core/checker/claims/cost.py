@@ -17,7 +17,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
-from sparserob_core.checker.reach.varying import VaryingFlow
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic, nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary

@@ -20,7 +20,7 @@ from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.claims.cost import Price, Tangent
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
-from sparserob_core.checker.reach.varying import VaryingFlow
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -150,6 +150,11 @@ class Duality:
         jumps = self.changes if jumps is None else jumps
         if not jumps:
             return []
+        if self.varying is not None:
+            begins = sorted({0.0, *(s for s in jumps if s < time)})
+            weights, row = self.varying.weights([*begins, time]), stacked([[_exact(c) for c in direction]])
+            late = [[_exact(0.0)] * self.problem.system.disturbances for s in jumps if s >= time]
+            return [(row * one).entries() for one in weights.disturbance] + late
         every = flows(self.problem.system, ())
         parts = every[0].parts
         first, mw = direction.size + parts["B"][0].ncols(), parts["E"][0].ncols()
@@ -158,6 +163,9 @@ class Duality:
 
     def carried(self, direction: Array, time: float) -> list[arb]:
         """What the initial state of a known system gives to ``c'x(t)``, ``(d,)``."""
+        if self.varying is not None:
+            row = stacked([[_exact(c) for c in direction]])
+            return list((row * self.varying.weights([0.0, time]).free).entries())
         return self._lags(flows(self.problem.system, ()), direction, time, {0.0})[0.0][: direction.size]
 
     def _lags(self, every: Sequence[Flow], direction: Array, time: float, since: set[float]) -> dict[float, list[arb]]:

@@ -23,6 +23,7 @@ from sparserob_core.checker.reach.effort import at_most
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
+from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Product
@@ -103,7 +104,7 @@ class FeedbackClaims:
         measured = None if case.policy is None else case.problem.measurements
         if measured is not None and case.measurable:
             raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
-        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(
+        parts = (
             case.problem.system,
             [float(v) for v in np.asarray(case.problem.initial_state)],
             nominal,
@@ -117,6 +118,9 @@ class FeedbackClaims:
             measured,
             self.observer,
         )
+        if case.changing is not None:
+            return VaryingLoop(*parts, law=case.changing)
+        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(*parts)
 
     def control(self) -> str:
         """Every piece of the control in its set, for every disturbance."""
@@ -253,7 +257,8 @@ class FeedbackClaims:
 
     def _cuts(self, window: Window) -> Array:
         """The times at which the state, or what stands beside it, turns or jumps."""
-        return np.unique([*self.case.grid, *window.cuts(self.loop.breakpoints)])
+        segments = [] if self.case.changing is None else self.case.changing.ends
+        return np.unique([*self.case.grid, *segments, *window.cuts(self.loop.breakpoints)])
 
     def _turning(self, window: Window, entry: Mapping[str, Any]) -> str:
         """The same for a curved set: cells of times and directions."""
@@ -346,7 +351,7 @@ class FeedbackClaims:
         case, d = self.case, self.case.problem.system.states
         everything, end = Box(np.full(d, -np.inf), np.full(d, np.inf)), case.problem.horizon
         scene = replace(case.scene, disturbance=None, initial_set=None)
-        return RowUnits(case.problem, scene, everything, end, end).sums
+        return RowUnits(case.problem, scene, everything, end, end, varying=case.changing).sums
 
     def _entry(self, window: Window) -> Mapping[str, Any]:
         """What the certificate says of the proof of a constraint."""
@@ -574,13 +579,13 @@ class FeedbackClaims:
 
     def _pushed(self, loop: ClosedLoop, block: int) -> Pushed:
         """Who can see the deviations of a block; of the initial state everyone sees its own."""
-        d, varying = loop.parts["A"].nrows(), tuple(self._chords[block])
+        d, varying = loop.system.states, tuple(self._chords[block])
         if loop.measured is not None:  # outputs see what the observer makes of everything: as many as there are
             return Pushed(np.ones((loop.outputs, len(varying)), dtype=bool), loop.outputs, len(varying))
         if self.case.problem.initial_set is not None and block == loop.begun:
             return Pushed(np.eye(d, dtype=bool)[:, list(varying)], len(varying), len(varying))
         if varying not in self._pushes:
-            self._pushes[varying] = Pushed.of([(one["A"], one["E"]) for one in loop.modes], varying)
+            self._pushes[varying] = loop.pushed(varying)
         return self._pushes[varying]
 
     @cached_property

@@ -14,8 +14,8 @@ from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import flows, held, stacked
 from sparserob_core.checker.reach.tube import Tube
-from sparserob_core.checker.reach.varying import VaryingFlow
-from sparserob_core.checker.reach.varying_tube import VaryingTube
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
 

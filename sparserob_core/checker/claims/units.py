@@ -14,7 +14,7 @@ from sparserob_core.checker.claims.duality import before
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, flows, held, stacked
-from sparserob_core.checker.reach.varying import VaryingFlow
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem

@@ -11,9 +11,10 @@ block.
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.flow import OwnUnits, flows, held, middles, stacked
+from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.sets.sets import ConvexSet
@@ -99,7 +101,7 @@ class ClosedLoop:
     @property
     def width(self) -> int:
         """How many entries a block has."""
-        return int(self.parts["E"].ncols())
+        return int(self.system.disturbances)
 
     @cached_property
     def middle(self) -> Array:
@@ -128,7 +130,7 @@ class ClosedLoop:
     @property
     def outputs(self) -> int:
         """How many numbers an innovation has."""
-        return int(self.parts["A"].nrows()) if self.measured is None else self.measured.outputs
+        return int(self.system.states) if self.measured is None else self.measured.outputs
 
     @cached_property
     def starts(self) -> list[int]:
@@ -159,8 +161,23 @@ class ClosedLoop:
     def _identity(self) -> arb_mat:
         from flint import arb_mat
 
-        d = self.parts["A"].nrows()
+        d = self.system.states
         return arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
+
+    def _moved(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
+        """What a part of a piece of the grid makes of the states at its beginning, and what is added by what drives
+        them, ``(d, 1 + Q)``."""
+        Phi, Gamma = self._held(start, stop)
+        return Phi, Gamma * self.drives[piece]
+
+    def _passed(self, piece: int) -> tuple[arb_mat, arb_mat]:
+        """What a piece of the grid makes of a state, and of the block of the disturbance that acts, ``(d, mw)``."""
+        Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
+        return Phi, Gamma * self.modes[self.mode(self.grid[piece])]["E"]
+
+    def pushed(self, entries: Sequence[int]) -> Pushed:
+        """Who can see these entries of a block of the disturbance."""
+        return Pushed.of([(one["A"], one["E"]) for one in self.modes], entries)
 
     @staticmethod
     def _exact(start: float, stop: float, key: float) -> bool:
@@ -200,7 +217,7 @@ class ClosedLoop:
         """The flows from each breakpoint of the control to the next."""
         found = [self._identity for _ in self.breakpoints[:-1]]
         for piece in range(len(self.grid) - 1):
-            found[self.on(piece)] = self._held(self.grid[piece], self.grid[piece + 1])[0] * found[self.on(piece)]
+            found[self.on(piece)] = self._passed(piece)[0] * found[self.on(piece)]
         return found
 
     @cached_property
@@ -215,9 +232,8 @@ class ClosedLoop:
             k, (_, block) = self.on(piece), self._places(piece)
             if k + 1 >= K:
                 break
-            Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
-            seen = {earlier: Phi * push for earlier, push in found[k + 1].items()}
-            push = Gamma * self.modes[self.mode(self.grid[piece])]["E"]
+            Phi, push = self._passed(piece)
+            seen = {earlier: Phi * before for earlier, before in found[k + 1].items()}
             if any(not x.is_zero() for x in push.entries()):
                 seen[block] = seen[block] + push if block in seen else push
             found[k + 1] = seen
@@ -289,9 +305,9 @@ class ClosedLoop:
             begin = [v + arb(float(m)) for v, m in zip(begin, self.sets[-1][1], strict=True)]
         zero = [arb(0)] * self.starts[self.begun]
         found = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
-        for piece, drive in enumerate(self.drives):
-            Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
-            found.append(self._ended(piece, Phi * found[-1] + Gamma * drive))
+        for piece, ends in enumerate(pairwise(self.grid)):
+            Phi, added = self._moved(piece, *ends)
+            found.append(self._ended(piece, Phi * found[-1] + added))
         return found
 
     def state(self, piece: int, time: float) -> arb_mat:
@@ -300,8 +316,8 @@ class ClosedLoop:
             return self.nodes[piece]
         if time == self.grid[piece + 1]:
             return self.nodes[piece + 1]
-        Phi, Gamma = self._held(self.grid[piece], time)
-        return Phi * self.nodes[piece] + Gamma * self.drives[piece]
+        Phi, added = self._moved(piece, self.grid[piece], time)
+        return Phi * self.nodes[piece] + added
 
     @cached_property
     def radii(self) -> Array:

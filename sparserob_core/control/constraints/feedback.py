@@ -285,7 +285,8 @@ class FeedbackConstraint:
             acting = flat.commanded((ends[0] + ends[1]) / 2)[:, 0]
             added = flat.gains[:proven] @ self.loop.controls(x)[acting]
             beside = [np.concatenate([more + added[..., :1], added[..., 1:]], axis=-1) for more in beside]
-        found = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]))[0]
+        # an equality is one of computed numbers, to their rounding, as it is without feedback
+        found = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]), computed=self.exact)[0]
         bounds = (found - flat.h[:proven]).max(axis=1)
         return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
 

@@ -13,19 +13,22 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.feedback.innovations import KNOWN, Answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces
 from sparserob_core.control.feedback.observer import Observer, innovations_of
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.measurable import MISSED
+from sparserob_core.control.response.varying_motion import VaryingMotion
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread, UncertainRows
 
 if TYPE_CHECKING:
-    from sparserob_core.control.response.response import Steps
+    from sparserob_core.control.response.response import Steps, TimeGrid
 
 TERMS = 8  # of the Taylor expansion that bounds a curvature
 ROUND_OFF = 2.0**-46  # of the numbers that are added up
+FLOWS_KEPT = 8  # lists of times to which transitions of a system in t are remembered: each round asks for the same
 
 
 @final
@@ -49,6 +52,7 @@ class ClosedLoop:
     observer: Observer | None = None
     anew: bool = False
     _paths: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
+    _flows: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @property
     def nominal_size(self) -> int:
@@ -82,6 +86,18 @@ class ClosedLoop:
         ``observer (K, d, p)``."""
         observer = {} if self.observer is None else {"observer": self.observer.L}
         return observer if x is None else {"gains": self.gains(x), **observer}
+
+    @cached_property
+    def motion(self) -> VaryingMotion | None:
+        """The system between all marks, where it changes with time."""
+        (first, *_) = self.functionals.legs(KNOWN[0], KNOWN[0]) if self.functionals.response.grid.varying else (None,)
+        return first if isinstance(first, VaryingMotion) else None
+
+    @cached_property
+    def grid(self) -> TimeGrid:
+        """The pieces between whose ends nothing jumps; of a system that changes with time, on which it is one
+        polynomial of it: ``L`` of them."""
+        return self.functionals.response.grid if self.motion is None else self.motion.grid
 
     @cached_property
     def steps(self) -> Steps:
@@ -153,16 +169,25 @@ class ClosedLoop:
             return np.tile(self.measurable.middle, (self.functionals.response.grid.pieces, 1))
         return np.asarray(self.entries @ self.spread.middle)
 
-    def drives(self, x: Array) -> Array:
-        """What drives the nominal state and every response, on the pieces of the grid: ``(L, d, 1 + Q)``."""
-        grid, m = self.functionals.response.grid, self.answers.shape[1]
-        B, E = (grid.of_modes(matrices)[grid.modes] for matrices in (self.steps.B[0], self.steps.E[0]))
-        inputs = np.concatenate([grid.inputs(self.nominal(x)).T[:, :, None], self.middles[:, :, None]], axis=1)
-        nominal = np.concatenate([B, E], axis=2) @ inputs
-        acts = grid.control_piece >= 0
-        answered = E @ self.entries
-        answered[acts] += B[acts, :, :m] @ self.effects(x)[grid.control_piece[acts]]
+    def inputs(self, x: Array) -> Array:
+        """What acts on the pieces of the grid, nominally and as answers: control, drift and disturbance, ``(L, m + mw,
+        1 + Q)``."""
+        grid, m = self.grid, self.answers.shape[1]
+        origin = slice(None) if self.motion is None else self.motion.origin
+        nominal = np.concatenate([grid.inputs(self.nominal(x)).T[:, :, None], self.middles[origin, :, None]], axis=1)
+        acts, entries = grid.control_piece >= 0, self.entries[origin]
+        answered = np.zeros((*nominal.shape[:2], entries.shape[2]))
+        answered[:, nominal.shape[1] - entries.shape[1] :] = entries
+        answered[acts, :m] = self.effects(x)[grid.control_piece[acts]]
         return np.concatenate([nominal, answered], axis=2)
+
+    def drives(self, x: Array) -> Array:
+        """What drives the nominal state and every response, on the pieces of the grid: ``(L, d, 1 + Q)``; of a system
+        that changes with time, through which matrices too, so that it is the `inputs` themselves."""
+        if self.motion is not None:
+            return self.inputs(x)
+        B, E = (self.grid.of_modes(matrices)[self.grid.modes] for matrices in (self.steps.B[0], self.steps.E[0]))
+        return np.asarray(np.concatenate([B, E], axis=2) @ self.inputs(x))
 
     def path(self, x: Array) -> tuple[Array, Array]:
         """The nominal state and every response at the breakpoints of the grid, ``(L + 1, d, 1 + Q)``, and what drives
@@ -170,13 +195,14 @@ class ClosedLoop:
         piece is over."""
         key = x.tobytes()
         if key not in self._paths:
-            response, drives = self.functionals.response, self.drives(x)
-            nodes = np.zeros((drives.shape[0] + 1, *drives.shape[1:]))
+            response, drives, motion = self.functionals.response, self.drives(x), self.motion
+            Phi, Gamma, which = self.steps.Phi[0], self.steps.Gamma[0], response.which
+            if motion is not None:
+                Phi, Gamma, which = motion.flow.state, motion.inputs, motion.every
+            nodes = np.zeros((drives.shape[0] + 1, self.start.size, drives.shape[2]))
             nodes[0] = np.column_stack([self.start, self.begins])
-            for piece, length in enumerate(response.which.tolist()):
-                nodes[piece + 1] = (
-                    self.steps.Phi[0, length] @ nodes[piece] + self.steps.Gamma[0, length] @ drives[piece]
-                )
+            for piece, length in enumerate(which.tolist()):
+                nodes[piece + 1] = Phi[length] @ nodes[piece] + Gamma[length] @ drives[piece]
                 if self.measurable is not None:
                     place, outward = self.measurable.at(piece)
                     nodes[piece + 1, :, 1:][:, place] += outward
@@ -187,11 +213,23 @@ class ClosedLoop:
 
     def states(self, x: Array, times: Array, pieces: np.ndarray | None = None) -> Array:
         """The nominal state and every response at ``times (k,)``, which lie in these pieces: ``(k, d, 1 + Q)``."""
-        grid = self.functionals.response.grid
-        pieces = grid.locate(times) if pieces is None else pieces
+        pieces = self.grid.locate(times) if pieces is None else pieces
         nodes, drives = self.path(x)
-        flow, driven = self.functionals.response.flows_in(pieces, np.clip(times - grid.breakpoints[pieces], 0.0, None))
+        flow, driven = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
         return np.asarray(flow @ nodes[pieces] + driven @ drives[pieces])
+
+    def _flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
+        """What the first ``durations (k,)`` of ``pieces (k,)`` of the grid make of a state, and of what drives it."""
+        if self.motion is None:
+            return self.functionals.response.flows_in(pieces, durations)
+        starts = self.grid.breakpoints[pieces]
+        key = np.concatenate([starts, durations]).tobytes()
+        if key not in self._flows:
+            distinct, which = np.unique(np.stack([starts, starts + durations]), axis=1, return_inverse=True)
+            over, which = self.motion.expansion.flow(distinct[0], distinct[1]), which.reshape(-1)
+            driven = np.concatenate([over.control, over.disturbance], axis=2)
+            remember(self._flows, key, (over.state[which], driven[which]), FLOWS_KEPT)
+        return self._flows[key]
 
     def height(self, along: Array) -> Array:
         """``max_w`` of functionals ``(..., 1 + Q)`` of the nominal state and the responses."""
@@ -208,23 +246,51 @@ class ClosedLoop:
         return self.bounded(x, lower, upper, H)[0]
 
     def bounded(
-        self, x: Array, lower: Array, upper: Array, H: Array, beside: tuple[Array, Array] | None = None
+        self,
+        x: Array,
+        lower: Array,
+        upper: Array,
+        H: Array,
+        beside: tuple[Array, Array] | None = None,
+        computed: bool = False,
     ) -> tuple[Array, Array]:
         """The bounds, ``H (r, d)`` or ``(k, r, d)``, and how much of each is owed to the length of the cell;
-        ``beside``: what is added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear between.
+        ``beside``: what is added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear between;
+        ``computed``: with the transitions as they are computed, whatever the expansion of a system in t leaves out.
 
         On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
         support function of a chord lies below the chord of the support functions.
         """
-        grid = self.functionals.response.grid
-        pieces = grid.locate((lower + upper) / 2)
-        modes = np.zeros(1, dtype=int) if grid.mode is None else grid.mode[pieces]
-        A = self.steps.A[0, modes]  # (1, d, d) of one system, (k, d, d) of several
+        pieces = self.grid.locate((lower + upper) / 2)
         ends = [self.states(x, times, pieces) for times in (lower, upper)]
         along = [H @ end for end in ends]
-        h = (upper - lower)[:, None, None]
-        rates = A @ ends[0] + self.path(x)[1][pieces]
-        second, row, factor = np.zeros(along[0].shape), H @ A, np.ones_like(h)
+        radii = np.concatenate([[1.0], self.spread.radii])
+        late = self._late(x, H, lower, upper - lower, pieces, ends[0])
+        size = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+        for end, more in zip(along, beside or (), strict=False):
+            end[..., : more.shape[-1]] += more
+            size[..., : more.shape[-1]] += np.abs(more)
+        found, lost = [self.height(one) for one in along], ROUND_OFF * (size @ radii)
+        if self.motion is not None and not computed:
+            lost += (np.abs(H) @ self._left_out(x, self.motion)[pieces][:, :, None])[:, :, 0]
+        if self.measurable is not None:
+            inside = (self.measurable.within(end, H, pieces) for end in (lower, upper))
+            found = [value + more for value, more in zip(found, inside, strict=True)]
+            lost += self.measurable.allowance(lower, upper, H, pieces) + MISSED * (size @ radii)
+        most = np.maximum(*found) + late + lost
+        return np.where(np.isnan(most), np.inf, most), late
+
+    def _late(self, x: Array, H: Array, start: Array, width: Array, pieces: np.ndarray, states: Array) -> Array:
+        """How far ``H x(t)`` may be from its chord on ``[start, start + width]``, each within one of the ``pieces
+        (k,)``, from ``states (k, d, 1 + Q)`` at the start, for any deviations: ``(k, r)``."""
+        drives, radii = self.path(x)[1][pieces], np.concatenate([[1.0], self.spread.radii])
+        if self.motion is not None:
+            return self.motion.bent(H, start, width, pieces, states, drives, radii)
+        modes = np.zeros(1, dtype=int) if self.grid.mode is None else self.grid.mode[pieces]
+        A = self.steps.A[0, modes]  # (1, d, d) of one system, (k, d, d) of several
+        h, rates = width[:, None, None], A @ states + drives
+        row, factor = H @ A, np.ones_like(h)
+        second = np.zeros((start.size, H.shape[-2], radii.size))
         for order in range(TERMS):
             second += factor * np.abs(row @ rates)
             row, factor = row @ A, factor * h / (order + 1)
@@ -236,20 +302,13 @@ class ClosedLoop:
                 * np.linalg.norm(row, axis=-1)[..., None]
                 * np.linalg.norm(rates, axis=1, keepdims=True)
             )
-        bent = second + tail
+        return np.asarray((h[..., 0] ** 2 / 8.0) * ((second + tail) @ radii))
+
+    def _left_out(self, x: Array, motion: VaryingMotion) -> Array:
+        """What the transitions of a system that changes with time may be off by, on every piece, ``(L, d)``."""
+        nodes, inputs = self.path(x)
         radii = np.concatenate([[1.0], self.spread.radii])
-        size = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        for end, more in zip(along, beside or (), strict=False):
-            end[..., : more.shape[-1]] += more
-            size[..., : more.shape[-1]] += np.abs(more)
-        late = (h[..., 0] ** 2 / 8.0) * (bent @ radii)
-        found, lost = [self.height(one) for one in along], ROUND_OFF * (size @ radii)
-        if self.measurable is not None:
-            inside = (self.measurable.within(end, H, pieces) for end in (lower, upper))
-            found = [value + more for value, more in zip(found, inside, strict=True)]
-            lost += self.measurable.allowance(lower, upper, H, pieces) + MISSED * (size @ radii)
-        most = np.maximum(*found) + late + lost
-        return np.where(np.isnan(most), np.inf, most), late
+        return motion.left_out(np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii))
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
         """A deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""
@@ -260,9 +319,8 @@ class ClosedLoop:
         """The pieces ``(k,)`` of the grid in which the state at ``times (k,)`` is looked at. A breakpoint is one of the
         piece that it ends; but where the control on a piece ``acting (k,)`` stands beside the state, which begins then,
         of that: this control has answered what happened before."""
-        grid, ends = self.functionals.response.grid, self.functionals.dictionary.breakpoints
-        found = grid.locate(times)
-        return found if acting is None else np.maximum(found, np.searchsorted(grid.commanded(ends), acting))
+        ends, found = self.functionals.dictionary.breakpoints, self.grid.locate(times)
+        return found if acting is None else np.maximum(found, np.searchsorted(self.grid.commanded(ends), acting))
 
     def signal(
         self, deviation: Array, time: float, direction: Array | None, acting: int | None = None

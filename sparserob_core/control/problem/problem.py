@@ -265,7 +265,6 @@ class OptimalControlProblem:
                 path="system", expected=f"a law up to {self.horizon:g}, the horizon", got=f"up to {system.horizon:g}"
             )
         refused: dict[str, object] = {
-            "measurements": self.measurements,
             "integral": self.integral,
         }
         for key, given in refused.items():

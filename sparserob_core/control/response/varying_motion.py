@@ -135,19 +135,34 @@ class VaryingMotion:
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
-        """`Motion.deviation`: by the second time derivative at the start, and how far the third may move it."""
-        d, m = self.states, inputs.shape[1]
-        at, pushes = self.bends(start, pieces), np.abs(inputs)
-        bent = np.einsum("kij,kj->ki", at[:, :, :d], states[:, 0])
-        bent = bent + np.einsum("kim,km->ki", at[:, :, d : d + m], inputs)
+        """`Motion.deviation`."""
+        return self.bent(rows, start, width, pieces, states[:, 0, :, None], inputs[:, :, None], np.ones(1))
+
+    def bent(
+        self,
+        rows: Array,
+        start: Array,
+        width: Array,
+        pieces: np.ndarray,
+        states: Array,
+        inputs: Array,
+        sizes: Array,
+    ) -> Array:
+        """How far ``rows (r, d)``, or ``(k, r, d)``, of several states are from their chords on ``[start, start +
+        width]``, ``(k, r)``: of any sum of ``states (k, d, n)`` at ``start``, driven by the first of the ``inputs (k,
+        i, n)``, each times a factor of at most its size, ``sizes (n,)``. By the second time derivative at the start,
+        and how far the third may move it."""
+        d, last = self.states, self.states + inputs.shape[1]
+        at = self.bends(start, pieces)[:, :, :last]
+        bent = at[:, :, :d] @ states + at[:, :, d:] @ inputs
+        begun, pushes = np.abs(states) @ sizes, np.abs(inputs) @ sizes
         most, third = self.most[pieces], self.third[pieces]
-        begun = np.abs(states[:, 0]) + width[:, None] * np.einsum("kim,km->ki", most[:, :, d : d + m], pushes)
-        turned = np.einsum("kij,kj->ki", third[:, :, :d], self.grown(pieces, width, begun))
-        turned = turned + np.einsum("kim,km->ki", third[:, :, d : d + m], pushes)
-        sizes = np.einsum("kij,kj->ki", np.abs(at[:, :, :d]), np.abs(states[:, 0]))
-        sizes = sizes + np.einsum("kim,km->ki", np.abs(at[:, :, d : d + m]), pushes)
-        turned = width[:, None] * turned + rounding(self.terms + m) * sizes
-        along = np.abs(bent @ rows.T) + turned @ np.abs(rows).T
+        reached = begun + width[:, None] * np.einsum("kim,km->ki", most[:, :, d:last], pushes)
+        turned = np.einsum("kij,kj->ki", third[:, :, :d], self.grown(pieces, width, reached))
+        turned = turned + np.einsum("kim,km->ki", third[:, :, d:last], pushes)
+        added = np.einsum("kij,kj->ki", np.abs(at), np.concatenate([begun, pushes], axis=1))
+        turned = width[:, None] * turned + rounding(self.terms + inputs.shape[1]) * added
+        along = np.abs(rows @ bent) @ sizes + (np.abs(rows) @ turned[:, :, None])[:, :, 0]
         return np.asarray((width**2 / 8)[:, None] * along * OUTWARD)
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:

@@ -104,9 +104,12 @@ def _walk_varying(
     state = np.repeat(response.initial_state[:, None], count, axis=1)
     state = state if initial_states is None else np.ascontiguousarray(initial_states.T)
     yield state
+    decided, before = np.zeros(0), -2
     for piece, (B, E) in enumerate(zip(grid.of_modes(steps.B[0]), grid.of_modes(steps.E[0]), strict=True)):
         acting = int(grid.control_piece[piece])
-        drive = B @ (control(acting, state) if callable(control) else control[:, acting, None])
+        if acting != before:
+            decided, before = control(acting, state) if callable(control) else control[:, acting, None], acting
+        drive = B @ decided
         if disturbances is not None:
             drive = drive + E @ disturbances[:, :, grid.disturbance_piece[piece]].T
         state = steps.Phi[0, piece] @ state + steps.Gamma[0, piece] @ drive

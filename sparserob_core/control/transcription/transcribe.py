@@ -104,9 +104,6 @@ def prepare(
     stated, problem = problem, accumulated(problem)
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
-    if policy is not None and mask.any() and isinstance(problem.system, VaryingSystem):
-        expected = "open_loop where the system changes with time, of which feedback is not proven yet"
-        raise InputError(path="policy", expected=expected, got="one that answers what is measured")
     if problem.execution is not None and mask.any():
         expected = "none under feedback, where the size of the control, and with it that of its error, answers too"
         raise InputError(path="execution", expected=expected, got=f"{np.asarray(problem.execution).tolist()}")

@@ -16,7 +16,7 @@ from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.reach.disturbance_support import Scene, bounded
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.tube import Polynomial
-from sparserob_core.checker.reach.varying import VaryingFlow, prefixes
+from sparserob_core.checker.reach.varying.flow import VaryingFlow, prefixes
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array

@@ -1,5 +1,5 @@
-"""Guards checker/reach/varying: balls around the flow of a system that changes with time hold closed forms, also where
-the series are cut short, and stay narrow over many pieces."""
+"""Guards checker/reach/varying/flow: balls around the flow of a system that changes with time hold closed forms, also
+where the series are cut short, and stay narrow over many pieces."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 pytest.importorskip("flint")
 from flint import arb, arb_series, ctx
 
-import sparserob_core.checker.reach.varying as varying
+import sparserob_core.checker.reach.varying.flow as varying
 from sparserob_core.checker.arithmetic.jets import kepler_root, kepler_series
 from sparserob_core.checker.arithmetic.timed import Timed
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.varying import VaryingFlow
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.control.problem.system import VaryingSystem
 from tests.support.integration import mathieu
 

@@ -1,4 +1,4 @@
-"""Guards checker/reach/varying_tube: polynomials on cells of time of systems that change with time are above closed
+"""Guards checker/reach/varying/tube: polynomials on cells of time of systems that change with time are above closed
 forms of the worst case, close to them on short cells, and where series are cut short."""
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import pytest
 pytest.importorskip("flint")
 from flint import arb_mat, ctx
 
-import sparserob_core.checker.reach.varying as varying
-import sparserob_core.checker.reach.varying_tube as varying_tube
+import sparserob_core.checker.reach.varying.flow as varying
+import sparserob_core.checker.reach.varying.tube as varying_tube
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.tube import Polynomial
-from sparserob_core.checker.reach.varying import VaryingFlow
-from sparserob_core.checker.reach.varying_tube import VaryingTube
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet

@@ -1,0 +1,1 @@
+"""Known systems that change with time, as power series of it."""

@@ -1,0 +1,84 @@
+"""What a system that changes with time does whose control answers what it measures, in balls: what `ClosedLoop` is to
+the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.preimages import Pushed
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb_mat
+
+ORDER = 8  # of the states in the time on a cell; what comes after counts twice, half of it takes shorter cells
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class VaryingLoop(ClosedLoop):
+    """The same of a system of which ``law`` is the flow."""
+
+    law: VaryingFlow | None = None
+
+    @cached_property
+    def _flow(self) -> VaryingFlow:
+        assert self.law is not None
+        return self.law
+
+    @cached_property
+    def drives(self) -> list[arb_mat]:
+        """What acts on each piece of the grid, nominally and as answers: control, drift and disturbance, ``(m + mw, 1 +
+        Q)``."""
+        found, none = [], [0.0] * self.starts[-1]
+        for piece in range(len(self.grid) - 1):
+            k, block = self._places(piece)
+            given = [balls([1.0, *none])] if self.system.c is not None else []
+            for b, middle in enumerate(self.middle.tolist()):
+                row = [middle, *none]
+                if self.blocks:
+                    row[1 + block * self.width + b] = 1.0
+                given.append(balls(row))
+            found.append(stacked([*self.inputs(k).tolist(), *given]))
+        return found
+
+    def _moved(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
+        Phi, Gamma, Delta = self._flow.over(start, stop)
+        both = stacked([[*one, *two] for one, two in zip(Gamma.tolist(), Delta.tolist(), strict=True)])
+        return Phi, both * self.drives[piece]
+
+    def _passed(self, piece: int) -> tuple[arb_mat, arb_mat]:
+        Phi, _, Delta = self._flow.over(self.grid[piece], self.grid[piece + 1])
+        return Phi, Delta
+
+    def pushed(self, entries: Sequence[int]) -> Pushed:
+        """As that of `ClosedLoop`, from which numbers are other than 0 at any time alone."""
+        A, E = (np.array(self._flow.links[name][0].tolist(), dtype=float) != 0.0 for name in ("A", "E"))
+        pattern = E[:, list(entries)]
+        for _ in range(len(A) - 1):
+            pattern = pattern | (A.astype(int) @ pattern.astype(int) > 0)
+        return Pushed(pattern, int(pattern.any(axis=1).sum()), int(pattern.any(axis=0).sum()))
+
+    def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
+        """As that of `ClosedLoop`, within one segment of the system: the states are a power series of the share ``s``
+        of the cell, whose term ``a s^n`` is at most ``(n - 1) n^(-n / (n - 1)) |a|`` from its chord."""
+        terms, rest = self._flow.within(start, stop, ORDER)
+        both = stacked([*self.state(piece, start).tolist(), *self.drives[piece].tolist()])
+        line, sizes = exactly(rows), np.concatenate([[1.0], self.radii])
+        total = np.zeros((line.nrows(), sizes.size))
+        for n, term in enumerate(terms[2:], 2):
+            found = Enclosed.of(line * (term * both))
+            total += (np.abs(found.mid) + found.rad) * ((n - 1) * n ** (-n / (n - 1)) * OUTWARD)
+        found = Enclosed.of(line * (rest * both))  # at both ends too, of which the chord takes the larger share
+        total += 2.0 * (np.abs(found.mid) + found.rad)
+        return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)
