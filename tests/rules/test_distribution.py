@@ -8,12 +8,14 @@ import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import venv
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from ruamel.yaml import YAML
 
 from tests.support.places import ROOT
 
@@ -38,6 +40,12 @@ def run(command: list[str | Path], place: Path, **variables: str) -> str:
 @pytest.mark.parametrize("module", ["sparserob", "sparserob_core"])
 def test_the_command_is_a_module_of_either_name(module: str, tmp_path: Path) -> None:
     assert run([sys.executable, "-m", module, "--version"], tmp_path) == f"sparserob {version('sparserob')}\n"
+
+
+def test_whoever_cites_it_cites_the_version_that_the_package_states_and_the_changelog_tells() -> None:
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+    assert YAML(typ="safe").load(ROOT / "CITATION.cff")["version"] == stated
+    assert f"\n## {stated}" in (ROOT / "CHANGELOG.md").read_text("utf-8")
 
 
 def test_the_name_of_the_command_says_what_to_import() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -93,6 +94,7 @@ def _status(arguments: Sequence[str]) -> int:
 def _usage(error: click.ClickException) -> str:
     """What is wrong with the command line, in one line, with the command that says what is right."""
     said = " ".join(error.format_message().split()).rstrip(".")
+    said = re.sub(r"\\u(dc[89a-f][0-9a-f])", lambda byte: chr(int(byte[1], 16)), said)  # click names things by `repr`
     context = error.ctx if isinstance(error, click.UsageError) else None
     return f"{said[:1].lower()}{said[1:]}" + (
         "" if context is None else f" (`{context.command_path} --help` says more)"

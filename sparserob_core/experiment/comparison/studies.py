@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ def read_profiles(studies: Sequence[Path], accuracy: float, measure: Measure | N
         if len(study.table) < study.points:
             raise InputError(
                 f"{directory}: expected a finished study, got {len(study.table)} of {study.points} points; "
-                f"sparserob sweep --resume {directory} goes on with it"
+                f"sparserob sweep --resume {quote(str(directory))} goes on with it"
             )
         titles.append(study.title)
         places = [directory / RUNS / str(row["run"]) for row in study.table]

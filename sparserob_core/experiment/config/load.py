@@ -10,6 +10,7 @@ from typing import Any, final
 
 from pydantic import ValidationError
 
+from sparserob_core.encodings import name_of, path_of
 from sparserob_core.errors import ConfigError, InputError, Path, PluginError, UnknownPluginError, dotted
 from sparserob_core.experiment.config.matrices.files import resolve
 from sparserob_core.experiment.config.overrides import Override, apply_override, parse_overrides
@@ -115,7 +116,7 @@ def _registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...
         return load_registry()
     on_command_line = any(change.path[0] == "plugins" for change in changes)
     folder = File.cwd() if on_command_line else source.folder
-    data["plugins"] = [str((folder / file).resolve()) for file in files]
+    data["plugins"] = [name_of((folder / path_of(file)).resolve()) for file in files]
     try:
         return load_registry(data["plugins"])
     except PluginError as error:

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from sparserob_core.encodings import as_utf8
 from sparserob_core.errors import ConfigError, Path, dotted
 from sparserob_core.experiment.plugins.messages import shown
 
@@ -30,23 +30,12 @@ def parse_overrides(
     if isinstance(given, Mapping):
         return [Override(_path(key), value, f"{key}={value}") for key, value in given.items()]
     found = []
-    for text in map(_as_utf8, given):
+    for text in (as_utf8(argument, "strict") for argument in given):
         key, equals, value = text.partition("=")
         if not equals:
             raise ConfigError(f"override {shown(text)}: expected key=value, for example method.name=nominal")
         found.append(Override(_path(key), parse(value), text))
     return found
-
-
-def _as_utf8(text: str) -> str:
-    """The bytes of a command line's argument as UTF-8, the encoding of configs: a narrower locale (``LC_ALL=C``) leaves
-    those that it does not know as lone surrogates (PEP 383)."""
-    if not any("\ud800" <= character <= "\udfff" for character in text):
-        return text
-    try:
-        return os.fsencode(text).decode("utf-8")
-    except UnicodeError:  # of no encoding that is known: the value is refused as it stands
-        return text
 
 
 def _path(key: str) -> Path:

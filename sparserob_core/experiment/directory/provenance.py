@@ -11,6 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from sparserob_core.encodings import path_of
 from sparserob_core.experiment.config.plain import identity
 
 PATIENCE = 5.0  # seconds for git
@@ -31,7 +32,7 @@ def provenance(plain: Mapping[str, Any], git: Mapping[str, Any] | None) -> dict[
             "cores": cores(),
             "python": f"{platform.python_implementation()} {platform.python_version()}",
         },
-        "plugins": {str(file): _digest(Path(file)) for file in plain.get("plugins") or ()},
+        "plugins": {str(file): _digest(path_of(file)) for file in plain.get("plugins") or ()},
     }
 
 

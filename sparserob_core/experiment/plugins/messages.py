@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel
 
+from sparserob_core.encodings import as_utf8
 from sparserob_core.errors import InputError, Path, dotted
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ class Complaint:
 
 def shown(value: object) -> str:
     """A short text of a value, in the words of a config."""
+    value = as_utf8(value) if isinstance(value, str) else value
     text = {"None": "null", "True": "true", "False": "false"}.get(repr(value), repr(value))
     return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."
 

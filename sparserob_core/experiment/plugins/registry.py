@@ -15,6 +15,7 @@ from typing import TypeAlias
 
 import pluggy
 
+from sparserob_core.encodings import path_of
 from sparserob_core.errors import PluginError, UnknownPluginError
 from sparserob_core.experiment.plugins import files
 from sparserob_core.experiment.plugins.attribution import attributed, short_repr
@@ -61,7 +62,7 @@ def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = T
 
 
 def _with_files(known: Registry, extra_paths: Iterable[str | Path], hint: str = "") -> Registry:
-    paths = tuple(Path(path).resolve() for path in extra_paths)
+    paths = tuple(path_of(path).resolve() for path in extra_paths)
     return Registry([*known.records(), *_of_files(paths)], known.failures, _disabled(), hint) if paths else known
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from sparserob_core.arguments import is_whole
+from sparserob_core.encodings import name_of, path_of
 from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.matrices.files import resolve
@@ -229,7 +230,11 @@ def _stored(source: Source) -> Plan:
         changes = [*_changes(data.get("overrides")), *parse_axes(data.get("axes"))]
     except InputError as error:
         raise ConfigError(f"{source.where(('axes', *error.path))}: {error}") from None
-    below = read_source(source.folder / base) if isinstance(base, str) else replace(source, data=dict(base), text="")
+    below = (
+        read_source(source.folder / path_of(base))
+        if isinstance(base, str)
+        else replace(source, data=dict(base), text="")
+    )
     return Plan(_based(below), tuple(changes), points, number, seed, source.name)
 
 
@@ -261,7 +266,7 @@ def _based(source: Source) -> Source:
     list(resolve(data, lambda _: source.folder))  # what is wrong with one is said where a config is checked
     files = data.get("plugins")
     if isinstance(files, list) and all(isinstance(file, str) for file in files):
-        data["plugins"] = [str((source.folder / file).resolve()) for file in files]
+        data["plugins"] = [name_of((source.folder / path_of(file)).resolve()) for file in files]
     if not data.get("title"):
         data["title"] = Path(source.name).stem
     return replace(source, data=data)
@@ -270,7 +275,7 @@ def _based(source: Source) -> Source:
 def _absolute(axis: Axis) -> Axis:
     if axis.path != ("plugins",) or not isinstance(axis.values[0], list):
         return axis
-    files = [str(Path(str(file)).resolve()) for file in axis.values[0]]
+    files = [name_of(path_of(str(file)).resolve()) for file in axis.values[0]]
     return replace(axis, values=(files,), written=files)
 
 

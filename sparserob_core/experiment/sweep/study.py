@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import Any, final, overload
 
 from sparserob_core.brief import brief
@@ -110,7 +111,7 @@ def remarks_of(study: Study) -> Iterator[str]:
         yield f"{cut} ended at a time limit; they run again when the study is resumed"
     yield from study.remarks
     if study.stopped:
-        yield f"{study.stopped}; what is left: sparserob sweep --resume {study.directory}"
+        yield f"{study.stopped}; what is left: sparserob sweep --resume {quote(str(study.directory))}"
 
 
 def _by_status(table: Sequence[Row]) -> tuple[list[str], list[list[str]]]:

@@ -13,13 +13,17 @@ from typing import Any, TextIO, cast, final
 
 import click
 
+from sparserob_core.encodings import as_utf8
+
 EXIT = {"certified": 0, "verified": 0, "infeasible": 3, "refuted": 4, "undecided": 4, "failed": 5}
 
 
 def printable(text: str) -> str:
     """The same text with every control character written out, as in ``\\x1b``, but line feeds: what a config says must
-    not steer the terminal."""
-    return "".join(one if one == "\n" or one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+    not steer the terminal. Bytes of a path that a narrow locale has no letters for are read as UTF-8."""
+    return "".join(
+        one if one == "\n" or one.isprintable() else one.encode("unicode_escape").decode() for one in as_utf8(text)
+    )
 
 
 @final
@@ -47,7 +51,7 @@ def output() -> TextIO:
 
 def say(text: str) -> None:
     """Print a line."""
-    click.echo(text, file=output())
+    click.echo(as_utf8(text), file=output())
 
 
 def print_json(data: Any) -> None:

@@ -14,7 +14,8 @@ from tests.support.stub import Command
 
 
 def test_a_run_prints_a_table_and_where_everything_is(config: Path, process: Command) -> None:
-    done = process("run", config, "--out", "out", "--no-figures")
+    patient = "observers=[{name: progress, patience: 600}]"  # however slow the machine is, no progress is shown
+    done = process("run", config, patient, "--out", "out", "--no-figures")
     assert done.returncode == 0, done.stderr
     for name in (
         "lower bound",

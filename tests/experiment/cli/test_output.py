@@ -115,4 +115,4 @@ def test_commands_say_what_they_say_through_one_door() -> None:
         for name, line in lines
         if re.search(r"(?<![.\w])print\(|click\.echo|sys\.stdout\.write", line) and "err=True" not in line
     ]
-    assert astray == ["printing.py: click.echo(text, file=output())"]
+    assert astray == ["printing.py: click.echo(as_utf8(text), file=output())"]

@@ -22,6 +22,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.cli.shell.process import hand_back_output, open_streams
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.lock import GUARD, NAME, Lock
+from sparserob_core.experiment.terminal.printing import printable, say
 from tests.support.stub import Command
 
 TELLING = '''
@@ -477,10 +478,14 @@ NARROW = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE":
 @pytest.mark.slow
 def test_titles_overrides_and_paths_outlive_a_locale_that_has_no_letters_for_them(config: Path, tmp_path: Path) -> None:
     there = config.rename(tmp_path / "überall.yaml")
-    command = [sys.executable, "-m", "sparserob_core", "run", there, "title=Wärme in °C", "--no-figures", "--out", "rü"]
+    (tmp_path / "stub.py").rename(tmp_path / "stüb.py")
+    there.write_text(there.read_text("utf-8").replace("stub.py", "stüb.py"), "utf-8")
+    given = ["title=Wärme in °C", "observers=[{name: progress, patience: 600}]", "--no-figures", "--out", "rü"]
+    command = [sys.executable, "-m", "sparserob_core", "run", there, *given]
     done = subprocess.run(command, cwd=tmp_path, env=NARROW, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
-    assert done.stdout.splitlines()[0] == rb"W\xe4rme in \xb0C"
+    first, *_, last = done.stdout.decode().splitlines()
+    assert (first, last) == ("Wärme in °C", "written to rü")
     assert "title: Wärme in °C" in (tmp_path / "rü" / "config.yaml").read_text(encoding="utf-8")
 
 
@@ -497,9 +502,29 @@ def test_the_interpreter_gets_its_own_kind_of_output_back(monkeypatch: pytest.Mo
     written = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
     open_streams()
-    print("é", end="")  # what ASCII has no letter for is written out
+    print("é", end="")  # ASCII says nothing of the bytes of letters that it has not
     assert type(sys.stdout) is not io.TextIOWrapper
     hand_back_output()
     assert type(sys.stdout) is io.TextIOWrapper
     sys.stdout.flush()
-    assert written.getvalue() == rb"\xe9"
+    assert written.getvalue().decode() == "é"
+
+
+@pytest.mark.parametrize(
+    ("encoding", "expected"),
+    [
+        ("ascii", "läufe ホ \\xe4".encode()),
+        ("utf-8", "läufe ホ \\xe4".encode()),
+        ("latin-1", b"l\xe4ufe \\u30db \\xe4"),
+    ],
+)
+def test_a_path_that_is_printed_can_be_pasted_unless_its_bytes_may_steer_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, encoding: str, expected: bytes
+) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding=encoding))
+    open_streams()
+    say(printable(("läufe ホ ".encode() + b"\xe4").decode("ascii", "surrogateescape")))
+    hand_back_output()
+    sys.stdout.flush()
+    assert written.getvalue() == expected + b"\n"

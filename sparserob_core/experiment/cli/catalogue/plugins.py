@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import click
@@ -78,5 +79,5 @@ def new_plugin(kind: str, name: str, out: str) -> int:
     from sparserob_core.experiment.scaffold.new_plugin import new_plugin as write
 
     folder = write(kind, name, out)
-    say(f"written to {folder}; next: cd {folder} && pip install -e '.[test]' && pytest")
+    say(f"written to {folder}; next: cd {quote(str(folder))} && pip install -e '.[test]' && pytest")
     return 0

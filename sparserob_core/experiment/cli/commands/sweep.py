@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -123,7 +124,11 @@ def sweep(
         print_json({**study.summary(), "table": study.table})
     elif not quiet:
         print_table(study.title, *shown(study))
-        whole = "" if point is None else f"; the table of all points: sparserob sweep --resume {study.directory}"
+        whole = (
+            ""
+            if point is None
+            else f"; the table of all points: sparserob sweep --resume {quote(str(study.directory))}"
+        )
         for remark in (*remarks_of(study), f"written to {study.directory}{whole}"):
             say(printable(remark))
     status = 5 if study.failed else 0

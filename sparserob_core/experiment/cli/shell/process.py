@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import codecs
 import errno
 import io
 import os
@@ -131,8 +132,17 @@ def open_streams() -> None:
         sys.stdout = Output(open(_own_descriptor(), "wb"))  # noqa: SIM115
     elif type(sys.stdout) is io.TextIOWrapper:
         sys.stdout = _rewrapped(sys.stdout, Output)
-        # A title may hold what a narrow locale has no letters for: it is written out, as it is on the error stream.
-        sys.stdout.reconfigure(errors="backslashreplace")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            _give_letters(stream)
+
+
+def _give_letters(stream: io.TextIOWrapper) -> None:
+    """Let a stream take every title and path. ASCII says nothing of the other bytes: there they are UTF-8, as they are
+    in configs and nearly always in names of files, so that a path that was printed can be pasted. What another encoding
+    has no letters for is written out: the bytes of UTF-8 may be control characters there."""
+    narrow = codecs.lookup(stream.encoding).name == "ascii"
+    stream.reconfigure(encoding="utf-8" if narrow else None, errors="backslashreplace")
 
 
 def _own_descriptor() -> int:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.encodings import path_of
 from sparserob_core.errors import InputError, Path
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
 from sparserob_core.experiment.config.matrices.packed import Packed, checked, pack, shape_of, spread
@@ -57,7 +58,7 @@ def _read(given: Mapping[str, object], folder: File, known: dict[File, dict[str,
         raise InputError(path="file", expected=f"a file whose name ends with {SUFFIX}", got=shown(stated))
     if not isinstance(name, str) or not name:
         raise InputError(path="name", expected="the name of a matrix in the file", got=shown(name))
-    file = folder / stated
+    file = folder / path_of(stated)
     if file not in known:
         if not file.is_file():
             raise InputError(path="file", expected=f"a file, relative to {folder}", got=f"{stated}, which is none")
