@@ -56,10 +56,8 @@ class Dask(sr.ExecutorFactory, sr.Options):
     @contextmanager
     def open(self) -> Iterator[Executor]:
         """See `sparserob_core.ExecutorFactory`."""
-        try:
-            from sparserob_dask.cluster import connected, started
-        except ModuleNotFoundError as error:
-            raise sr.UnknownPluginError(f"executor 'dask': {sr.not_installed('distributed')}") from error
+        from sparserob_dask.cluster import connected, started
+
         with sr.one_thread():  # here, too: what this process adds up, it adds up as the workers do
             if self.address is not None:
                 with connected(self.address, self.timeout) as executor:
@@ -72,4 +70,9 @@ class Dask(sr.ExecutorFactory, sr.Options):
 @sr.hookimpl
 def sparserob_executors() -> Iterator[sr.ExecutorPlugin]:
     """Offer ``dask``."""
-    yield sr.ExecutorPlugin(name="dask", factory=Dask, summary="a dask cluster, of this machine or of many (extra)")
+    yield sr.ExecutorPlugin(
+        name="dask",
+        factory=Dask,
+        summary="a dask cluster, of this machine or of many (extra)",
+        needs=("distributed", "distributed"),
+    )

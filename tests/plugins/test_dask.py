@@ -23,17 +23,6 @@ def opened(**options):
     return REGISTRY.build("executor", "dask", options).open()
 
 
-def test_a_missing_package_is_named_with_the_extra_that_brings_it(monkeypatch):
-    monkeypatch.delitem(sys.modules, "sparserob_dask.cluster", raising=False)
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    monkeypatch.setitem(sys.modules, "cloudpickle", None)
-    with (
-        pytest.raises(sr.UnknownPluginError, match=r"distributed is not installed; `pip install 'distributed>="),
-        opened(),
-    ):
-        pass
-
-
 @pytest.mark.parametrize("options", [{"workers": 2}, {"host": "0.0.0.0"}])
 def test_a_running_cluster_has_its_own_workers(options):
     with pytest.raises(sr.InputError, match=rf"{next(iter(options))}: expected nothing beside address"):

@@ -250,7 +250,12 @@ def _cost(case: Case) -> str:
         return _counted(case)
     derived = case.price.of(case.pieces) if case.policy is None else _feedback(case).cost()
     _agrees("cost", number(case.certificate, "cost"), derived, CANCELLED * added_up(case))
-    return f"J = {float(derived.mid()):.12g}"
+    return f"J = {float(derived.mid()):.12g}{_effort(case)}"
+
+
+def _effort(case: Case) -> str:
+    """The unit of the cost, with a space before it, where it is known."""
+    return f" {unit}" if (unit := case.problem.cost_unit) else ""
 
 
 def _counted(case: Case) -> str:
@@ -264,7 +269,7 @@ def _counted(case: Case) -> str:
     if case.letters is not None and not np.isin(case.control.control(case.theta), case.letters).all():
         raise Broken(f"the control takes other values than {list(case.letters)}")
     unit = f" {case.problem.names.time}" if case.problem.names.time else ""
-    return f"it acts for {acted * total:.9g}{unit} of {total:.9g}{unit}, J = {float(derived.mid()):.12g}"
+    return f"it acts for {acted * total:.9g}{unit} of {total:.9g}{unit}, J = {float(derived.mid()):.12g}{_effort(case)}"
 
 
 def _agrees(name: str, written: float, derived: arb, scale: float) -> None:

@@ -97,6 +97,18 @@ class Names:
         """The name of a component of the disturbance, such as ``w1``."""
         return self.disturbances[index] if self.disturbances else f"w{index + 1}"
 
+    @property
+    def effort(self) -> str:
+        """The unit of a control's integral over time, where every control has the same; empty where it is not known. A
+        rate's time cancels: ``l/s`` over ``s`` is ``l``, ``m/s^2`` over ``s`` is ``m/s``."""
+        unit = next(iter(self.control_units), "")
+        if not unit or not self.time or set(self.control_units) != {unit}:
+            return ""
+        for rate, left in ((f"/{self.time}^2", f"/{self.time}"), (f"/{self.time}", "")):
+            if unit.endswith(rate) and len(unit) > len(rate):
+                return unit.removesuffix(rate) + left
+        return f"{unit} {self.time}"
+
     def _texts(self, field: str) -> tuple[str, ...]:
         given = getattr(self, field)
         if isinstance(given, str) or not all(isinstance(text, str) for text in given):

@@ -371,7 +371,9 @@ def _units(case: Case, summary: Mapping[str, Any]) -> list[str]:
     ]
     different = [unit for unit in told if not isinstance(unit, str) or unit not in known]
     wrong = [f"units: {unit} is none of the config's" for unit in dict.fromkeys(map(repr, different))]
-    for key, mine in (("time", names.time), ("states", list(names.state_units))):
+    effort = case.problem.cost_unit
+    cost = names.time if case.counts else effort
+    for key, mine in (("time", names.time), ("states", list(names.state_units)), ("cost", cost), ("J", effort)):
         wrong += [f"units: {key} is {said[key]!r}, not {mine!r}"] if key in said and said[key] != mine else []
     return wrong
 

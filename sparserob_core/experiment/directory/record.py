@@ -71,8 +71,8 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
 
 
 def units_of(model: Transcription, result: Result) -> dict[str, Any]:
-    """The units of what is told: of ``time``, of the ``states``, of every row of a constraint (``rows``, by its name)
-    and of the ``worst`` violation; nothing where the problem names none."""
+    """The units of what is told: of ``time``, of the ``states``, of the ``cost`` and its bounds, of ``J``, of every row
+    of a constraint (``rows``, by its name) and of the ``worst`` violation; nothing where the problem names none."""
     names = model.problem.names
     if not (names.time or names.state_units or names.control_units):
         return {}
@@ -83,7 +83,15 @@ def units_of(model: Transcription, result: Result) -> dict[str, Any]:
     worst = result.worst
     mine = [] if worst is None else rows.get(worst.constraint, [])
     measured = mine[0 if len(mine) == 1 else worst.row] if worst is not None and mine else ""
-    return {"time": names.time, "states": list(names.state_units), "rows": rows, "worst": measured}
+    effort = model.problem.cost_unit
+    return {
+        "time": names.time,
+        "states": list(names.state_units),
+        "cost": effort if result.sparsest is None else names.time,
+        "J": effort,
+        "rows": rows,
+        "worst": measured,
+    }
 
 
 def _tolerance(proof: Proof) -> dict[str, Any]:

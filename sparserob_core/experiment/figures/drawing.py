@@ -124,6 +124,7 @@ def _data(
         cost_scale=program.added(decision) if decision.size == program.n and not counts else 0.0,
         counts=counts,
         cost_of="" if counts else problem.cost.words(),
+        cost_unit=problem.names.time if counts else problem.cost_unit,
         active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,
         cost=cost,
         names=problem.names,

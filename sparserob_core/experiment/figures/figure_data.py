@@ -105,9 +105,10 @@ class FigureData:
     every disturbance and parameter; ``walls`` the path and terminal constraints on single components; ``active_times``
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
     the relative gap that was asked for, ``cost_scale`` what is added up to the cost, ``cost_of`` what is
-    added up to it, where that is not the L1 norm alone, ``counts`` whether cost means the time that the control acts,
-    ``names`` what everything is called, ``plane`` where the system moves, if the problem says that it does so in one,
-    ``push (m, K)`` the switching function, how hard the constraints push the control, where that is known.
+    added up to it, where that is not the L1 norm alone, ``cost_unit`` what it is measured in, where that is known,
+    ``counts`` whether cost means the time that the control acts, ``names`` what everything is called, ``plane``
+    where the system moves, if the problem says that it does so in one, ``push (m, K)`` the switching function, how
+    hard the constraints push the control, where that is known.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and
@@ -134,6 +135,7 @@ class FigureData:
     tolerance: float | None = None
     cost_scale: float = 0.0
     cost_of: str = ""
+    cost_unit: str = ""
     alone_lower: Array | None = None
     alone_upper: Array | None = None
     control_least: Array | None = None

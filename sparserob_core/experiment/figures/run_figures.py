@@ -297,7 +297,8 @@ def draw_convergence(data: FigureData) -> Figure:
     upper = np.array([entry.upper_bound for entry in data.history])
     best = float(upper.min())
     _draw_bounds(bounds, rounds, lower, upper, best)
-    bounds.set_ylabel("time of action" if data.counts else "cost $J$")
+    unit = f" [{plain(data.cost_unit)}]" if data.cost_unit else ""
+    bounds.set_ylabel(("time of action" if data.counts else "cost $J$") + unit)
     _draw_gaps(gaps, rounds, np.array([relative_gap(bound, best, data.cost_scale) for bound in lower]), data)
     bounds.set_title(data.title)
     gaps.set_xlim(0.6, len(data.history) + 0.4)
@@ -335,7 +336,8 @@ def _title(ax: Axes, title: str, summary: str) -> None:
 
 def _summary(data: FigureData) -> str:
     said = f" ({data.cost_of})" if data.cost_of else ""
-    known = [] if data.cost is None else [f"{data.cost:.6g}"]
+    unit = f" {plain(data.cost_unit)}" if data.cost_unit else ""
+    known = [] if data.cost is None else [f"{data.cost:.6g}{unit}"]
     parts = [f"acts for {text}" if data.counts else f"$J$ = {text}{said}" for text in known]
     if data.active_fraction is not None:
         parts.append(f"active {100 * data.active_fraction:.1f} % of the time")

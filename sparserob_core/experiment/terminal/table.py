@@ -50,12 +50,12 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     units = summary.get("units") or {}
     rows = [
         ("status", f"{summary['status']}: {summary['message']}"),
-        ("cost", _number(summary["cost"], ".9g")),
+        ("cost", _amount(summary["cost"], units.get("cost"))),
         ("cost of", summary.get("cost_of") or "unknown"),
-        ("lower bound", _number(summary["lower_bound"], ".9g")),
-        ("upper bound", _number(summary["upper_bound"], ".9g")),
+        ("lower bound", _amount(summary["lower_bound"], units.get("cost"))),
+        ("upper bound", _amount(summary["upper_bound"], units.get("cost"))),
         ("relative gap", _number(summary["gap"], ".2e")),
-        ("any causal policy", _causal(summary)),
+        ("any causal policy", _causal(summary, units.get("cost"))),
         ("worst violation", _worst(worst, units, summary.get("parameters") or ())),
         ("proven to", _tolerances(summary.get("tolerances") or {}, units.get("rows") or {})),
         ("equalities", _equalities(summary.get("equalities"))),
@@ -63,7 +63,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("rounds", str(counts["rounds"])),
         ("solved by", _solved_by(counts.get("solved_by"))),
         ("share of time active", _active(sparsity)),
-        ("J", _number(summary.get("J"), ".9g")),
+        ("J", _amount(summary.get("J"), units.get("J"))),
         ("sparsest", sparsity.get("verdict") or "unknown"),
         ("fewest active", _fewest(sparsity.get("fewest_active"), sparsity.get("channels"))),
         ("switches", _number(sparsity["switches"], "d")),
@@ -109,12 +109,17 @@ def _fewest(known: Mapping[str, Any] | None, channels: int | None) -> str:
     return f"every admissible control acts at least {lower} of the time{mean}{above}"
 
 
-def _causal(summary: Mapping[str, Any]) -> str:
+def _amount(value: float | None, unit: str | None) -> str:
+    """A cost with its unit, where both are known."""
+    return "unknown" if value is None else _measured(value, unit or "", ".9g")
+
+
+def _causal(summary: Mapping[str, Any], unit: str | None) -> str:
     """What no causal policy can do."""
     if summary.get("causal_infeasible"):
         return "none exists: proven"
     lower = summary.get("causal_lower_bound")
-    return "unknown" if lower is None else f"costs at least {lower:.9g}"
+    return "unknown" if lower is None else f"costs at least {_amount(lower, unit)}"
 
 
 def _number(value: Any, form: str) -> str:
@@ -169,5 +174,5 @@ def _worst(worst: Mapping[str, Any], units: Mapping[str, Any], parameters: Seque
     return f"{worst['violation']:.2e}{f' {unit}' if unit else ''} in {worst['constraint']}{at}"
 
 
-def _measured(value: float, unit: str) -> str:
-    return f"{value:.6g} {unit}".rstrip()
+def _measured(value: float, unit: str, form: str = ".6g") -> str:
+    return f"{value:{form}} {unit}".rstrip()

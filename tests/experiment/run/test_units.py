@@ -51,6 +51,34 @@ def test_a_run_tells_units_row_by_row(outcome: sr.Outcome) -> None:
     assert " m in path" in rows["proven to"] and " m/s in terminal" in rows["proven to"] and " m, " in rows["proven to"]
     assert sorted(where["rows"]["terminal"]) == ["m", "m", "m/s", "m/s"]
     assert where["time"] == "s"
+    assert where["cost"] == "N s" and all(rows[key].endswith(" N s") for key in ("cost", "lower bound", "upper bound"))
+    said = {claim.name: claim.text for claim in sr.check(outcome).claims}
+    assert said["cost"].endswith(" N s")
+
+
+@pytest.mark.parametrize(
+    ("controls", "time", "more", "expected"),
+    [
+        (["kW", "kW"], "h", {}, "kW h"),
+        (["m/s^2", "m/s^2"], "s", {}, "m/s"),
+        (["l/s", "l/s"], "s", {"cost": sr.Cost(l1=2.0, group="all")}, "l"),
+        (["N", "A"], "s", {}, ""),
+        (["N", ""], "s", {}, ""),
+        (["N", "N"], "", {}, ""),
+        (["N", "N"], "s", {"weights": 2.0}, ""),
+        (["N", "N"], "s", {"weights": [[0.0, 1.0, 1.0], [1.0, 2.0, 1.0]]}, ""),
+        (["N", "N"], "s", {"cost": sr.Cost(control={"R": [[1, 0], [0, 1]]})}, ""),
+    ],
+)
+def test_a_cost_is_told_in_the_unit_of_control_and_time_where_nothing_else_is_added_up(
+    controls: list[str], time: str, more: dict[str, Any], expected: str
+) -> None:
+    system = sr.LinearSystem(A=[[0, 1], [0, 0]], B=[[0, 0], [1, 0.5]])
+    names = sr.Names(control_units=controls, time=time)
+    problem = sr.OptimalControlProblem(
+        system=system, horizon=2.0, initial_state=[1, 0], control=sr.Box([-1, -1], [1, 1]), names=names, **more
+    )
+    assert problem.cost_unit == expected
 
 
 def test_horizons_and_comparisons_have_units(outcome: sr.Outcome) -> None:
@@ -164,6 +192,8 @@ def test_tables_of_samples_and_loops_have_units(outcome: sr.Outcome) -> None:
     [
         ({"worst": "km"}, "units: 'km' is none of the config's"),
         ({"time": "h"}, "units: time is 'h', not 's'"),
+        ({"cost": "kN s"}, "units: cost is 'kN s', not 'N s'"),
+        ({"J": "s"}, "units: J is 's', not 'N s'"),
         ({"rows": 3}, "units is no mapping with rows"),
         ({"rows": {"path": 3}}, "units: 3 is none of the config's"),
     ],
