@@ -344,7 +344,8 @@ class OptimalControlProblem:
     def cost_unit(self) -> str:
         """What the cost is measured in: the unit of a control's integral over time; empty where it is not known, or
         where weights or quadratic terms give it another one, which no name states."""
-        priced = np.ndim(self.weights) == 2 or bool(np.any(np.asarray(self.weights) != 1.0))
+        weights = np.asarray(self.weights)
+        priced = weights.ndim == 2 or bool((weights != 1.0).any())
         return "" if priced or self.cost.is_quadratic else self.names.effort
 
     def _measured(self) -> Measurements | None:
