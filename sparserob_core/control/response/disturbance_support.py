@@ -192,9 +192,9 @@ class DisturbanceSupport:
     def _by_age(self, within: Array, count: int, start: Array, of_blocks: Callable[[Array], Array]) -> Array:
         """The sums of `_gathered` at such times ``within (q,)`` of the pieces ``0, ..., count``, ``(q, r, count + 1,
         j)``, since what a block receives depends on its age."""
-        flow, driven = self.lifted.backward.flows(within)
-        young = self._weights(start @ driven)[..., None, :]
-        old = self._impulses.of(start @ flow, count)
+        flown, driven = self.lifted.flown(np.broadcast_to(start, (within.size, *start.shape)), within)
+        young = self._weights(driven)[..., None, :]
+        old = self._impulses.of(flown, count)
         old = old.reshape(*old.shape[:-1], young.shape[2], young.shape[4]).swapaxes(-2, -3)
         return np.asarray(np.concatenate([of_blocks(young), of_blocks(old)], axis=2).cumsum(axis=2))
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.combination import Combination
-from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
@@ -292,8 +291,10 @@ class WorstCase:
                 known = remember(self._frozen, parameter.tobytes(), frozen(*fixed), LEGS_KEPT)
             sigma = DisturbanceSupport(known, model, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
         if self.initial is not None:
-            flows = transitions(self.response.system.modes[0].matrices(parameter[None])[0][0], times)[0]
-            sigma = sigma + self.initial.support(np.einsum("rd,kde->kre", directions, flows))
+            several = max(1, CHUNK // (r * directions.shape[1]))
+            for part in (slice(first, first + several) for first in range(0, k, several)):
+                rows = self.response.propagator.backwards(times[part], directions, parameter)
+                sigma[part] += self.initial.support(rows)
         return sigma
 
     @shaped

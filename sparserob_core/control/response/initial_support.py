@@ -180,9 +180,7 @@ class InitialSupport:
         """The lifted functionals that ``c'x(t)`` are of the state at time 0, ``(k, r, M d)``."""
         grid = self.lifted.grid
         pieces = np.clip(np.searchsorted(grid.breakpoints, times, side="right") - 1, 0, grid.pieces - 1)
-        within, which = grid.distinct(times - grid.breakpoints[pieces])
-        flow = self.lifted.backward.flows(within)[0]
-        return np.asarray(self._nodes[pieces] @ flow[which])
+        return self.lifted.flown(self._nodes[pieces], times - grid.breakpoints[pieces])[0]
 
     @cached_property
     def _nodes(self) -> Array:

@@ -40,6 +40,7 @@ from sparserob_core.control.enclosures.decoupling import (
     decoupled_transitions,
     identity,
 )
+from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.enclosures.matrix_exponential import Transitions, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.system import LinearSystem, System
@@ -265,11 +266,30 @@ class LiftedSystem:
         if size < LONG_STEP:
             found = self._by_series(start, start @ self.matrix.T + self._drive(inputs), within[:, None], size)
         else:
-            distinct, which = self.grid.distinct(within)
-            flow, driven = self.forward.flows(distinct)
-            found = np.einsum("kij,kj->ki", flow[which], start)
-            found = found + np.einsum("kij,kj->ki", driven[which], self._drive(inputs))
+            found = self._columns(start, self._drive(inputs), within)
         return np.asarray(found.reshape(within.size, self.space.size, -1))
+
+    def _columns(self, start: Array, drives: Array, within: Array) -> Array:
+        """By exponentials: ``(k, M d)`` after durations ``(k,)`` under ``drives (k, M d)``."""
+        if not self.space.nu:
+            return self.flows.columns(start, drives, within)
+        distinct, which = self.grid.distinct(within)
+        flow, driven = self.forward.flows(distinct)
+        found = np.einsum("kij,kj->ki", flow[which], start)
+        return np.asarray(found + np.einsum("kij,kj->ki", driven[which], drives))
+
+    @cached_property
+    def flows(self) -> Flows:
+        """The exponentials of a known system on vectors."""
+        return Flows(self.decoupling, self.A[0])
+
+    def flown(self, rows: Array, durations: Array) -> tuple[Array, Array]:
+        """Lifted functionals ``(k, r, M d)`` backwards over durations ``(k,)``, and their integrals on the way."""
+        if not self.space.nu:
+            return self.flows.rows(rows, durations)
+        distinct, which = self.grid.distinct(durations)
+        flow, driven = self.backward.flows(distinct)
+        return rows @ flow[which], rows @ driven[which]
 
     def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
         """The exponential series, for short steps: no matrix is built."""

@@ -18,7 +18,8 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.matrix_exponential import exponential, rounding
+from sparserob_core.control.enclosures.flows import Leaps, products
+from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response
@@ -45,13 +46,29 @@ ALIKE = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
+class _Table:
+    """What is known of one direction between the times ``starts (n + 1,)``: the integral up to each of them, or its
+    lower and upper bound, ``sums (n + 1, c)``, and of what follows it ``rows (n + 1, d)``, or polynomials with ``terms
+    (n, ORDER + 1, mw)``, what is ``lost (n,)`` by them, and what an integral may be off by, as a goal (``accuracy``)
+    and by the rounding of a time (``late``)."""
+
+    starts: Array
+    sums: Array
+    rows: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    terms: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    lost: Array = field(default_factory=lambda: np.zeros(0))
+    accuracy: float = 0.0
+    late: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class MeasurableSupport:
     """The support ``sigma`` for one set ``bound``; integrals up to the grid's breakpoints are remembered per direction
     and parameter."""
 
     response: Response
     bound: ConvexSet
-    _tables: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
+    _tables: dict[bytes, _Table] = field(default_factory=dict, repr=False)
 
     @shaped
     def __call__(
@@ -90,25 +107,22 @@ class MeasurableSupport:
         which = which.reshape(-1)
         A, _, E = self.response.system.modes[0].matrices(parameter[None])
         tables = self._known(A[0], E[0], unique, parameter, enclosed)
-        grid = self.response.grid
-        pieces = grid.locate(times)
-        within = np.clip(times - grid.breakpoints[pieces], 0.0, None)
-        starts = np.stack([tables[one][0][piece] for one, piece in zip(which, pieces, strict=True)])
-        before = np.array([tables[one][1][piece] for one, piece in zip(which, pieces, strict=True)])
-        return np.asarray(before + self._columns(A[0], E[0], starts, within, which, enclosed))
-
-    @shaped
-    def _columns(
-        self,
-        A: Float[Array, "d d"],
-        E: Float[Array, "d mw"],
-        starts: Float[Array, "l d"],
-        lengths: Float[Array, " l"],
-        member: Int[np.ndarray, " l"],
-        enclosed: bool,
-    ) -> Float[Array, "l n"]:
-        integrate = self._enclosures if enclosed else self._integrals
-        return np.asarray(integrate(A, E, starts, lengths, member).reshape(lengths.size, -1))
+        starts = tables[0].starts
+        parts = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
+        within = np.clip(times - starts[parts], 0.0, None)
+        before, found = np.array([tables[one].sums[part] for one, part in zip(which, parts, strict=True)]), None
+        if enclosed:
+            terms = np.array([tables[one].terms[part] for one, part in zip(which, parts, strict=True)])
+            lost = np.array([tables[one].lost[part] for one, part in zip(which, parts, strict=True)])
+            accuracy = np.array([table.accuracy for table in tables])[which]
+            shares = within / np.diff(starts)[parts]
+            terms = terms * (shares[:, None] ** np.arange(ORDER + 1))[..., None]
+            late = np.array([table.late for table in tables])[which]
+            found = integrated(self.bound, terms, within, accuracy) + (shares * lost + late)[:, None] * [-1.0, 1.0]
+        else:
+            rows = np.stack([tables[one].rows[part] for one, part in zip(which, parts, strict=True)])
+            found = self._integrals(A[0], E[0], rows, within, which)[:, None]
+        return np.asarray(before + found)
 
     @shaped
     def _known(
@@ -118,34 +132,26 @@ class MeasurableSupport:
         directions: Float[Array, "k d"],
         parameter: Float[Array, " nu"],
         enclosed: bool,
-    ) -> list[tuple[Array, Array]]:
-        """For each of ``directions (k, d)``: rows ``c'e^{A s}`` at the breakpoints ``(L+1, d)``, and the columns of
-        `_at` up to them, ``(L+1, n)``."""
+    ) -> list[_Table]:
+        """What is remembered of each of ``directions (k, d)``."""
         keys = [direction.tobytes() + parameter.tobytes() + bytes([enclosed]) for direction in directions]
-        new = np.array([place for place, key in enumerate(keys) if key not in self._tables], dtype=int)
-        found: dict[bytes, tuple[Array, Array]] = {key: self._tables[key] for key in keys if key in self._tables}
-        if new.size:
-            breakpoints = self.response.grid.breakpoints
-            starts = np.einsum("ki,lij->klj", directions[new], _flows(A, breakpoints))
-            lengths = np.tile(np.diff(breakpoints), new.size)
-            owner = np.repeat(np.arange(new.size), breakpoints.size - 1)
-            columns = self._columns(A, E, starts[:, :-1].reshape(-1, A.shape[0]), lengths, owner, enclosed)
-            total = np.cumsum(columns.reshape(new.size, breakpoints.size - 1, -1), axis=1)
-            for place, rows, sums in zip(new, starts, total, strict=True):
-                found[keys[place]] = (rows, np.concatenate([np.zeros((1, sums.shape[1])), sums]))
-                remember(self._tables, keys[place], found[keys[place]], TABLES_KEPT)
+        found = {key: self._tables[key] for key in keys if key in self._tables}
+        for key, direction in zip(keys, directions, strict=True):
+            if key not in found:
+                make = self._enclosing if enclosed else self._measuring
+                found[key] = remember(self._tables, key, make(A, E, direction), TABLES_KEPT)
         return [found[key] for key in keys]
 
-    @shaped
-    def _enclosures(
-        self,
-        A: Float[Array, "d d"],
-        E: Float[Array, "d mw"],
-        starts: Float[Array, "l d"],
-        lengths: Float[Array, " l"],
-        member: Int[np.ndarray, " l"],
-    ) -> Float[Array, "l 2"]:
-        """Lower and upper bounds of `_integrals`, ``(l, 2)``.
+    def _measuring(self, A: Array, E: Array, direction: Array) -> _Table:
+        """By quadrature, from breakpoint to breakpoint."""
+        breakpoints = self.response.grid.breakpoints
+        rows = _moved(A, direction[None], breakpoints[None])[0]
+        lengths, alike = np.diff(breakpoints), np.zeros(breakpoints.size - 1, dtype=int)
+        sums = np.append(0.0, np.cumsum(self._integrals(A, E, rows[:-1], lengths, alike)))
+        return _Table(breakpoints, sums[:, None], rows=rows)
+
+    def _enclosing(self, A: Array, E: Array, direction: Array) -> _Table:
+        """Lower and upper bounds, from the end of one short interval to that of the next.
 
         On short intervals a row is a polynomial ``f`` with a rest. In Bernstein's form ``f`` is a convex combination of
         its coefficients ``b_k`` with weights of equal integrals, and ``h`` is convex; so the integral is at most the
@@ -156,33 +162,34 @@ class MeasurableSupport:
 
         # In units of the states in which the matrix is small, powers of two: what is left is bounded by its norm.
         A, (units, _) = matrix_balance(A, permute=False, separate=True)
-        starts, E = starts * units, E / units[:, None]
-        total, speed = np.zeros((lengths.size, 2)), float(np.linalg.norm(A, 2))
+        E, breakpoints = E / units[:, None], self.response.grid.breakpoints
+        speed, pieces = float(np.linalg.norm(A, 2)), np.diff(breakpoints)
         # not by the norm alone, which of a matrix far from normal is much larger than what its flow does
         fastest = min(speed, max(4.0 * float(np.abs(np.linalg.eigvals(A)).max()), speed / 16.0))
-        count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0) / SHORT), 1, MOST_SHORT))
-        owner, offsets = np.repeat(np.arange(lengths.size), count), np.outer(lengths, np.arange(count) / count)
-        row = np.einsum("li,lqij->lqj", starts, _flows(A, offsets)).reshape(-1, A.shape[0])
-        lengths = lengths[owner] / count
+        count = int(np.clip(np.ceil(fastest * pieces.max() / SHORT), 1, MOST_SHORT))
+        starts = np.append(
+            (breakpoints[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), breakpoints[-1]
+        )
+        lengths, far = np.diff(starts), self.bound.radius_bound
+        row, once, sized = Leaps(A), products(A), products(np.abs(A))
+        row = row.rows(np.tile(direction * units, (lengths.size, 1)), starts[:-1])[0]
         terms, sizes, size = [row @ E], np.abs(row) @ np.abs(E), np.abs(row)
         for order in range(1, ORDER + 1):
             step = (lengths / order)[:, None]
-            row, size = step * (row @ A), step * (size @ np.abs(A))
+            row, size = step * np.asarray(row @ once), step * np.asarray(size @ sized)
             terms.append(row @ E)
             sizes = sizes + size @ np.abs(E)
-        far = self.bound.radius_bound
         with np.errstate(over="ignore"):
             growth = np.exp(speed * lengths) * lengths / (ORDER + 1)
         operations = ORDER * (A.shape[0] + 4) + A.shape[0] + 4 * E.shape[1] + HALVINGS
-        lost = far * (np.linalg.norm(row @ A, axis=1) * growth * np.linalg.norm(E, 2))
+        lost = far * (np.linalg.norm(np.asarray(row @ once), axis=1) * growth * np.linalg.norm(E, 2))
         lost = lengths * (lost + far * rounding(operations) * np.linalg.norm(sizes, axis=1)) * (1.0 + rounding(8))
-        np.add.at(total, owner, lost[:, None] * [-1.0, 1.0])
-        largest = np.zeros(int(member.max(initial=0)) + 1)
-        np.maximum.at(largest, member[owner], far * np.linalg.norm(sizes, axis=1))
-        accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
+        tallest, horizon = far * float(np.linalg.norm(sizes, axis=1).max(initial=0.0)), float(breakpoints[-1])
+        accuracy = ACCURACY * max(tallest * horizon, TINY)
         points = np.array(terms).swapaxes(0, 1)
-        np.add.at(total, owner, integrated(self.bound, points, lengths, accuracy[owner]))
-        return total
+        found = integrated(self.bound, points, lengths, np.full(lengths.size, accuracy)) + lost[:, None] * [-1.0, 1.0]
+        sums = np.vstack([np.zeros(2), np.cumsum(found, axis=0)])
+        return _Table(starts, sums, terms=points, lost=lost, accuracy=accuracy, late=rounding(8) * horizon * tallest)
 
     @shaped
     def _integrals(
@@ -201,14 +208,14 @@ class MeasurableSupport:
         count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0)), 1, MOST_SHORT))
         owner = np.repeat(np.arange(lengths.size), count)  # short intervals, on which the quadrature is at home
         offsets = np.outer(lengths, np.arange(count) / count)
-        starts = np.einsum("li,lqij->lqj", starts, _flows(A, offsets)).reshape(-1, A.shape[0])
+        starts = _moved(A, starts, offsets).reshape(-1, A.shape[0])
         lengths = lengths[owner] / count
         whole, size = self._quadrature(A, E, starts, lengths)
         largest = np.zeros(int(member.max(initial=0)) + 1)
         np.maximum.at(largest, member[owner], size)
         accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
         for _ in range(HALVINGS):
-            middles = np.einsum("li,lij->lj", starts, _flows(A, lengths / 2))
+            middles = _moved(A, starts, lengths[:, None] / 2)[:, 0]
             left, right = (
                 self._quadrature(A, E, starts, lengths / 2)[0],
                 self._quadrature(A, E, middles, lengths / 2)[0],
@@ -226,8 +233,7 @@ class MeasurableSupport:
     def _quadrature(
         self, A: Float[Array, "d d"], W: Float[Array, "d mw"], starts: Float[Array, "l d"], lengths: Float[Array, " l"]
     ) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
-        lines = np.einsum("lqij,jw->lqiw", _flows(A, lengths[:, None] * (NODES + 1) / 2), W)
-        values = self.bound.support(np.einsum("li,lqiw->lqw", starts, lines))
+        values = self.bound.support(_moved(A, starts, lengths[:, None] * (NODES + 1) / 2) @ W)
         return (values * WEIGHTS).sum(axis=1) * lengths / 2, np.abs(values).max(axis=1, initial=0.0)
 
 
@@ -260,11 +266,10 @@ def _halved(points: Array) -> Array:
     return np.concatenate([left, right])
 
 
-@shaped
-def _flows(A: Float[Array, "d d"], durations: Float[Array, " *k"]) -> Float[Array, "*k d d"]:
-    """``e^{A r} (..., d, d)``; of equal durations once, since directions share their times."""
-    distinct, which = np.unique(durations, return_inverse=True)
-    return np.asarray(exponential(A * distinct[:, None, None])[which.reshape(durations.shape)])
+def _moved(A: Array, rows: Array, durations: Array) -> Array:
+    """``c'e^{A r} (k, q, d)`` of ``rows (k, d)`` over ``durations (k, q)`` of their own."""
+    every = np.repeat(rows, durations.shape[1], axis=0)
+    return Leaps(A).rows(every, durations.ravel())[0].reshape(*durations.shape, -1)
 
 
 class KnownCellSupport:
@@ -317,7 +322,7 @@ class MeasurableCellSupport(KnownCellSupport):
         ``h(E' e^{A' s} c)``, or by twice its integral, mode by mode."""
         bound, lifted, comparison = self.support.bound, self.lifted, self.lifted.comparison
         rows, W = self.rows @ lifted.transform, lifted.W[0]
-        slopes = rows @ lifted.forward.flows(start)[0] @ lifted.A[0]  # (k, r, d)
+        slopes = lifted.flown(np.broadcast_to(rows, (start.size, *rows.shape)), start)[0] @ lifted.A[0]  # (k, r, d)
         reach = comparison.over(widths)
         drive = np.broadcast_to(self._drive, (start.size, self._drive.size))
         square = (widths**2 / 8)[:, None]
@@ -415,7 +420,7 @@ class Execution:
         """The derivative ``(k,)`` of `added` in the time, from the left where that jumps."""
         (A, B), (which, jumps) = self.matrices, self.jumps(control)
         ages = times[:, None] - self.breakpoints[which]
-        at = np.einsum("kd,kqde,em->kqm", directions, exponential(A * np.maximum(ages, 0.0)[..., None, None]), B)
+        at = _moved(A, directions, ages) @ B
         return np.asarray(np.einsum("kqm,mq,kq->k", np.abs(at), jumps, ages > 0.0))
 
     @shaped
@@ -493,7 +498,7 @@ class ExecutionCellSupport(KnownCellSupport):
         begun = ages + widths[:, None] > 0.0  # the others begin after the cell
         ages, width = np.where(begun, np.maximum(ages, 0.0), 0.0).ravel(), np.repeat(widths, which.size)
         rows, drive = self.rows @ lifted.transform, lifted.B[0][:, : jumps.shape[0]]
-        slopes = rows @ lifted.forward.flows(ages)[0] @ lifted.A[0]  # (k q, r, d)
+        slopes = lifted.flown(np.broadcast_to(rows, (ages.size, *rows.shape)), ages)[0] @ lifted.A[0]  # (k q, r, d)
         departure = comparison.over(width).departure
         bent = np.abs(slopes @ drive)  # (k q, r, m)
         norms = block_norms(slopes, lifted.starts)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.enclosures.flows import Leaps
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, Transitions, exponential, transitions
 from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.response.varying.expansion import Expansion
@@ -505,10 +506,7 @@ class Propagator:
         A = steps.A[0, 0]
         size = float(np.linalg.norm(A)) * float(within.max())
         if size > SHORT:
-            Phi, Gamma = self._partial(
-                steps, np.zeros(within.size, dtype=int), within, np.zeros(within.size, dtype=int)
-            )
-            return (rows[:, None] @ Phi)[:, 0], (rows[:, None] @ Gamma)[:, 0]
+            return self._jumps.rows(rows, within)
         if A.shape[0] <= FEW_STATES:  # a table of the series takes fewer calls than the series on the rows
             powers = (within / length)[:, None] ** np.arange(TERMS)
             both = (powers @ self._series_of_parts).reshape(within.size, 2, *A.shape)
@@ -519,6 +517,27 @@ class Propagator:
             return _series(A, rows, within, size)
         found = [_series(A, rows[i : i + count], within[i : i + count], size) for i in range(0, len(rows), count)]
         return np.concatenate([flown for flown, _ in found]), np.concatenate([driven for _, driven in found])
+
+    @shaped
+    def backwards(
+        self, times: Float[Array, " k"], directions: Float[Array, "r d"], parameter: Float[Array, " nu"]
+    ) -> Float[Array, "k r d"]:
+        """``e^{A't} c (k, r, d)`` at all ``times (k,)`` for all ``directions (r, d)``, at one parameter: within pieces
+        that are alike together, then over whole ones."""
+        (k, r), d = (times.size, directions.shape[0]), directions.shape[1]
+        if not self.aged(parameter.size):
+            moved = Leaps(self.steps(parameter[None]).A[0, 0]).rows(np.tile(directions, (k, 1)), np.repeat(times, r))
+            return moved[0].reshape(k, r, d)
+        pieces = self.grid.locate(times)
+        within, which = self.grid.distinct(np.maximum(times - self.grid.breakpoints[pieces], 0.0))
+        inside = self._jumps.rows(np.tile(directions, (within.size, 1)), np.repeat(within, r))[0]
+        rows = inside.reshape(-1, r, d)[which].reshape(-1, d)
+        return self._leapt(rows, np.repeat(pieces, r)).reshape(k, r, d)
+
+    @cached_property
+    def _jumps(self) -> Leaps:
+        """What a known system makes of rows over parts of pieces on which it moves far."""
+        return Leaps(self.steps(np.zeros((1, 0))).A[0, 0])
 
     @cached_property
     def _series_of_parts(self) -> Array:
@@ -699,6 +718,11 @@ class Outputs:
         r, d)``."""
         steps, grid = self.propagator.steps(self.points), self.propagator.grid
         pieces, durations, which = self.within
+        if self.propagator.expansion is None and steps.A.shape[:2] == (1, 1):
+            rows = np.tile(self.H, (durations.size, 1))
+            both = Leaps(steps.A[0, 0]).rows(rows, np.repeat(durations, self.H.shape[0]))
+            flown, driven = (part.reshape(1, durations.size, *self.H.shape) for part in both)
+            return flown, driven
         if grid.mode is None:
             found = transitions(steps.A, durations[None])
         else:

@@ -15,6 +15,7 @@ from math import ceil, factorial, log2
 
 import numpy as np
 
+from sparserob_core.control.enclosures.flows import products
 from sparserob_core.control.enclosures.matrix_exponential import exponential, rounding
 from sparserob_core.control.response.measurable import ORDER, integrated
 from sparserob_core.errors import NotEnclosable
@@ -24,7 +25,6 @@ SHORT = 0.5  # norm times length of a step: what is left of the expansion is the
 BENDING = 7  # terms of the bounds of derivatives; what is left of them is 1e-6 of the row's size in balanced units
 MOST = 2**27  # numbers that the rows of all steps take (1 GB)
 ROWS = 2**22  # numbers of rows that are expanded at once (32 MB)
-SPARSE = 0.1  # share of entries below which products with a matrix are those of its entries
 MOVED = 46  # a power of 1/2 of the horizon: what a witness loses by it is rounding, and 53 bits hold sums of such times
 INWARDS = 1e-12  # of a set without axes, what corners and boundary points may be off: thousands of roundings
 HALVED = 44  # halvings of a step across a switch: what is left of it is rounding
@@ -76,11 +76,7 @@ class Adjoint:
 
     @cached_property
     def _products(self):  # type: ignore[no-untyped-def]  # an array, or one of scipy's sparse arrays
-        if np.count_nonzero(self.A) > SPARSE * self.A.size:
-            return self.A
-        from scipy.sparse import csr_array
-
-        return csr_array(self.A)
+        return products(self.A)
 
     @cached_property
     def coefficients(self) -> Array:

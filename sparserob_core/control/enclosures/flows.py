@@ -1,0 +1,149 @@
+"""Exponentials of a matrix on vectors, each over a duration of its own: what is made is as large as the vectors, and no
+matrix is made for a duration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.enclosures.decoupling import Decoupling
+from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.shapes import Float, shaped
+from sparserob_core.sip.convex_set import Array
+
+# share of entries below which products with a matrix are those of its entries: they take some ten times as long each
+SPARSE = 0.1
+LAST = 1e-17  # relative size of the first term of the series that is left out: less than its rounding
+
+
+def products(A: Array):  # type: ignore[no-untyped-def]  # an array, or one of scipy's sparse arrays
+    """The matrix as products with it take the least time: that of its entries where few of them are not 0."""
+    if A.shape[0] < 1.0 / SPARSE or np.count_nonzero(A) > SPARSE * A.size:  # one entry of a short row is more
+        return A
+    from scipy.sparse import csr_array
+
+    return csr_array(A)
+
+
+@dataclass(frozen=True, eq=False)
+class Leaps:
+    """``c'e^{A r}`` and ``c'int_0^r e^{A s} ds``: by transitions over a short time and its doubles, and the exponential
+    series over what is left of ``r``.
+
+    The short time is a power of two, so that no duration is rounded, and ``|A|`` times it is at most 1: doubled, the
+    transitions are those that scaling and squaring makes, and what rows go through beside is few products. So
+    `exponential_rounding` bounds what is rounded here too.
+    """
+
+    A: Array
+
+    @cached_property
+    def step(self) -> float:
+        """The short time."""
+        size = float(np.abs(self.A).sum(axis=0).max())
+        return float(2.0 ** np.floor(-np.log2(size))) if size > 0.0 else 1.0
+
+    @cached_property
+    def _doubled(self) -> list[tuple[Array, Array]]:
+        flow, driven = transitions(self.A, np.array([self.step]))
+        return [(flow[0], driven[0])]
+
+    @cached_property
+    def _products(self):  # type: ignore[no-untyped-def]
+        return products(self.A)
+
+    def over(self, count: int) -> list[tuple[Array, Array]]:
+        """Transitions and their integrals over 1, 2, 4, ... short times, ``count`` of them."""
+        while len(self._doubled) < count:
+            flow, driven = self._doubled[-1]
+            self._doubled.append((flow @ flow, driven + flow @ driven))
+        return self._doubled[:count]
+
+    @shaped
+    def rows(
+        self, rows: Float[Array, "k d"], durations: Float[Array, " k"]
+    ) -> tuple[Float[Array, "k d"], Float[Array, "k d"]]:
+        """Both of ``rows (k, d)`` over ``durations (k,)``."""
+        durations = np.maximum(durations, 0.0)  # differences of times may be less by rounding
+        whole = np.floor(durations / self.step).astype(int)
+        rest = (durations - whole * self.step)[:, None]
+        flown, driven = np.array(rows, dtype=float), np.zeros(rows.shape)
+        for place, (flow, integral) in enumerate(self.over(int(whole.max(initial=0)).bit_length())):
+            far = np.flatnonzero(whole >> place & 1)
+            if far.size:
+                driven[far] += flown[far] @ integral
+                flown[far] = flown[far] @ flow
+        order, left = 1, 1.0
+        term, driven = flown, driven + rest * flown
+        while left > LAST and rest.any():
+            term = np.asarray(term @ self._products) * (rest / order)
+            flown, driven = flown + term, driven + term * (rest / (order + 1))
+            left, order = left / order, order + 1
+        return flown, driven
+
+
+@dataclass(frozen=True, eq=False)
+class Flows:
+    """``e^{D r}`` of the normal form ``D (d, d)`` of a decoupling: modes that are blocks of their own by numbers, those
+    of a group by `Leaps`."""
+
+    decoupling: Decoupling
+    D: Array
+
+    @cached_property
+    def _singles(self) -> tuple[np.ndarray, Array, np.ndarray, np.ndarray]:
+        """Where the real modes are, and their rates; where rotations ``[[a, b], [-b, a]]`` begin, and ``a + ib``."""
+        alone = [part for part, single in self.decoupling.parts if single]
+        real = np.array([part.start for part in alone if part.stop == part.start + 1], dtype=int)
+        turning = np.array([part.start for part in alone if part.stop == part.start + 2], dtype=int)
+        return real, self.D[real, real], turning, self.D[turning, turning] + 1j * self.D[turning, turning + 1]
+
+    @cached_property
+    def _groups(self) -> list[tuple[slice, Leaps, Leaps]]:
+        """Every group, on rows and on columns."""
+        found = [(part, self.D[part, part]) for part, single in self.decoupling.parts if not single]
+        return [(part, Leaps(D), Leaps(np.ascontiguousarray(D.T))) for part, D in found]
+
+    @shaped
+    def rows(
+        self, rows: Float[Array, "k r d"], durations: Float[Array, " k"]
+    ) -> tuple[Float[Array, "k r d"], Float[Array, "k r d"]]:
+        """``c'e^{D r}`` and ``c'int_0^r e^{D s} ds``, ``(k, r, d)`` each, of ``rows (k, r, d)`` over ``durations
+        (k,)``."""
+        return self._applied(rows, durations, transposed=False)
+
+    @shaped
+    def columns(
+        self, states: Float[Array, "k d"], drives: Float[Array, "k d"], durations: Float[Array, " k"]
+    ) -> Float[Array, "k d"]:
+        """Where ``states (k, d)`` are after ``durations (k,)`` under constant ``drives (k, d)``."""
+        flown, driven = self._applied(np.stack([states, drives], axis=1), durations, transposed=True)
+        return flown[:, 0] + driven[:, 1]
+
+    def _applied(self, rows: Array, durations: Array, transposed: bool) -> tuple[Array, Array]:
+        flown, driven = np.empty((2, *rows.shape))
+        real, rates, turning, spins = self._singles
+        late = durations[:, None]
+        if real.size:
+            grown, added = np.exp(rates * late), _integrals(rates, late)
+            flown[..., real], driven[..., real] = rows[..., real] * grown[:, None], rows[..., real] * added[:, None]
+        if turning.size:
+            spins = spins.conj() if transposed else spins
+            points = rows[..., turning] + 1j * rows[..., turning + 1]
+            for found, factor in ((flown, np.exp(spins * late)), (driven, _integrals(spins, late))):
+                moved = points * factor[:, None]
+                found[..., turning], found[..., turning + 1] = moved.real, moved.imag
+        for part, along, across in self._groups:
+            mine = np.ascontiguousarray(rows[..., part]).reshape(-1, part.stop - part.start)
+            every = np.repeat(durations, rows.shape[1])
+            for found, moved in zip((flown, driven), (across if transposed else along).rows(mine, every), strict=True):
+                found[..., part] = moved.reshape(*rows.shape[:-1], -1)
+        return flown, driven
+
+
+def _integrals(rates: np.ndarray, durations: Array) -> np.ndarray:
+    """``int_0^r e^{a s} ds`` of rates ``a (q,)`` over durations ``r (k, 1)``, ``(k, q)``."""
+    safe = np.where(rates == 0, 1.0, rates)
+    return np.where(rates == 0, durations, np.expm1(safe * durations) / safe)
