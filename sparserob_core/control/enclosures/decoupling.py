@@ -216,6 +216,13 @@ def _grouped(form: Array, basis: Array, clusters: list[np.ndarray]) -> tuple[Arr
     return np.hstack(bases), np.array(starts), np.array(groups)
 
 
+def pace(A: Array) -> float:
+    """About how fast a system moves: the norm of ``A (d, d)`` in units of the states in which it is balanced, or as it
+    is, whichever is less."""
+    scale = _balance(A)
+    return float(min(np.linalg.norm(A, 2), np.linalg.norm(A * scale / scale[:, None], 2)))
+
+
 def _balance(A: Array) -> Array:
     """Powers of two ``s (d,)`` such that rows and columns of ``A s_j / s_i`` are equally large (Osborne 1960)."""
     scale, start = _swept(A, np.ones(A.shape[0])), _near_one(A)

@@ -117,7 +117,7 @@ class MeasurableSupport:
             accuracy = np.array([table.accuracy for table in tables])[which]
             shares = within / np.diff(starts)[parts]
             terms = terms * (shares[:, None] ** np.arange(ORDER + 1))[..., None]
-            late = np.array([table.late for table in tables])[which]
+            late = np.where(times > 0.0, np.array([table.late for table in tables])[which], 0.0)
             found = integrated(self.bound, terms, within, accuracy) + (shares * lost + late)[:, None] * [-1.0, 1.0]
         else:
             rows = np.stack([tables[one].rows[part] for one, part in zip(which, parts, strict=True)])
@@ -171,8 +171,8 @@ class MeasurableSupport:
             (breakpoints[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), breakpoints[-1]
         )
         lengths, far = np.diff(starts), self.bound.radius_bound
-        row, once, sized = Leaps(A), products(A), products(np.abs(A))
-        row = row.rows(np.tile(direction * units, (lengths.size, 1)), starts[:-1])[0]
+        once, sized = products(A), products(np.abs(A))
+        row = Leaps(A).rows(np.tile(direction * units, (lengths.size, 1)), starts[:-1])[0]
         terms, sizes, size = [row @ E], np.abs(row) @ np.abs(E), np.abs(row)
         for order in range(1, ORDER + 1):
             step = (lengths / order)[:, None]

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.brief import brief
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.control.enclosures.flows import Leaps
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.transcription.record import Feedback
@@ -128,22 +128,23 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     )
     ends = np.append(starts[1:], grid.breakpoints[-1])
     past = starts < time
-    starts, ends = _halved(model, (A, W), (starts[past], np.minimum(ends[past], time)), (time, direction))
-    values = model.bound.support_point(_gains((A, W), starts, ends, time, direction))
+    flow = (Leaps(A), W)
+    starts, ends = _halved(model, flow, (starts[past], np.minimum(ends[past], time)), (time, direction))
+    values = model.bound.support_point(_gains(flow, starts, ends, time, direction))
     if time < grid.breakpoints[-1]:  # afterwards nothing matters
         starts, values = np.append(starts, time), np.vstack([values, model.bound.interior_point()])
     return _merged(starts, values, grid.breakpoints)
 
 
 def _halved(
-    model: DisturbanceModel, matrices: tuple[Array, Array], parts: tuple[Array, Array], at: tuple[float, Array]
+    model: DisturbanceModel, flow: tuple[Leaps, Array], parts: tuple[Array, Array], at: tuple[float, Array]
 ) -> tuple[Array, Array]:
     """The parts, halved wherever the best constant on one is not the best at both of its ends; the most lossy of them
     when they are too many."""
     starts, ends = parts
     here = np.arange(starts.size)
     for _ in range(HALVINGS):
-        lost, allowed = _lost(model, matrices, starts[here], ends[here], at)
+        lost, allowed = _lost(model, flow, starts[here], ends[here], at)
         middles = (starts[here] + ends[here]) / 2
         open_ = np.flatnonzero((lost > allowed) & (middles > starts[here]) & (middles < ends[here]))
         open_ = open_[np.argsort(-lost[open_], kind="stable")][: max(0, SIGNAL - starts.size)]
@@ -158,28 +159,27 @@ def _halved(
 
 
 def _lost(
-    model: DisturbanceModel, matrices: tuple[Array, Array], starts: Array, ends: Array, at: tuple[float, Array]
+    model: DisturbanceModel, flow: tuple[Leaps, Array], starts: Array, ends: Array, at: tuple[float, Array]
 ) -> tuple[Array, float]:
     """What the best constant on each part misses at its two ends, times the part's length, ``(k,)``, and how much of
     that is rounding."""
-    A, W = matrices
+    leaps, W = flow
     time, direction = at
-    best = model.bound.support_point(_gains(matrices, starts, ends, time, direction))
+    best = model.bound.support_point(_gains(flow, starts, ends, time, direction))
     missed, largest = np.zeros(starts.size), 0.0
     for times in (starts, ends):
-        rows = np.einsum("i,kij,jw->kw", direction, transitions(A[None], time - times)[0], W)
+        rows = leaps.rows(np.tile(direction, (times.size, 1)), time - times)[0] @ W
         height = model.bound.support(rows)
         missed += (ends - starts) * (height - (best * rows).sum(axis=1))
         largest = max(largest, float(np.abs(height).max(initial=0.0)))
     return missed, LOST * largest * float(model.grid.breakpoints[-1])
 
 
-def _gains(matrices: tuple[Array, Array], starts: Array, ends: Array, time: float, direction: Array) -> Array:
+def _gains(flow: tuple[Leaps, Array], starts: Array, ends: Array, time: float, direction: Array) -> Array:
     """``int_start^end E' e^{A' (time - s)} direction ds`` for parts ``(k,)`` before ``time``, ``(k, mw)``."""
-    A, W = matrices
-    flow, _ = transitions(A[None], time - ends)
-    _, driven = transitions(A[None], ends - starts)
-    return np.asarray(np.einsum("i,kij,kjl,lw->kw", direction, flow, driven, W, optimize=True))
+    leaps, W = flow
+    rows, _ = leaps.rows(np.tile(direction, (ends.size, 1)), time - ends)
+    return np.asarray(leaps.rows(rows, ends - starts)[1] @ W)
 
 
 def _merged(starts: Array, values: Array, breakpoints: Array) -> tuple[Array, Array]:

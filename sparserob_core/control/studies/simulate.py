@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.control.constraints.flat import INSIDE, MOST_INSIDE, SMOOTH
+from sparserob_core.control.enclosures.decoupling import decoupled, pace
+from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response, TimeGrid, distinct_times
@@ -25,7 +27,7 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
     on it, and fewer where there are many pieces; ``(T,)``."""
     grid = response.grid
     points = parameters.lattice()[0]
-    rate = max(float(np.linalg.norm(mode.matrices(points)[0], axis=(1, 2)).max()) for mode in response.system.modes)
+    rate = max(pace(A) for mode in response.system.modes for A in mode.matrices(points)[0])
     fewest = INSIDE + 1 if grid.pieces < MANY else 1
     counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), fewest, MOST_INSIDE).astype(int)
     place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -66,6 +68,9 @@ def walk(
     ]
     signal = None if disturbances is None else np.ascontiguousarray(disturbances.transpose(2, 1, 0))
     lengths, which = grid.distinct(grid.lengths)
+    if not parameters.shape[1] and grid.mode is None and lengths.size * 4 * response.system.states**2 > HELD:
+        yield from _walk_by_modes(response, control, parameters.shape[0], disturbances, initial_states)
+        return
     state = np.repeat(response.initial_state[:, None], parameters.shape[0], axis=1)
     if initial_states is not None:
         state = np.ascontiguousarray(initial_states.T)
@@ -90,6 +95,33 @@ def walk(
             )
         state = _times(flows[inputs[0]], state) + sigma
         yield state
+
+
+def _walk_by_modes(
+    response: Response,
+    control: Array | Callable[[int, Array], Array],
+    count: int,
+    disturbances: Array | None,
+    initial_states: Array | None,
+) -> Iterator[Array]:
+    """`walk` of a known system with many states on pieces of many lengths, in coordinates in which its modes are apart:
+    no matrix is held for a length."""
+    grid = response.grid
+    A, B, W = (part[0] for part in response.system.modes[0].matrices(np.zeros((1, 0))))
+    basis = decoupled(A)
+    flows, inverse = Flows(basis, basis.normal_form(basis.matrix(A)[0])), basis.inverse.astype(float)
+    B, W = inverse @ B, inverse @ W
+    begun = np.repeat(response.initial_state[None], count, axis=0) if initial_states is None else initial_states
+    yield begun.T.copy()
+    state = begun @ inverse.T
+    for piece, length in enumerate(grid.lengths.tolist()):
+        acting = int(grid.control_piece[piece])
+        driven = control(acting, basis.transform @ state.T) if callable(control) else control[:, acting, None]
+        drive = np.broadcast_to(_times(B, driven).T, state.shape)
+        if disturbances is not None:
+            drive = drive + disturbances[:, :, grid.disturbance_piece[piece]] @ W.T
+        state = flows.columns(state, drive, np.full(count, length))
+        yield basis.transform @ state.T
 
 
 def _walk_varying(
