@@ -476,6 +476,8 @@ class UncertainRows:
         """The ``C_p``, one below the other, ``(p Q, n)``."""
         from scipy.sparse import csr_array, vstack
 
+        if len(self.C) == 1:  # the commonest, which would be there twice
+            return self.C[0]
         return csr_array(vstack(self.C)) if self.C else csr_array((0, self.g.shape[1]))
 
     def coefficients(self, x: Array) -> Array:

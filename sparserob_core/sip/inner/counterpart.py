@@ -244,14 +244,12 @@ class Counterpart:
     def _multipliers(self, even: Array, mu: Array) -> tuple[Array, Array]:
         """The multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand for."""
         y, deviations = self._plain(even)
-        slope = mu @ self.program.A + (0.0 if self.elastic else self.program.q)
+        terms = [(np.zeros(0, dtype=int), np.zeros(0))]
         late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]] = []
         first = 0
         for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
             mine = y[first : first + block.h.size]
-            slope = slope + block.g.T @ mine
-            if not parts:
-                slope = slope + even[where] @ block.equations[0] - block.g.T @ mine
+            terms.append(weighted(mine, block.g) if parts else weighted(even[where], block.equations[0]))
             for p, part in enumerate(parts):
                 rows = np.flatnonzero(block.part == p)
                 total = float(mine[rows] @ np.abs(block.factor[rows]))
@@ -267,9 +265,12 @@ class Counterpart:
                     shares = np.maximum(even[np.array(at, dtype=int)], 0.0)
                     most = max(total, float(shares.sum()))  # what is missing to it is the share of 0
                     w[place] = shares @ np.array(known) / most if known else 0.0
-                slope = slope + total * (block.C[p].T @ w)
+                terms.append(weighted(total * w, block.C[p]))
                 deviations[first + rows] = np.sign(block.factor[rows])[:, None] * w
             first += block.h.size
+        column, value = (np.concatenate(part) for part in zip(*terms, strict=True))
+        slope = mu @ self.program.A + (0.0 if self.elastic else self.program.q)
+        slope = slope + np.bincount(column, value, self.program.n)
         self._balance(slope, deviations, late)
         if not self.spread.is_box:
             deviations = deviations + DRAWN * (self.spread.inner - deviations)
@@ -460,6 +461,14 @@ class Growing:
         return int(1 + max(0, done.simplex_iteration_count) + INNER * max(0, done.ipm_iteration_count))
 
 
+def weighted(weights: Array, table: csr_array) -> tuple[np.ndarray, Array]:
+    """The terms of ``weights @ table`` of a sparse ``table (r, n)``: columns and values, which are still to be added
+    up; of thousands of small tables at once that is far less than their products."""
+    row = np.repeat(weights, np.diff(table.indptr))
+    used = np.flatnonzero(row)
+    return table.indices[used], row[used] * table.data[used]
+
+
 def _both(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> tuple[np.ndarray, np.ndarray, Array]:
     """Entries of the decision in its positive and its negative part."""
     return np.concatenate([row, row]), np.concatenate([column, column + n]), np.concatenate([value, -value])
@@ -474,22 +483,23 @@ def robust_bound(
     slope, constant = (program.q.copy() if priced else np.zeros(program.n)), -float(mu @ program.b)
     slope = slope + mu @ program.A
     size, noise, first = abs(constant), np.abs(slope) + np.abs(mu) @ np.abs(program.A), 0
+    terms = [(np.zeros(0, dtype=int), np.zeros(0))]
     for block in blocks:
         mine, w = y[first : first + block.h.size], deviations[first : first + block.h.size]
         first += block.h.size
         used = np.flatnonzero(mine)
         if not used.size:
             continue
-        slope = slope + mine @ block.g
-        noise = noise + np.abs(mine) @ abs(block.g)
         weight = np.zeros(block.d.shape)
         np.add.at(weight, block.part[used], (mine[used] * block.factor[used])[:, None] * w[used])
-        slope = slope + weight.ravel() @ block.stacked
-        noise = noise + np.abs(weight).ravel() @ abs(block.stacked)
+        terms += [weighted(mine, block.g), weighted(weight.ravel(), block.stacked)]
         constant += float(weight.ravel() @ block.d.ravel())
         size += float(np.abs(weight).ravel() @ np.abs(block.d).ravel())
         constant -= float(mine @ block.h)
         size += float(mine @ np.abs(block.h))
+    column, value = (np.concatenate(part) for part in zip(*terms, strict=True))
+    slope = slope + np.bincount(column, value, program.n)
+    noise = noise + np.bincount(column, np.abs(value), program.n)
     weights = program.weights if priced else np.zeros(program.n)
     ends = np.stack([program.lower, program.upper, np.clip(0.0, program.lower, program.upper)])
     with np.errstate(invalid="ignore"):

@@ -320,10 +320,36 @@ class Interior:
         y = self._y[self._limits.size :]
         y = np.where(y > NOTHING * y.max(), y, 0.0)
         leaning = L.radius * (self._alpha - self._beta) / np.maximum(self._alpha + self._beta, TINY)
+        y, leaning = self._balanced(y, np.clip(leaning, -L.radius, L.radius))
         table = L.at_rest.copy()
-        table[L.part, L.entry] = np.clip(leaning, -L.radius, L.radius)
+        table[L.part, L.entry] = leaning
         signs = np.concatenate([np.sign(block.factor) for block in self.blocks])
         return RobustAnswer(solved, said, x, y, signs[:, None] * table[L.of], np.zeros(0))
+
+    def _balanced(self, y: Array, leaning: Array) -> tuple[Array, Array]:
+        """Multipliers ``(r,)`` and deviations ``(J,)`` that leave no slope in the variables that answer.
+
+        What rounding leaves of ten thousand slopes, times how far each variable can go, is more than the tolerated
+        gap. Every such variable is alone in an absolute value, of its effect on the control, whose deviation takes the
+        slope; where that is at its end the part weighs more, by all its rows alike, so that opposite ones move no joint
+        variable.
+        """
+        L = self._layout
+        eta = np.bincount(L.of, L.scale * y, L.parts)
+        aim = eta[L.part] * leaning
+        single = np.flatnonzero(np.diff(L.C.indptr) == 1)
+        single = single[np.lexsort((eta[L.part[single]], L.offset[single] == 0.0))]  # the best ones are written last
+        taker = np.full(self._f.size, -1)
+        taker[L.C.indices[L.C.indptr[single]]] = single
+        takes = taker >= 0
+        taker = taker[takes]
+        aim[taker] -= (L.C.T @ aim)[takes] / L.C.data[L.C.indptr[taker]]
+        weight = eta.copy()
+        np.maximum.at(weight, L.part, np.abs(aim) / L.radius)
+        rows = np.bincount(L.of, L.scale, L.parts)
+        y = y + ((weight - eta) / np.maximum(rows, TINY))[L.of]
+        moved = np.divide(aim, weight[L.part], out=leaning.copy(), where=weight[L.part] > 0.0)
+        return y, np.clip(moved, -L.radius, L.radius)
 
 
 def _moves(move: Direction) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:

@@ -3,6 +3,7 @@ later, refutations, programs that it leaves to others."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,19 @@ def answering(name: int, piece: int) -> UncertainRows:
 
 def bound(x: Interior | Counterpart, y: Array, deviations: Array) -> float:
     return robust_bound(program(), x.blocks, y, deviations, np.zeros(0), priced=True)[0]
+
+
+def test_multipliers_leave_no_slope_in_what_answers_however_far_that_may_go() -> None:
+    far = replace(program(), lower=np.where(np.arange(JOINT + BLOCKS * EACH) < JOINT, program().lower, -1e7))
+    far = replace(far, upper=-far.lower)
+    central, rng = Interior(far, spread()), np.random.default_rng(0)
+    for block in [answering(k, k) for k in range(EACH)] + [rows(rng, 1.5) for _ in range(6)]:
+        central.add(block)
+    found = central.solve(0.0, 1e-9)
+    assert found.solved
+    lower = robust_bound(far, central.blocks, found.y, found.deviations, np.zeros(0), priced=True)[0]
+    cost = float(far.weights @ np.abs(found.x))
+    assert cost - 1e-7 <= lower <= cost + 1e-9  # 5e-4 where what rounding leaves stays
 
 
 @pytest.mark.parametrize("seed", range(4))
