@@ -157,18 +157,34 @@ def test_curved_steps_go_around_too(tmp_path) -> None:
     assert _verdicts(tmp_path / "run")["control_step"] == "holds"
 
 
-@pytest.mark.parametrize(("w", "feasible"), [(0.1965, True), (0.1985, False)])
-def test_the_largest_disturbance_for_ever_is_that_of_an_independent_program(tmp_path, w, feasible) -> None:
-    """known answer: 0.1973, for the box of 0.3 into itself within 1."""
+@pytest.mark.parametrize(("share", "feasible"), [(0.996, True), (1.006, False)])
+@pytest.mark.parametrize(
+    ("period", "noise", "largest"),
+    [
+        (1, None, 0.1973),
+        pytest.param(2, None, 0.3171, marks=pytest.mark.slow),
+        pytest.param(5, None, 0.3394, marks=pytest.mark.slow),
+        (1, 0.02, 0.1565),
+        pytest.param(2, 0.02, 0.1917, marks=pytest.mark.slow),
+        pytest.param(5, 0.02, 0.1988, marks=pytest.mark.slow),
+    ],
+)
+def test_the_largest_disturbance_for_ever_is_that_of_an_independent_program(
+    period, noise, largest, share, feasible
+) -> None:
+    """known answers, for the box of 0.3 into itself within a period, of the state or of ``x1`` with that noise."""
+    seen = {} if noise is None else {"measurements": {"C": [[1, 0]], "noise": {"box": noise}}}
     config = _config(
-        4,
+        4 * period,
         system=MASS,
-        horizon=1.0,
+        horizon=float(period),
         initial_state={"centre": [0, 0], "box": [0.3, 0.3]},
-        disturbance={"box": [w, w]},
+        disturbance={"box": [share * largest, share * largest]},
         path=[{"box": [0.7, None]}],
+        **seen,
     )
-    assert (_run(tmp_path / "run", config).status == "certified") is feasible
+    found = sr.run(config, quiet=True, figures=False)
+    assert found.status == ("certified" if feasible else "infeasible")
 
 
 @pytest.fixture(scope="module")
