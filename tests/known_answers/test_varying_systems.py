@@ -3,6 +3,7 @@ what is refused of them."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,7 @@ def test_a_system_that_is_changed_afterwards_is_found(change: tampering.Change, 
             {"disturbance": [{"set": {"box": 0.1}}, {"set": {"box": 0.1}, "from": 1}]},
             r"disturbance\.1: expected one that acts all the time",
         ),
+        ({"integral": [{"G": [[1]], "from": 0.5, "upper": 1}]}, r"integral\.0\.from: expected 0 where the system chang"),
         ({"system": {"A": [["t + p"]], "B": [[1]], "parameters": {"p": [0, 1]}}}, r"system\.parameters: expected none"),
         ({"system": {"A": [["t"]], "B": [[1]], "delay": 0.1}}, r"system\.delay: expected none"),
         ({"system": {"A": [["a"]], "B": [[1]], "define": {"a": "b*t", "b": "a"}}}, r"system\.define\.a: .*circle"),
@@ -252,3 +254,38 @@ def test_quadratic_costs_of_a_fading_plant_are_those_of_a_program_of_its_own(tmp
     }
     config = {**FADING, "terminal": [], "control": {"box": 3.0}, "cost": cost, "path": [{"box": 9.0}]}
     assert verified(tmp_path / "run", config, pieces(count))["cost"] == pytest.approx(least, rel=1e-7)
+
+
+def area(ends: np.ndarray, until: float) -> np.ndarray:
+    """An antiderivative of ``(1 + s) (log(1 + until) - log(1 + s))``: what a push at ``s`` adds to the integral of the
+    fading plant."""
+    y = 1.0 + ends
+    return np.asarray(y**2 / 2 * (np.log1p(until) - np.log(y)) + y**2 / 4)
+
+
+@pytest.mark.parametrize(
+    "policy", [None, pytest.param({"name": "affine"}, marks=pytest.mark.slow)], ids=["open loop", "affine"]
+)
+def test_the_integral_of_a_fading_plant_is_bounded_as_in_closed_form(
+    policy: dict[str, str] | None, tmp_path: Path
+) -> None:
+    # until 1.5, with 0.2 of fuel in it: 2.5 log(2.5) and what u and w add; of w nothing can be answered in one piece
+    count, until, limit = (10, 1.5, 1.9) if policy is None else (1, 1.5, 1.9)
+    breaks = np.linspace(0.0, 2.0, count + 1)
+    adds = np.diff(area(np.minimum(breaks, until), until))
+    lengths = np.clip(until - breaks[:-1], 0.0, 2.0 / count)
+    worst = 2.5 * np.log(2.5) + 0.1 * float(adds.sum())
+    rows = np.append(adds + 0.2 * lengths, -adds - 0.2 * lengths)
+    least = linprog(np.full(2 * count, 2.0 / count), rows[None], [limit - worst], bounds=[(0, 2)] * (2 * count)).fun
+    problem = {**FADING, "terminal": [], "control": {"box": 2.0}, "disturbance": {"box": 0.1}}
+    problem["integral"] = [{"H": [[1]], "G": [[0.2]], "to": until, "upper": limit}]
+    config = {"problem": problem, "dictionaries": {"control": pieces(count)}, "observers": []}
+    sr.run({**config, **({} if policy is None else {"policy": policy})}, out=tmp_path / "run", figures=False)
+    assert check(tmp_path / "run").status == "verified"
+    found = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert found["status"] == "certified" and found["cost"] == pytest.approx(least, rel=1e-6)
+    for k, key in enumerate(("upper", "to", "H")):
+        value = {"upper": limit - 1e-6, "to": until + 1e-5, "H": [[1.00001]]}[key]
+        change = tampering.problem(integral=[{**problem["integral"][0], key: value}])
+        forged = tampering.forged(tmp_path / "run", tmp_path / str(k), change, consistent=True)
+        assert check(forged).status == "refuted"

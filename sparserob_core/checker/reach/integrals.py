@@ -22,7 +22,7 @@ from sparserob_core.control.problem.problem import (
     OptimalControlProblem,
     PathConstraint,
 )
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope, Product
 from sparserob_core.sip.convex_set import Array
 
@@ -109,7 +109,10 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 
 def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> System:
-    """The system with its coordinates, cut where one of them begins or ends."""
+    """The system with its coordinates, cut where one of them begins or ends; one that changes with time has none that
+    begins later than it does."""
+    if isinstance(system, VaryingSystem):
+        return VaryingSystem(_with(system.law, [(one.h, one.g) for one in coordinates]), system.horizon)
     turns = [*system.switches, horizon]
     for time in sorted({t for one in coordinates for t in (one.begin, one.end)}):
         if all(abs(time - turn) > APART * horizon for turn in (0.0, *turns)):

@@ -264,12 +264,14 @@ class OptimalControlProblem:
             raise InputError(
                 path="system", expected=f"a law up to {self.horizon:g}, the horizon", got=f"up to {system.horizon:g}"
             )
-        refused: dict[str, object] = {
-            "integral": self.integral,
-        }
-        for key, given in refused.items():
-            if given:
-                raise _unproven(key)
+        late = [i for i, entry in enumerate(self.integral) if entry.start > 0.0]
+        if late:
+            raise InputError(
+                path=f"integral.{late[0]}.from",
+                expected="0 where the system changes with time: a window that begins later makes pieces of it, which"
+                " are not proven",
+                got=f"{self.integral[late[0]].start:g}",
+            )
 
     def _executed(self) -> Array | None:
         """The errors of execution, ``None`` where there are none; raises `InputError` for what they are not proven
@@ -578,14 +580,6 @@ class ProblemFactory(ABC):
     @abstractmethod
     def build(self) -> OptimalControlProblem | SemiInfiniteProgram:
         """The problem; raises `InputError` when the options do not describe one."""
-
-
-def _unproven(key: str) -> InputError:
-    return InputError(
-        path=key,
-        expected="none where the system changes with time, of which it is not proven yet",
-        got="one",
-    )
 
 
 def _listed(name: str, value: object, of: str = "sets") -> list[object]:

@@ -100,10 +100,12 @@ def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -
     return Polytope(H[np.isfinite(h)], h[np.isfinite(h)])
 
 
-def _system(system: System, running: list[Running], horizon: float) -> LinearSystem | SwitchedSystem:
+def _system(system: System, running: list[Running], horizon: float) -> System:
     """The system beside what is integrated of it; of pieces where one of the integrals begins later than at 0, or ends
     before it is looked at."""
-    assert not isinstance(system, VaryingSystem)  # of which integrals are refused
+    if isinstance(system, VaryingSystem):  # whose integrals all begin at 0
+        h, g = np.stack([one.h for one in running]), np.stack([one.g for one in running])
+        return VaryingSystem(system.law.accumulating(h, g), system.horizon)
     slack, pieces = SHORTEST * horizon, list[tuple[float, LinearSystem]]()
     for begin, until, mode in legs(system, {time for one in running for time in (one.start, one.stop)}, horizon):
         acts = np.array([[one.start <= begin + slack and until <= one.stop + slack] for one in running])
