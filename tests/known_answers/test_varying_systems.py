@@ -118,9 +118,15 @@ def test_a_system_that_is_changed_afterwards_is_found(change: tampering.Change, 
             {"disturbance": [{"set": {"box": 0.1}}, {"set": {"box": 0.1}, "from": 1}]},
             r"disturbance\.1: expected one that acts all the time",
         ),
-        ({"integral": [{"G": [[1]], "from": 0.5, "upper": 1}]}, r"integral\.0\.from: expected 0 where the system chang"),
+        (
+            {"integral": [{"G": [[1]], "from": 0.5, "upper": 1}]},
+            r"integral\.0\.from: expected 0, and a control that acts at",
+        ),
+        (
+            {"system": {"A": [["t"]], "B": [[1]], "delay": 0.1}, "integral": [{"G": [[1]], "to": 1, "upper": 1}]},
+            r"integral\.0\.from: expected 0, and a control that acts at once",
+        ),
         ({"system": {"A": [["t + p"]], "B": [[1]], "parameters": {"p": [0, 1]}}}, r"system\.parameters: expected none"),
-        ({"system": {"A": [["t"]], "B": [[1]], "delay": 0.1}}, r"system\.delay: expected none"),
         ({"system": {"A": [["a"]], "B": [[1]], "define": {"a": "b*t", "b": "a"}}}, r"system\.define\.a: .*circle"),
         ({"system": {"A": [["a"]], "B": [[1]], "define": {"a": "q*t"}}}, r"system\.define\.a: .*unknown name 'q'"),
         ({"system": {"A": [["1/(t - 1)"]], "B": [[1]]}}, "A is not finite at t = 1"),
@@ -289,3 +295,65 @@ def test_the_integral_of_a_fading_plant_is_bounded_as_in_closed_form(
         change = tampering.problem(integral=[{**problem["integral"][0], key: value}])
         forged = tampering.forged(tmp_path / "run", tmp_path / str(k), change, consistent=True)
         assert check(forged).status == "refuted"
+
+
+LATE: dict[str, Any] = {
+    **FADING,
+    "system": {"A": [["-1/(1 + t)"]], "B": [[1]], "delay": 0.3},
+    "initial_control": [-0.5],
+    "control": {"box": 2.0},
+    "disturbance": {"box": 0.1},
+    "terminal": [{"box": 0.3}],
+}
+
+
+def test_a_fading_plant_that_hears_late_costs_what_a_program_in_closed_form_says(tmp_path: Path) -> None:
+    # (1 + t) x is the integral of (1 + t) (u(t - 0.3) + w), and u = -0.5 before 0
+    breaks, late = np.linspace(0.0, 2.0, 11), 0.3
+    acts = np.minimum(breaks + late, 2.0)
+    rows = np.diff((1 + acts) ** 2) / 2
+    begun = 2.5 - 0.5 * ((1 + late) ** 2 - 1) / 2
+    limit = 0.3 * 3.0 - 0.1 * (3.0**2 - 1) / 2 - begun
+    least = linprog(np.full(20, 0.2), np.append(rows, -rows)[None], [limit], bounds=[(0, 2)] * 20).fun
+    assert verified(tmp_path / "run", LATE, pieces(10))["cost"] == pytest.approx(least, rel=1e-6)
+    for k, change in enumerate(
+        (tampering.problem(initial_control=[-0.499999]), tampering.system(delay=0.3001), tampering.system(delay=0.2999))
+    ):
+        assert check(tampering.forged(tmp_path / "run", tmp_path / str(k), change, True)).status == "refuted"
+    found = sr.simulate(tmp_path / "run", 200, "vertices")
+    assert not found.contradicts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"cost": {"l1": 0.5, "control": {"R": [[0.2]]}, "state": {"Q": [[1, 0], [0, 0.1]], "reference": [0.1, 0]}}},
+        {"integral": [{"H": [[1, 0]], "to": 2.5, "upper": 0.6}]},
+        {"policy": {"name": "affine"}},
+    ],
+    ids=["quadratic", "integral", "affine"],
+)
+def test_a_constant_plant_that_hears_late_is_the_same_as_a_function_of_time(
+    more: dict[str, Any], tmp_path: Path
+) -> None:
+    policy = {key: value for key, value in more.items() if key == "policy"}
+    more, costs = {key: value for key, value in more.items() if key != "policy"}, []
+    for name, t in (("still", ""), ("changing", " + 0*t")):
+        problem = {
+            "name": "linear",
+            "system": {"A": [[f"0{t}", "1"], ["-1", f"-0.2{t}"]], "B": [[0], [1]], "E": [[0], [1]], "delay": 0.3},
+            "horizon": 3.0,
+            "initial_state": [1.0, 0.0],
+            "initial_control": [0.4],
+            "control": {"box": 1.5},
+            "disturbance": {"box": 0.05},
+            "path": [{"box": [1.3, 2.0]}],
+            "terminal": [{"box": [0.4, 0.5]}],
+            **more,
+        }
+        config = {"problem": problem, "dictionaries": {"control": pieces(6)}, "observers": [], **policy}
+        outcome = sr.run(config, out=tmp_path / name, figures=False)
+        assert outcome.status == "certified" and check(tmp_path / name).status == "verified"
+        costs.append(outcome.result.cost)
+    assert costs[0] == pytest.approx(costs[1], rel=2e-7)

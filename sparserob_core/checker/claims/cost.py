@@ -219,7 +219,7 @@ def _walked(
         if changing is None:
             flow, weight = modes[leg].over(stop - start, acting=k >= 0)
         else:
-            flow, weight = changing.over(float(start), float(stop), modes[0].M)
+            flow, weight = changing.over(float(start), float(stop), modes[0].M, k >= 0)
         z = arb_mat(x.tolist() + (still if k < 0 else pieces[k]).tolist())
         walked.append((k, flow, weight, z))
         x = arb_mat((flow * z).tolist()[: d + 1])
@@ -328,11 +328,12 @@ class _Changing:
     law: VaryingFlow
     _known: dict[tuple[float, float], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
 
-    def over(self, start: float, stop: float, M: arb_mat) -> tuple[arb_mat, arb_mat]:
-        """What the time from ``start`` to ``stop`` does to ``z``, and what it costs, segment by segment of the law."""
+    def over(self, start: float, stop: float, M: arb_mat, acting: bool) -> tuple[arb_mat, arb_mat]:
+        """What the time from ``start`` to ``stop`` does to ``z``, and what it costs, segment by segment of the law;
+        ``acting``: a control of the decision acts, not the one before time 0."""
         if (start, stop) not in self._known:
             times = [start, *(t for t in self.law.ends if start < t < stop), stop]
-            parts = [self._within(*ends, M) for ends in pairwise(times)]
+            parts = [self._within(*ends, M, acting) for ends in pairwise(times)]
             flow, weight = parts[0]
             for onward, cost in parts[1:]:
                 weight = weight + flow.transpose() * cost * flow
@@ -340,13 +341,13 @@ class _Changing:
             self._known[start, stop] = flow, weight
         return self._known[start, stop]
 
-    def _within(self, start: float, stop: float, M: arb_mat) -> tuple[arb_mat, arb_mat]:
+    def _within(self, start: float, stop: float, M: arb_mat, acting: bool) -> tuple[arb_mat, arb_mat]:
         """`over` within one segment, by the integrals of the products of all terms of the flow's series; what this
         leaves out is in a ball at every time."""
         from flint import arb
 
         terms, rest = self.law.within(start, stop, EVERY)
-        every, left = [self._of(term, n == 0) for n, term in enumerate(terms)], self._of(rest, False)
+        every, left = [self._of(term, n == 0, acting) for n, term in enumerate(terms)], self._of(rest, False, acting)
         flow = every[0]
         for term in every[1:]:
             flow = flow + term
@@ -362,7 +363,7 @@ class _Changing:
                 weight = weight + along * other / (i + j + 1)
         return flow + left, weight * (arb(stop) - arb(start))
 
-    def _of(self, term: arb_mat, first: bool) -> arb_mat:
+    def _of(self, term: arb_mat, first: bool, acting: bool) -> arb_mat:
         """A term on states, controls and disturbances as one on ``z``."""
         from flint import arb
 
@@ -371,8 +372,10 @@ class _Changing:
         mw = problem.system.disturbances
         point = np.zeros(mw) if problem.disturbance is None else nominal_point(problem.disturbance)
         w[len(w) - mw :] = balls(point)
+        early = balls(np.zeros(m) if acting or problem.initial_control is None else np.asarray(problem.initial_control))
+        given = [*early, *w]  # the columns of a control that does not act yet meet zeros
         rows = [
-            [*row[:d], sum((e * v for e, v in zip(row[d + m :], w, strict=True)), arb(0)), *row[d : d + m]]
+            [*row[:d], sum((e * v for e, v in zip(row[d:], given, strict=True)), arb(0)), *row[d : d + m]]
             for row in term.tolist()
         ]
         below = [[arb(int(first and i == j)) for j in range(d + 1 + m)] for i in range(d, d + 1 + m)]

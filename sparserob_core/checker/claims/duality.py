@@ -122,7 +122,8 @@ class Duality:
     def _varying_row(self, flow: VaryingFlow, direction: Array, time: float, limit: arb, disturbed: bool) -> Row:
         """`row` of a system that changes with time, which is known."""
         m, problem = self.problem.system.controls, self.problem
-        breaks, jumps = [float(s) for s in self.control.breakpoints[:-1]], self.changes or []
+        delay, jumps = problem.system.delay, self.changes or []
+        breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
         begins = sorted({0.0, *(s for s in (*breaks, *jumps) if s < time)})
         weights = flow.weights([*begins, time])
         row, start = stacked([[_exact(c) for c in direction]]), np.asarray(problem.initial_state)
@@ -132,7 +133,10 @@ class Duality:
         pushes = [[_exact(0.0)] * problem.system.disturbances for _ in jumps]
         for begin, part, pushed in zip(begins, weights.control, weights.disturbance, strict=True):
             every, k = (row * part).entries(), bisect_right(breaks, begin) - 1
-            slope[k] = [a + b for a, b in zip(slope[k], every[:m], strict=True)]
+            if k < 0:
+                constant = sum((w * _exact(u) for w, u in zip(every[:m], before(problem), strict=True)), constant)
+            else:
+                slope[k] = [a + b for a, b in zip(slope[k], every[:m], strict=True)]
             constant = sum(every[m:], constant)  # a drift, whose input is 1
             if jumps:
                 block = bisect_right(jumps, begin) - 1

@@ -13,6 +13,7 @@ from typing import final
 
 import numpy as np
 
+from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.names import Names
@@ -112,7 +113,10 @@ def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> Sy
     """The system with its coordinates, cut where one of them begins or ends; one that changes with time has none that
     begins later than it does."""
     if isinstance(system, VaryingSystem):
-        return VaryingSystem(_with(system.law, [(one.h, one.g) for one in coordinates]), system.horizon)
+        if any(one.begin > 0.0 for one in coordinates):
+            raise Unchecked("of a system that changes with time the checker knows integrals from 0 on")
+        law = _with(system.law, [(one.h, one.g) for one in coordinates])
+        return VaryingSystem(law, system.horizon, system.delay)
     turns = [*system.switches, horizon]
     for time in sorted({t for one in coordinates for t in (one.begin, one.end)}):
         if all(abs(time - turn) > APART * horizon for turn in (0.0, *turns)):

@@ -107,7 +107,7 @@ def _joined_in_time(
         place = next(i for i, one in enumerate(every) if one.start > 0.0 or one.stop not in (None, horizon))
         expected = "one that acts all the time where the system changes with time"
         raise InputError(path=f"disturbance.{place}", expected=expected, got="one in a window")
-    return VaryingSystem(law, system.horizon), bound, kind
+    return replace(system, law=law), bound, kind
 
 
 def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:

@@ -264,14 +264,15 @@ class OptimalControlProblem:
             raise InputError(
                 path="system", expected=f"a law up to {self.horizon:g}, the horizon", got=f"up to {system.horizon:g}"
             )
-        late = [i for i, entry in enumerate(self.integral) if entry.start > 0.0]
-        if late:
-            raise InputError(
-                path=f"integral.{late[0]}.from",
-                expected="0 where the system changes with time: a window that begins later makes pieces of it, which"
-                " are not proven",
-                got=f"{self.integral[late[0]].start:g}",
-            )
+        for i, entry in enumerate(self.integral):
+            late = system.delay > 0.0 and np.any(entry.G)
+            if entry.start > 0.0 or late:
+                raise InputError(
+                    path=f"integral.{i}.from",
+                    expected="0, and a control that acts at once, where the system changes with time: a window that"
+                    " begins later makes pieces of it, which are not proven",
+                    got=f"from {entry.start:g} with a delay of {system.delay:g}",
+                )
 
     def _executed(self) -> Array | None:
         """The errors of execution, ``None`` where there are none; raises `InputError` for what they are not proven

@@ -507,19 +507,22 @@ class SwitchedSystem:
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingSystem:
-    """``x'(t) = A(t) x(t) + B(t) u(t) + E(t) w(t) + c(t)`` for ``t`` from 0 to the ``horizon``, without uncertain
-    parameters and without delay.
+    """``x'(t) = A(t) x(t) + B(t) u(t - delay) + E(t) w(t) + c(t)`` for ``t`` from 0 to the ``horizon``, without
+    uncertain parameters.
 
     ``law``: a `LinearSystem` whose one parameter is the time: its matrices at ``p = (t,)`` are those at the time ``t``.
-    Made of expressions by `of`. Raises `InputError`.
+    ``delay``, as that of a `LinearSystem`: what was commanded acts through the ``B`` of the time at which it acts. Made
+    of expressions by `of`. Raises `InputError`.
     """
 
     law: LinearSystem
     horizon: float
+    delay: float = 0.0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "delay", _duration(self.delay))
         if self.law.parameter_count != 1 or self.law.delay:
-            expected = "a law whose one parameter is the time, without delay"
+            expected = "a law whose one parameter is the time, without a delay of its own"
             raise InputError(path="system", expected=expected, got="another")
 
     @staticmethod
@@ -530,6 +533,7 @@ class VaryingSystem:
         E: Sequence[Sequence[str | float]] | None = None,
         c: Sequence[str | float] | None = None,
         define: Mapping[str, str | float] | None = None,
+        delay: float = 0.0,
     ) -> VaryingSystem:
         """The system whose entries are numbers and expressions in ``t`` and in the names that ``define`` gives to
         expressions in ``t``; see `parse_expression`. Raises `InputError` that begins with the key of a config."""
@@ -548,6 +552,7 @@ class VaryingSystem:
                 None if c is None else parse_column(f"{where}.c", c, names, defined),
             ),
             horizon,
+            delay,
         )
 
     @property
@@ -581,11 +586,6 @@ class VaryingSystem:
         return ()
 
     @property
-    def delay(self) -> float:
-        """0."""
-        return 0.0
-
-    @property
     def switches(self) -> tuple[float, ...]:
         """It never jumps from one system to another."""
         return ()
@@ -598,7 +598,7 @@ class VaryingSystem:
     @cached_property
     def forced(self) -> VaryingSystem:
         """As `LinearSystem.forced`."""
-        return self if self.law.c is None else VaryingSystem(self.law.forced, self.horizon)
+        return self if self.law.c is None else replace(self, law=self.law.forced)
 
     @cached_property
     def modes(self) -> tuple[LinearSystem, ...]:
@@ -620,7 +620,8 @@ class VaryingSystem:
         time: float = 1.0,
     ) -> VaryingSystem:
         """As `LinearSystem.in_units`; the time of the law is divided too."""
-        return VaryingSystem(self.law.in_units(A, B, E, np.array([time]), c, 1.0), self.horizon / time)
+        law = self.law.in_units(A, B, E, np.array([time]), c, 1.0)
+        return VaryingSystem(law, self.horizon / time, self.delay / time)
 
     @shaped
     def describe(self, parameter: Float[Array, " nu"]) -> str:

@@ -103,9 +103,10 @@ def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -
 def _system(system: System, running: list[Running], horizon: float) -> System:
     """The system beside what is integrated of it; of pieces where one of the integrals begins later than at 0, or ends
     before it is looked at."""
-    if isinstance(system, VaryingSystem):  # whose integrals all begin at 0
+    if isinstance(system, VaryingSystem):
+        assert all(one.start == 0.0 for one in running)  # others are refused
         h, g = np.stack([one.h for one in running]), np.stack([one.g for one in running])
-        return VaryingSystem(system.law.accumulating(h, g), system.horizon)
+        return replace(system, law=system.law.accumulating(h, g))
     slack, pieces = SHORTEST * horizon, list[tuple[float, LinearSystem]]()
     for begin, until, mode in legs(system, {time for one in running for time in (one.start, one.stop)}, horizon):
         acts = np.array([[one.start <= begin + slack and until <= one.stop + slack] for one in running])

@@ -86,7 +86,8 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     if state is not None:
         M[:d, :d] = state.Q
     if varying:
-        which, (flows, weights) = np.arange(grid.pieces), _in_time(Propagator(system.forced, grid), reference, noise, M)
+        propagator = Propagator(system.forced, grid)
+        which, (flows, weights) = np.arange(grid.pieces), _in_time(propagator, reference, noise, given, M)
     else:
         which, flows, weights = _by_kind(grid, modes, reference, noise, given, M)
     end = np.zeros((d + 1, d + 1))
@@ -125,27 +126,29 @@ def _by_kind(
     return which, np.stack(flows), np.stack(weights)
 
 
-def _in_time(propagator: Propagator, reference: Array, noise: Array, M: Array) -> tuple[Array, Array]:
+def _in_time(propagator: Propagator, reference: Array, noise: Array, given: Array, M: Array) -> tuple[Array, Array]:
     """Flows and weights of every piece of a system that changes with time, ``(L, ...)`` each: the integrals by Gauss'
     rule between the times at which it is another polynomial."""
     grid, expansion, d = propagator.grid, propagator.expansion, reference.size
     assert expansion is not None
     m = M.shape[0] - d - 1
 
-    def moved(starts: Array, stops: Array) -> Array:
-        flow = expansion.flow(starts, stops)
-        found = np.tile(np.eye(M.shape[0]), (starts.size, 1, 1))
+    def moved(pieces: np.ndarray, stops: Array) -> Array:
+        flow, decided = expansion.flow(grid.breakpoints[pieces], stops), grid.control_piece[pieces] >= 0
+        found = np.tile(np.eye(M.shape[0]), (stops.size, 1, 1))
         drift = flow.state @ reference - reference + flow.control[:, :, m:].sum(axis=2) + flow.disturbance @ noise
+        drift[~decided] += (flow.control[:, :, :m] @ given)[~decided]
         found[:, :d, :d], found[:, :d, d], found[:, :d, d + 1 :] = flow.state, drift, flow.control[:, :, :m]
+        found[~decided, :d, d + 1 :] = 0.0
         return found
 
     points, shares = np.polynomial.legendre.leggauss(POINTS)
     half = np.diff(propagator.marks)[:, None] / 2
     times = (propagator.marks[:-1, None] + half * (1.0 + points)).ravel()
     pieces, weights = grid.locate(times), np.zeros((grid.pieces, *M.shape))
-    inside = moved(grid.breakpoints[pieces], times)
+    inside = moved(pieces, times)
     np.add.at(weights, pieces, np.swapaxes(inside, 1, 2) @ M @ inside * (half * shares).reshape(-1, 1, 1))
-    return moved(grid.breakpoints[:-1], grid.breakpoints[1:]), weights
+    return moved(np.arange(grid.pieces), grid.breakpoints[1:]), weights
 
 
 def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> QuadraticCost:

@@ -215,16 +215,16 @@ class SystemOptions(Options):
         return any(TIME in re.findall(r"[A-Za-z_]\w*", text) for text in texts if isinstance(text, str))
 
     def _varying(self, of: Matrices, horizon: float | None) -> VaryingSystem:
-        refused = {"parameters": self.parameters, "pieces": self.pieces, "delay": self.delay}
+        refused = {"parameters": self.parameters, "pieces": self.pieces}
         for key, given in refused.items():
             if given:
-                expected = "none where the system changes with the time t, of which known ones without delay are proven"
+                expected = "none where the system changes with the time t, of which known ones are proven"
                 raise InputError(path=f"system.{key}", expected=expected, got="one")
         if horizon is None:
             raise InputError(path="system", expected="a system that stays the same with time here", got="one in t")
         _check_shapes("system", of)
         A, B, E, c = of
-        return VaryingSystem.of(A, B, horizon, E, c, self.define)
+        return VaryingSystem.of(A, B, horizon, E, c, self.define, self.delay)
 
     def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
         if isinstance(self.parameters, ParameterSetOptions):

@@ -114,7 +114,8 @@ def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
 
 def _system_keys(system: System) -> dict[str, Any]:
     if isinstance(system, VaryingSystem):
-        return {**_matrix_keys(system.law), **_defined_keys([system.law])}
+        late = {"delay": system.delay} if system.delay else {}
+        return {**_matrix_keys(system.law), **late, **_defined_keys([system.law])}
     unknown = {one.name for mode in system.modes for one in fields(mode)} - WRITTEN_OF_SYSTEM
     if unknown:
         raise InputError(path=f"system.{sorted(unknown)[0]}", expected="a system in its own units", got="another")
