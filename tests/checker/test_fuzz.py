@@ -55,9 +55,30 @@ KINDS: dict[str, dict[str, Any]] = {
     "feedback, infeasible": on(
         3, {**PUSHED, "disturbance": {"box": [2.0]}, "terminal": [{"box": [0.05, 0.05]}]}, policy=AFFINE
     ),
+    "integral": on(4, {**DECAY, "integral": [{"G": [[1.0]], "upper": 3.0}, {"H": [[1.0]], "from": 0.2, "upper": 9.0}]}),
+    "varying": on(
+        4,
+        {
+            **DECAY,
+            "system": {"A": [["-1 - 0.2*sin(t)"]], "B": [["1/(4 - t)"]], "E": [[1.0]]},
+            "disturbance": {"box": [0.05]},
+            "initial_state": {"centre": [2], "box": [0.05]},
+        },
+    ),
+    "execution": on(4, {**DECAY, "system": {"A": [[-1.0]], "B": [[1.0]]}, "execution": [0.05]}),
+    "repeat": on(
+        3, {**PUSHED, "initial_state": {"centre": [0.5, 0], "box": [0.3, 0.3]}, "repeat": True}, policy=AFFINE
+    ),
+    "feedback, outputs": on(
+        3, {**PUSHED, "measurements": {"C": [[1.0, 0.0]], "noise": {"box": [0.01]}}}, policy=AFFINE
+    ),
+    "feedback, integral": on(3, {**PUSHED, "integral": [{"G": [[1.0]], "upper": 3.0}]}, policy=AFFINE),
+    "bound": on(3, {**PUSHED, "terminal": []}),
+    "bound, parameter": on(3, DECAY),
 }
 PARTS = 8
 SECONDS = 5.0  # of a check, which ends without a verdict then: the honest ones take a fifth of one
+OF = 13  # parts of the tamperings, of which a run sees `PARTS`: others of every kind, so that all kinds have their time
 SEED = 24
 
 
@@ -68,7 +89,10 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Any:
     def run(kind: str) -> Path:
         if kind not in made:
             made[kind] = tmp_path_factory.mktemp("honest") / "run"
-            sr.run(copy.deepcopy(KINDS[kind]), out=made[kind], quiet=True, figures=False)
+            if kind.startswith("bound"):
+                sr.bound(copy.deepcopy(KINDS[kind]), out=made[kind])
+            else:
+                sr.run(copy.deepcopy(KINDS[kind]), out=made[kind], quiet=True, figures=False)
         return made[kind]
 
     return run
@@ -88,7 +112,7 @@ def wrong(source: Path, target: Path, part: int, parts: int) -> list[str]:
     shutil.copytree(source, target)
     assert judged(target) == "verified"
     failures = []
-    for file in ("certificate.json", "result.json"):
+    for file in sorted({"bound.json", "certificate.json", "result.json"} & {made.name for made in target.iterdir()}):
         text = (target / file).read_text()
         rng = np.random.default_rng(SEED)
         for name, place, data in tampered(json.loads(text), SEED):
@@ -123,7 +147,7 @@ def test_a_decision_where_nothing_is_feasible_is_no_reason_to_fail(honest: Any, 
 def test_whatever_is_wrong_is_a_verdict_or_an_error_of_the_input(
     kind: str, part: int, honest: Any, tmp_path: Path
 ) -> None:
-    assert wrong(honest(kind), tmp_path / "copy", part, PARTS) == []
+    assert wrong(honest(kind), tmp_path / "copy", (part + list(KINDS).index(kind)) % OF, OF) == []
 
 
 def test_a_number_that_is_not_finite_is_named(honest: Any, tmp_path: Path) -> None:

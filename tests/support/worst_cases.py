@@ -1,16 +1,21 @@
 """Worst cases of known systems by a walk back in time with exponentials of small matrices: nothing of the package but
-the support functions of its sets."""
+the support functions of its sets; and problems with their cases for the checker, of which they are the truth."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
 
+import sparserob_core as sr
+from sparserob_core.checker.claims.case import Case
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.sets.sets import Box, Ellipsoid
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 
@@ -85,3 +90,86 @@ class Motion:
         if bound is not None:
             total = total + bound.support(w.blocks).sum(axis=1)
         return np.asarray(total if begun is None else total + begun.support(w.free))
+
+
+HORIZON = 2.0
+A = np.array([[0.0, 1.0], [-3.0, -0.4]])
+OTHER = np.array([[-0.5, 2.0], [-1.0, 0.1]])
+B, E = np.array([[0.3, 0.0], [1.0, -0.7]]), np.array([[0.4, 1.0], [-0.2, 0.5]])
+C = np.array([0.25, -0.5])
+START, BEFORE = np.array([0.5, -0.25]), np.array([0.7, -0.3])
+ENDS, CHANGES = np.array([0.0, 0.5, 1.25, 2.0]), np.array([0.0, 0.75, 1.5])
+BOUND, BEGUN = Box([-0.1, -0.3], [0.2, 0.1]), Ellipsoid([0.02, 0.0], [[0.01, 0.004], [0.004, 0.02]])
+CONTROL = Box([-1.0, -2.0], [1.5, 0.5])
+MOVING = np.array([[0.25, 0.5, 0.0], [1.0, -0.5, 0.75], [1.875, 0.25, -0.5]])
+DIRECTIONS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.5, -1.25], [-0.75, -0.5]])
+TIMES = np.arange(0.0, HORIZON + 1e-9, 1.0 / 32.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """A problem, its case and the same motion here."""
+
+    motion: Motion
+    system: Any
+    begun: ConvexSet | None
+    bound: ConvexSet | None
+    u: Array
+
+    def case(self, certificate: dict[str, Any] | None = None, **more: Any) -> Case:
+        late = {"initial_control": BEFORE} if self.motion.delay else {}
+        given = {"disturbance": self.bound, "initial_set": self.begun, "control": CONTROL, **late, **more}
+        problem = sr.OptimalControlProblem(
+            system=self.system, horizon=HORIZON, initial_state=START, **given
+        )  # fmt: skip
+        said = {"decision": self.u.tolist(), "status": "verified", **(certificate or {})}
+        grids = [sr.Dictionary.indicators(ends) for ends in (ENDS, [*CHANGES, HORIZON])]
+        return Case(problem, *grids, said)
+
+    def heights(self, time: float, rows: Array = DIRECTIONS) -> Array:
+        return self.motion.heights(rows, time, self.u, self.bound, self.begun, BEFORE)
+
+    @cached_property
+    def sampled(self) -> Array:
+        """At `TIMES`, ``(T, r)``."""
+        return np.array([self.heights(float(t)) for t in TIMES])
+
+
+@cache
+def kind(name: str) -> Kind:
+    legs, ends, delay = [(A, B, E, C)], list[float](), 0.0
+    system: Any = LinearSystem(A, B, E, c=C)
+    if name == "turning":
+        legs, ends = [(A, B, E, C), (OTHER, B[::-1], E, -C), (A.T, B, 2.0 * E, C)], [0.625, 1.25]
+        pieces = [(end, LinearSystem(*leg[:3], c=leg[3])) for end, leg in zip([*ends, HORIZON], legs, strict=True)]
+        system = SwitchedSystem(pieces)
+    if name == "late":
+        delay = 0.375
+        system = replace(system, delay=delay)
+    if name == "alone":
+        legs, system = [(A, B, E, 0.0 * C)], LinearSystem(A, B, E)
+    motion = Motion(legs, ends, START, ENDS, CHANGES if name != "alone" else np.zeros(0), delay)
+    u = np.array([[0.5, -1.0, 1.5], [-2.0, 0.25, -0.5]])
+    return Kind(motion, system, None if name == "alone" else BEGUN, None if name == "alone" else BOUND, u)
+
+
+KINDS = ("alone", "known", "turning", "late")
+
+
+def walls(name: str, which: str, made: Kind) -> tuple[Any, Array, Array]:
+    """What makes a constraint of limits; the times of its window, and the highest rows at these, ``(T, r)``: on both
+    sides of a jump of the control."""
+    start, stop = 0.25, 1.875
+    seen = (start <= TIMES) & (stop >= TIMES)
+    inside, heights = TIMES[seen], made.sampled[seen]
+    if which == "fixed":
+        return lambda h: sr.PathConstraint(sr.Polytope(DIRECTIONS, h), start, stop), inside, heights
+    if which == "moving":
+        shift = np.stack([np.interp(inside, MOVING[:, 0], MOVING[:, i]) for i in (1, 2)], axis=1)
+        at = heights - shift @ DIRECTIONS.T
+        return lambda h: sr.PathConstraint(sr.Polytope(DIRECTIONS, h), start, stop, relative_to=MOVING), inside, at
+    gains = np.array([[0.5, 0.0], [-0.25, 1.0], [0.0, -0.5], [1.0, 1.0]])
+    beside = [
+        made.u.T[np.clip(np.searchsorted(ENDS, inside, side=side) - 1, 0, 2)] @ gains.T for side in ("left", "right")
+    ]
+    return lambda h: sr.MixedConstraint(DIRECTIONS, gains, h, start, stop), inside, heights + np.maximum(*beside)

@@ -167,6 +167,8 @@ def _followed(case: Case, asked: Asked, made: Made) -> Worst | None:
     system, problem = case.problem.system, case.problem
     if isinstance(system, VaryingSystem):
         raise Unchecked("worst cases of a system that changes with time are not derived")
+    if problem.execution is not None and case.theta.any():
+        raise Unchecked("worst cases of a control that is delivered with errors are not derived")
     if not isinstance(system, LinearSystem) or system.parameter_count:
         return None
     parts = flows(system, [])[0].parts

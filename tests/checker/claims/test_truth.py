@@ -3,8 +3,7 @@ late and drift, against a walk of our own through their pieces."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,75 +12,17 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.claims import claims, constraints, replay, units
-from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
-from sparserob_core.control.sets.sets import Box, Ellipsoid
-from sparserob_core.sip.convex_set import Array, ConvexSet
-from tests.support.worst_cases import Motion
-
-HORIZON = 2.0
-A = np.array([[0.0, 1.0], [-3.0, -0.4]])
-OTHER = np.array([[-0.5, 2.0], [-1.0, 0.1]])
-B, E = np.array([[0.3, 0.0], [1.0, -0.7]]), np.array([[0.4, 1.0], [-0.2, 0.5]])
-C = np.array([0.25, -0.5])
-START, BEFORE = np.array([0.5, -0.25]), np.array([0.7, -0.3])
-ENDS, CHANGES = np.array([0.0, 0.5, 1.25, 2.0]), np.array([0.0, 0.75, 1.5])
-BOUND, BEGUN = Box([-0.1, -0.3], [0.2, 0.1]), Ellipsoid([0.02, 0.0], [[0.01, 0.004], [0.004, 0.02]])
-CONTROL = Box([-1.0, -2.0], [1.5, 0.5])
-MOVING = np.array([[0.25, 0.5, 0.0], [1.0, -0.5, 0.75], [1.875, 0.25, -0.5]])
-DIRECTIONS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.5, -1.25], [-0.75, -0.5]])
-TIMES = np.arange(0.0, HORIZON + 1e-9, 1.0 / 32.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Kind:
-    """A problem, its case and the same motion here."""
-
-    motion: Motion
-    system: Any
-    begun: ConvexSet | None
-    bound: ConvexSet | None
-    u: Array
-
-    def case(self, certificate: dict[str, Any] | None = None, **more: Any) -> Case:
-        late = {"initial_control": BEFORE} if self.motion.delay else {}
-        given = {"disturbance": self.bound, "initial_set": self.begun, "control": CONTROL, **late, **more}
-        problem = sr.OptimalControlProblem(
-            system=self.system, horizon=HORIZON, initial_state=START, **given
-        )  # fmt: skip
-        said = {"decision": self.u.tolist(), "status": "verified", **(certificate or {})}
-        grids = [sr.Dictionary.indicators(ends) for ends in (ENDS, [*CHANGES, HORIZON])]
-        return Case(problem, *grids, said)
-
-    def heights(self, time: float, rows: Array = DIRECTIONS) -> Array:
-        return self.motion.heights(rows, time, self.u, self.bound, self.begun, BEFORE)
-
-    @cached_property
-    def sampled(self) -> Array:
-        """At `TIMES`, ``(T, r)``."""
-        return np.array([self.heights(float(t)) for t in TIMES])
-
-
-@cache
-def kind(name: str) -> Kind:
-    legs, ends, delay = [(A, B, E, C)], list[float](), 0.0
-    system: Any = LinearSystem(A, B, E, c=C)
-    if name == "turning":
-        legs, ends = [(A, B, E, C), (OTHER, B[::-1], E, -C), (A.T, B, 2.0 * E, C)], [0.625, 1.25]
-        pieces = [(end, LinearSystem(*leg[:3], c=leg[3])) for end, leg in zip([*ends, HORIZON], legs, strict=True)]
-        system = SwitchedSystem(pieces)
-    if name == "late":
-        delay = 0.375
-        system = replace(system, delay=delay)
-    if name == "alone":
-        legs, system = [(A, B, E, 0.0 * C)], LinearSystem(A, B, E)
-    motion = Motion(legs, ends, START, ENDS, CHANGES if name != "alone" else np.zeros(0), delay)
-    u = np.array([[0.5, -1.0, 1.5], [-2.0, 0.25, -0.5]])
-    return Kind(motion, system, None if name == "alone" else BEGUN, None if name == "alone" else BOUND, u)
-
-
-KINDS = ("alone", "known", "turning", "late")
+from tests.support.worst_cases import (
+    BEFORE,
+    CHANGES,
+    CONTROL,
+    DIRECTIONS,
+    KINDS,
+    START,
+    kind,
+    walls,
+)  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -134,25 +75,6 @@ def test_a_replayed_state_is_that_of_its_disturbance(name: str) -> None:
         if made.bound is not None:
             exact = exact + (w.blocks * signal.T).sum(axis=(1, 2)) + w.free @ deviation
         assert [float(x.mid()) for x in found] == pytest.approx(exact, abs=1e-13)
-
-
-def walls(name: str, which: str, made: Kind) -> tuple[Any, Array, Array]:
-    """What makes a constraint of limits; the times of its window, and the highest rows at these, ``(T, r)``: on both
-    sides of a jump of the control."""
-    start, stop = 0.25, 1.875
-    seen = (start <= TIMES) & (stop >= TIMES)
-    inside, heights = TIMES[seen], made.sampled[seen]
-    if which == "fixed":
-        return lambda h: sr.PathConstraint(sr.Polytope(DIRECTIONS, h), start, stop), inside, heights
-    if which == "moving":
-        shift = np.stack([np.interp(inside, MOVING[:, 0], MOVING[:, i]) for i in (1, 2)], axis=1)
-        at = heights - shift @ DIRECTIONS.T
-        return lambda h: sr.PathConstraint(sr.Polytope(DIRECTIONS, h), start, stop, relative_to=MOVING), inside, at
-    gains = np.array([[0.5, 0.0], [-0.25, 1.0], [0.0, -0.5], [1.0, 1.0]])
-    beside = [
-        made.u.T[np.clip(np.searchsorted(ENDS, inside, side=side) - 1, 0, 2)] @ gains.T for side in ("left", "right")
-    ]
-    return lambda h: sr.MixedConstraint(DIRECTIONS, gains, h, start, stop), inside, heights + np.maximum(*beside)
 
 
 @pytest.mark.parametrize("which", ["fixed", "moving", "mixed"])

@@ -274,6 +274,14 @@ def test_bad_input_is_named(stated: object, arguments: dict, named: str) -> None
     assert named in str(told.value)
 
 
+def test_a_run_with_errors_of_execution_is_refused_and_its_plant_without_control_is_not(tmp_path: Path) -> None:
+    stated = config(pieces=4, initial_state=[0.5, 0], execution=[0.05], terminal=[{"box": [0.4, 0.4]}])
+    outcome = sr.run(stated, out=tmp_path / "run", figures=False)
+    with pytest.raises(sr.InputError, match=r"execution: .*0\.05"):
+        sr.bound(outcome)
+    assert sr.bound(stated).rows
+
+
 @pytest.mark.slow
 def test_a_run_that_answers_what_it_measures_is_refused(tmp_path: Path) -> None:
     stated = config(pieces=4, initial_state=[0.1, 0], disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [0.4, 0.4]}])
