@@ -12,7 +12,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, tools_of
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.sip.inner.counterpart import Counterpart
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from tests.support.problems import spring

@@ -22,7 +22,7 @@ from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.experiment.check.check import check
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread
-from sparserob_core.sip.inner.counterpart import Growing
+from sparserob_core.sip.inner.simplex.counterpart import Growing
 from tests.support.problems import double_integrator
 
 RATE, T = 0.4, 3.0

@@ -405,7 +405,7 @@ def test_no_causal_policy_costs_less_than_a_tree_of_signals_proves(tmp_path: Pat
 def test_the_bound_against_causal_policies_depends_on_no_clock_and_says_so_where_it_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sparserob_core.sip.inner.counterpart import Growing
+    from sparserob_core.sip.inner.simplex.counterpart import Growing
 
     quick = run(springs(0.2, 0.5), 10, tmp_path / "quick").summary
     solve = Growing.solve

@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import linprog
 
 import sparserob_core as sr
-from sparserob_core.sip.inner.counterpart import Growing
+from sparserob_core.sip.inner.simplex.counterpart import Growing
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.solver import Asked, Auto, Failures, Named
 from sparserob_core.testing.solvers import regularised, robust_terminal

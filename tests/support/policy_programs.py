@@ -83,27 +83,38 @@ class PolicyProgram:
         self.fixed.append((what[0, 1:], value - float(what[0, 0])))
         self.fixed += [(what[1 + q, 1:], -float(what[1 + q, 0])) for q in np.flatnonzero(self.radii > 0.0)]
 
+    def within(self, bound: float) -> None:
+        """``|u_i| <= bound``, whatever happens."""
+        for k in range(self.K):
+            for u in self.control(k):
+                for sign in (1.0, -1.0):
+                    self.below(sign * u, bound)
+
+    @property
+    def table(self) -> tuple[csr_array, np.ndarray]:
+        """All rows ``table x <= limits`` of the variables, with those that absolute values need beside them."""
+        entries = [(r, c, v) for r, (row, _) in enumerate(self.rows) for c, v in row.items()]
+        r, c, v = (np.array(part) for part in zip(*entries, strict=True))
+        shape = (len(self.rows), self.n + self.more)
+        return coo_array((v, (r.astype(int), c.astype(int))), shape=shape).tocsr(), np.array([b for _, b in self.rows])
+
     def solve(self, bound: float, cost: str) -> float:
         """The least cost with ``|u_i| <= bound``; infinite where nothing is feasible."""
         m, K = self.B.shape[1], self.K
+        self.within(bound)
         for k in range(K):
             u = self.control(k)
             for i in range(m):
                 price = m * K + i * K + k
                 for sign in (1.0, -1.0):
-                    self.below(sign * u[i], bound)
                     priced = sign * u[i] if cost == "peak" else sign * u[i] * (np.arange(len(u[i])) == 0)[:, None]
                     self.below(priced, 0.0, {price: 1.0})
-        entries = [(r, c, v) for r, (row, _) in enumerate(self.rows) for c, v in row.items()]
-        r, c, v = (np.array(part) for part in zip(*entries, strict=True))
-        size = self.n + self.more
-        objective = np.zeros(size)
+        table, limits = self.table
+        objective = np.zeros(table.shape[1])
         objective[m * K : 2 * m * K] = self.horizon / K
-        table = coo_array((v, (r.astype(int), c.astype(int))), shape=(len(self.rows), size)).tocsr()
         equalities = {} if not self.fixed else {
             "A_eq": csr_array(np.array([np.pad(row, (0, self.more)) for row, _ in self.fixed])),
             "b_eq": [value for _, value in self.fixed],
         }  # fmt: skip
-        limits = [b for _, b in self.rows]
         found = linprog(objective, table, limits, bounds=(None, None), method="highs-ds", **equalities)
         return float(found.fun) if found.status == 0 else np.inf

@@ -284,7 +284,7 @@ def _multiplied(case: Case, priced: bool) -> arb:
     """The bound that the certificate's multipliers give."""
     data = case.certificate.get("multipliers")
     if case.policy is not None:
-        return _feedback(case).multiplied(_entries(data), priced)
+        return _feedback(case).multiplied(_entries(data), priced, _touched(case, data) if priced else None)
     rows, pieces = _weighted(case, data)
     if not priced:
         return case.duality.bound(rows, pieces, None)
@@ -551,9 +551,11 @@ def relative_gap(case: Case, cost: float, lower: float) -> float:
 
 def added_up(case: Case) -> float:
     """What is added up to the cost that is claimed: the cost itself, but where the quadratic terms of one cancel."""
-    if case.counts or case.policy is not None or not case.price.is_quadratic:
-        return abs(number(case.certificate, "cost"))
-    return case.price.added(case.pieces)
+    cost = number(case.certificate, "cost")
+    if case.counts or not case.price.is_quadratic:
+        return abs(cost)
+    other = None if case.charge == "nominal" else cost - case.price.squares(case.pieces)
+    return case.price.added(case.pieces, other)
 
 
 def largest_cost(case: Case) -> float:

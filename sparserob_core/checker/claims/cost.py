@@ -117,7 +117,13 @@ class Price:
         total = arb(0)
         for costs, piece in self.clock.each(zip(self.costs, pieces, strict=True)):
             total = total + self._norms(costs, piece.entries())
-        return total + (self._quadratic(pieces).value if self.is_quadratic else arb(0))
+        return total + self.squares(pieces)
+
+    def squares(self, pieces: Sequence[arb_mat]) -> arb:
+        """The quadratic terms of a control ``(m, 1)`` on every piece."""
+        from flint import arb
+
+        return self._quadratic(pieces).value if self.is_quadratic else arb(0)
 
     def _norms(self, costs: Sequence[arb], u: Sequence[arb]) -> arb:
         from flint import arb
@@ -136,11 +142,13 @@ class Price:
             constant = constant - sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), constant * 0)
         return Tangent(constant, found.slope)
 
-    def added(self, pieces: Sequence[arb_mat]) -> float:
-        """The absolute values of what the program adds up to the cost of a control: its norms, and of the quadratic
-        terms the linear, the quadratic and the constant part."""
+    def added(self, pieces: Sequence[arb_mat], lengths: arb | None = None) -> float:
+        """The absolute values of what the program adds up to the cost of a control: its norms, unless its ``lengths``
+        cost something else, and of the quadratic terms the linear, the quadratic and the constant part."""
         parts = zip(self.costs, pieces, strict=True)
-        norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), _ball(Fraction(0)))
+        norms = lengths
+        if norms is None:
+            norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), _ball(Fraction(0)))
         if not self.is_quadratic:
             return float(norms.mid())
         found, still = self._quadratic(pieces), [piece * 0 for piece in pieces]

@@ -204,15 +204,17 @@ class Duality:
         pieces: Sequence[Sequence[float]] | None,
         price: Price | None,
         touched: Sequence[arb_mat] | None = None,
+        lengths: bool = True,
     ) -> arb:
         """The bound that multipliers ``y`` of ``rows`` give; with the ``price``, or without as a proof of
         infeasibility. Quadratic terms, and norms, are replaced by their tangents at the control ``touched (m, 1)`` on
-        every piece."""
+        every piece. ``lengths``: whether absolute values of this control are charged, or of another one."""
         tangent = None if price is None or touched is None or not price.is_quadratic else price.tangent(touched)
         constant, slopes = self.summed(rows, pieces, tangent)
-        groups = [] if price is None else [block for block in price.blocks if len(block) > 1]
+        charges = price if lengths else None
+        groups = [] if charges is None else [block for block in charges.blocks if len(block) > 1]
         free = [[_exact(0.0)] * self.problem.system.controls] * len(slopes)
-        charged = self.charged(rows, free if price is None else price.costs)
+        charged = self.charged(rows, free if charges is None else charges.costs)
         for k, (costs, slope) in enumerate(zip(charged, slopes, strict=True)):
             if groups and touched is not None:
                 constant = constant + self._least_of_groups(costs, slope, groups, touched[k].entries())

@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims.case import EQUALS, STEP, Case, number, numbers
 from sparserob_core.checker.claims.constraints import covered, cut, normals_of, of_fixed
-from sparserob_core.checker.claims.duality import before, steps
+from sparserob_core.checker.claims.duality import Row, before, steps
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, RESOLVED, TOLERANCE, Broken, Unchecked
@@ -192,24 +192,24 @@ class FeedbackClaims:
         return self.loop.inputs(0) - stacked([balls([float(u), *zero]) for u in before(self.case.problem)])
 
     def cost(self) -> arb:
-        """The cost of the policy; where that is an effort, the written one, which is shown to be none too small."""
+        """The cost of the policy; where absolute values are charged as an effort, the written one, which is shown to
+        be none too small."""
         from flint import arb
 
         case, total = self.case, arb(0)
+        if case.charge == "nominal":
+            return case.price.of(case.pieces)
+        squares = case.price.squares(case.pieces)
         if case.charge == WORST:
             written = arb(number(case.certificate, "cost"))
-            self._effort(written + FIGURES * abs(written))
+            self._effort(written - squares + FIGURES * abs(written))
             return written
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
-                u = arb(float(case.theta[i, k]))
-                if case.charge == PEAK:
-                    row = self.loop.effects[k][i]
-                    height = (u + self.loop.support(row)).max(-u + self.loop.support([-x for x in row]))
-                else:
-                    height = abs(u)
+                u, row = arb(float(case.theta[i, k])), self.loop.effects[k][i]
+                height = (u + self.loop.support(row)).max(-u + self.loop.support([-x for x in row]))
                 total = total + price * height
-        return total
+        return total + squares
 
     def _effort(self, limit: arb) -> None:
         """Show that no deviation causes an effort beyond a limit."""
@@ -472,8 +472,9 @@ class FeedbackClaims:
         K, m = self.case.control.pieces, self.case.problem.system.controls
         return self._loop(np.zeros((m, K)), self._none)
 
-    def multiplied(self, entries: Sequence[Any], priced: bool) -> arb:
-        """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind.
+    def multiplied(self, entries: Sequence[Any], priced: bool, touched: Sequence[arb_mat] | None) -> arb:
+        """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind; norms
+        and quadratic terms of the nominal control are replaced by their tangents where it is ``touched``.
 
         Of the nominal control ``v`` and, with the costs ``peak`` and ``worst``, of the peaks and of the effort only the
         sets are used, and how far these let them go; of the gains that
@@ -482,28 +483,22 @@ class FeedbackClaims:
         from flint import arb
 
         case = self.case
-        K, m = case.control.pieces, case.problem.system.controls
-        loop = self.loop_at_rest
         rows = [row for entry in entries for row in _Row.of(case, self._told(entry), entry, case.charge)]
-        total = sum((row.multiplier * row.constant for row in rows), arb(0))
-        slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
-                  for i in range(m)] for k in range(K)]  # fmt: skip
-        peaks, most = case.charge == PEAK, arb(0)
+        nominal = [(float(row.multiplier.mid()), Row(row.constant, row.nominal)) for row in rows]
+        price = case.price if priced else None
+        total = case.duality.bound(nominal, None, price, touched, lengths=case.charge == "nominal")
+        most = arb(0)
         for k, asked_of in enumerate(case.price.costs):
-            prices = asked_of if priced else [arb(0)] * m
-            if case.charge == WORST:
-                most = most + sum((p * _reach(case.problem.control, i) for i, p in enumerate(asked_of)), arb(0))
-                prices = [arb(0)] * m
-            if peaks:
-                for i in range(m):
-                    asked = prices[i] - sum((r.multiplier for r in rows if r.peak == (k, i)), arb(0))
-                    total = total + (asked * _reach(case.problem.control, i)).min(arb(0))
-                prices = [arb(0)] * m
-            total = total + known(case.problem.control).least(prices, prices, slope[k])
+            for i, asked in enumerate(asked_of):
+                reach = _reach(case.problem.control, i)
+                if case.charge == PEAK:
+                    left = asked * int(priced) - sum((r.multiplier for r in rows if r.peak == (k, i)), arb(0))
+                    total = total + (left * reach).min(arb(0))
+                most = most + asked * reach
         if case.charge == WORST:
             left = arb(int(priced)) - sum((r.multiplier for r in rows if r.of_effort), arb(0))
             total = total + (left * most).min(arb(0))
-        return total - self._of_gains(loop, rows)
+        return total - self._of_gains(self.loop_at_rest, rows)
 
     def _of_gains(self, loop: ClosedLoop, rows: list[_Row]) -> arb:
         """How much the gains can lower the weighted sum of the rows, at most."""

@@ -24,7 +24,7 @@ import numpy as np
 
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.sip.inner.counterpart import Growing
+from sparserob_core.sip.inner.simplex.counterpart import Growing
 
 EXCEEDED = 1e-9  # of a row's size, beyond which it is imposed
 AT_ONCE = 3  # rows of every side that are imposed of each signal at once

@@ -26,6 +26,7 @@ from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.transcription.objective import objective
 from sparserob_core.control.transcription.own_units import extent, reaches, units_of_sides
 from sparserob_core.control.transcription.record import Feedback, Transcription
 from sparserob_core.control.transcription.steps import before
@@ -185,7 +186,8 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         and problem.control_step is not None
         and problem.measurements is not None,
         "control_step with flat sides": problem.control_step is not None and problem.control_step.halfspaces() is None,
-        "cost that is the L1 norm alone, without group": not problem.cost.is_linear,
+        f"cost of single channels where the policy is charged {cost}: without group": bool(problem.cost.blocks)
+        and cost != "nominal",
     }
     for wanted, hindered in reasons.items():
         if hindered:
@@ -238,9 +240,10 @@ def _program(
     low, high = -problem.control.support(-axes), problem.control.support(axes)
     most = (high - low)[known.channel] / loop.spread.chords[known.entry]
     low, high = np.repeat(low, pieces), np.repeat(high, pieces)
-    weights, lower, upper = np.zeros(size), np.concatenate([low, -most]), np.concatenate([high, most])
-    cost = problem.prices(model.control.breakpoints).ravel()
-    guide, largest, among = None, None, None
+    lower, upper = np.concatenate([low, -most]), np.concatenate([high, most])
+    priced = objective(problem, model.control, size, size)
+    weights, cost = np.zeros(size), priced["weights"][:nominal]
+    guide, among = None, None
     if charge.cost == "peak":
         both = np.vstack([axes, -axes])
         peaks = FeedbackControl(PEAK, loop, both, np.zeros(len(both)), first)
@@ -256,17 +259,19 @@ def _program(
         guide = (_program(model, replace(charge, cost="peak"), known, acting, fixed, steps)[0], first)
         weights[first:] = 1.0
         lower = np.append(lower, 0.0)
-        largest = float(cost @ np.maximum(np.abs(low), np.abs(high)))
-        upper = np.append(upper, 2.0 * largest)
+        most_effort = float(cost @ np.maximum(np.abs(low), np.abs(high)))
+        priced.setdefault("largest", most_effort)
+        upper = np.append(upper, 2.0 * most_effort)
     else:
         weights[:nominal] = cost
-        if charge.among == "peak":
+        if charge.among == "peak" and problem.cost.is_linear:
             peak = replace(charge, cost="peak")
             among = (_program(model, peak, known, acting, fixed, steps)[0], first)
+    priced["weights"] = weights
     program = SemiInfiniteProgram(
         n=size,
         families=families,
-        weights=weights,
+        **priced,
         lower=lower,
         upper=upper,
         channels=problem.system.controls,
@@ -275,7 +280,6 @@ def _program(
         settle=None if not settled else lambda x: reduce(lambda at, settle: settle(at), settled, x),
         guide=guide,
         among=among,
-        largest=largest,
     )
     return program, loop
 

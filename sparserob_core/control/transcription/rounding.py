@@ -85,8 +85,8 @@ def _quadratic(model: Transcription, result: Result) -> float:
     pieces = np.repeat(reach, model.control.pieces)
     far = pieces if finite.S is None else np.abs(np.linalg.pinv(model.control.values.T)).sum(axis=1)
     far = far if finite.S is None else np.kron(reach, far)
-    bent = np.abs(np.asarray(finite.P @ at))
-    return float(abs(finite.constant) + 0.5 * np.abs(at) @ bent + (np.abs(finite.q) + bent) @ far)
+    bent, at, q = (np.abs(model.nominal(each)) for each in (np.asarray(finite.P @ at), at, finite.q))
+    return float(abs(finite.constant) + 0.5 * at @ bent + (q + bent) @ far)
 
 
 def _neglected(model: Transcription, result: Result) -> float:

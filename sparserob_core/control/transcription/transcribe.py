@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, TypedDict
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.accumulated import accumulated
+from sparserob_core.control.transcription.objective import objective, quadratics
 from sparserob_core.control.transcription.own_units import (
     RESOLVED,
     extent,
@@ -189,12 +190,12 @@ def _assembled(
     elif own is not None:
         rows = _row_units(problem if own is problem.control else replace(problem, control=own), functionals, A)
         constraints = tuple(one.divided(row_units(one, own)) for one in constraints)
-    S, lower, upper, weights = _image(problem, control, rows)
+    S, lower, upper = _image(problem, control, rows)
     if rows is not None:
         A, b = rows.equalities(A, b)
         b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
     if functionals.execution is not None:
-        S, lower, upper, weights = _with_sizes(S, lower, upper, weights, functionals)
+        S, lower, upper = _with_sizes(S, lower, upper, functionals)
     families = [family_of(constraint) for constraint in constraints]
     held = []
     if problem.control.halfspaces() is None:
@@ -209,9 +210,7 @@ def _assembled(
     program = SemiInfiniteProgram(
         n=functionals.variables,
         families=families,
-        weights=weights,
-        blocks=_blocks(problem, control, weights.size),
-        **_quadratic(problem, control),
+        **objective(problem, control, lower.size, functionals.variables),
         S=S,
         lower=lower,
         upper=upper,
@@ -436,7 +435,7 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
     A, b = (A, b) if model.rows is None else model.rows.equalities(A, b)
     program = replace(
         model.program,
-        **_quadratic(problem, model.control),
+        **quadratics(problem, model.control, functionals.variables),
         families=[moved.get(family.name, family) for family in model.program.families],
         A=A if b.size else None,
         b=b if b.size else None,
@@ -489,8 +488,8 @@ def _name(kind: str, position: int, count: int) -> str:
 
 def _image(
     problem: OptimalControlProblem, dictionary: Dictionary, rows: RowUnits | None
-) -> tuple[csc_array | None, Array, Array, Array]:
-    """The control on every piece, its bounds and weights, one more image per piece and side of a polytope, and one per
+) -> tuple[csc_array | None, Array, Array]:
+    """The control on every piece, its bounds, one more image per piece and side of a polytope, and one per
     step and side of the set of its changes."""
     from scipy.sparse import csc_array, eye_array, kron, vstack
 
@@ -500,7 +499,6 @@ def _image(
         np.repeat(-bound.support(-axes), dictionary.pieces),
         np.repeat(bound.support(axes), dictionary.pieces),
     )
-    weights = problem.prices(dictionary.breakpoints).ravel()
     values = csc_array(dictionary.sparse.T)
     H, h = slanted(bound)
     H, h = (H, h) if rows is None else (H / rows.sides[:, None], h / rows.sides)
@@ -511,7 +509,6 @@ def _image(
             (None if dictionary.is_indicators else csc_array(kron(eye_array(channels), values))),
             lower,
             upper,
-            weights,
         )
     blocks = [kron(eye_array(channels), values)]
     blocks += [kron(csc_array(H), values)] if h.size else []
@@ -522,13 +519,12 @@ def _image(
         S,
         np.concatenate([lower, np.full(extra.size, -np.inf), least]),
         np.concatenate([upper, extra, most]),
-        np.concatenate([weights, np.zeros(extra.size + steps.count)]),
     )
 
 
 def _with_sizes(
-    S: csc_array | None, lower: Array, upper: Array, weights: Array, functionals: WorstCase
-) -> tuple[csc_array, Array, Array, Array]:
+    S: csc_array | None, lower: Array, upper: Array, functionals: WorstCase
+) -> tuple[csc_array, Array, Array]:
     """The images of `_image` where the decision goes on with a bound ``a`` of the size of every value ``s`` of the
     control, and those that make it one: ``0 <= a - s``, ``0 <= a + s``, neither more than twice as far as ``s`` goes,
     which ``a = |s|`` is not."""
@@ -543,43 +539,7 @@ def _with_sizes(
         csc_array(block_array([[known, None], [-values, one], [values, one]])),
         np.concatenate([lower, none, none]),
         np.concatenate([upper, far, far]),
-        np.concatenate([weights, none, none]),
     )
-
-
-def _blocks(problem: OptimalControlProblem, dictionary: Dictionary, images: int) -> Array | None:
-    """The number of the group and piece of every image; ``None`` where every channel counts alone."""
-    if not problem.cost.blocks:
-        return None
-    number = np.full((problem.system.controls, dictionary.pieces), -1)
-    for group, block in enumerate(problem.cost.blocks):
-        number[list(block)] = group * dictionary.pieces + np.arange(dictionary.pieces)
-    answer: Array = np.append(number.ravel(), np.full(images - number.size, -1))
-    return answer
-
-
-class Quadratics(TypedDict, total=False):
-    """What the quadratic terms of a cost are in a program."""
-
-    P: csc_array
-    q: Array
-    constant: float
-    largest: float
-
-
-def _quadratic(problem: OptimalControlProblem, dictionary: Dictionary) -> Quadratics:
-    """The quadratic terms of the cost, and what a gap is relative to: the largest cost of the absolute values, and the
-    largest of the quadratic terms at a control that stays 0, or stays at one end of one channel."""
-    if not problem.cost.is_quadratic:
-        return {}
-    from sparserob_core.control.transcription.quadratic import quadratic_cost
-
-    on_pieces = quadratic_cost(problem, dictionary.breakpoints)
-    terms, axes = on_pieces.on(dictionary), np.eye(problem.system.controls)
-    reach = problem.control.reach(axes)
-    prices = problem.prices(np.array([0.0, problem.horizon]))[:, 0]
-    largest = float(prices @ reach) + on_pieces.largest(reach)
-    return {"P": terms.P, "q": terms.q, "constant": terms.constant, "largest": largest}
 
 
 def slanted(bound: ConvexSet) -> tuple[Array, Array]:

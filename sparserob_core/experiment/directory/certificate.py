@@ -193,7 +193,11 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
         ],
         "equalities": dual.mu,
         "pieces": _on_pieces(problem, z, experiment.control.pieces),
-        **({} if dual.at is None else {"tangent": dual.at.reshape(problem.system.controls, -1)}),
+        **(
+            {}
+            if dual.at is None
+            else {"tangent": experiment.transcription.nominal(dual.at).reshape(problem.system.controls, -1)}
+        ),
     }
 
 

@@ -37,7 +37,7 @@ Multipliers: TypeAlias = tuple[Array, Array, Array | None, Array | None]
 
 
 @dataclass(frozen=True)
-class _Terms:
+class Terms:
     """``bound = constant + sum_k min weights_k |s| + 1/2 curvature_k s^2 + slope_k s`` over the bounds; ``noise (k,)``
     of the slope. ``at (k,)``: an image where norms of blocks may be replaced by their tangents."""
 
@@ -84,7 +84,7 @@ def proving(
 
 
 def _proven(
-    program: FiniteProgram, terms: _Terms, y: Array, mu: Array, z: Array | None, at: Array | None
+    program: FiniteProgram, terms: Terms, y: Array, mu: Array, z: Array | None, at: Array | None
 ) -> tuple[float, Array, Array, Array | None]:
     bound = _bound(terms, program)
     if bound > -np.inf:
@@ -212,7 +212,7 @@ def _terms(
     mu: Float[Array, " e"],
     z: Float[Array, " k"] | None,
     at: Float[Array, " n"] | None,
-) -> _Terms:
+) -> Terms:
     finite = np.where(y > 0, program.h, 0.0)
     constant = program.constant - float(_weighed(y, finite, mu, program.b))
     magnitude = float(_weighed(y, np.abs(finite), np.abs(mu), np.abs(program.b))) + abs(program.constant)
@@ -229,10 +229,10 @@ def _terms(
     if program.P is None:
         curvature = None
     if program.S is None:
-        return _Terms(constant, slope, noise, program.weights, curvature, magnitude, image)
+        return Terms(constant, slope, noise, program.weights, curvature, magnitude, image)
     start = np.zeros(program.weights.size) if z is None else z
     z = onto_stationary(program, start, slope)
-    return _Terms(constant, -z, np.abs(z) + np.abs(noise).max(initial=0.0), program.weights, None, magnitude, image)
+    return Terms(constant, -z, np.abs(z) + np.abs(noise).max(initial=0.0), program.weights, None, magnitude, image)
 
 
 def _weighed(y: Array, rows: Array, mu: Array, equalities: Array) -> Array:
@@ -240,7 +240,7 @@ def _weighed(y: Array, rows: Array, mu: Array, equalities: Array) -> Array:
     return np.asarray(y @ rows + mu @ equalities if mu.size else y @ rows)
 
 
-def _without_norms(terms: _Terms, program: FiniteProgram) -> _Terms:
+def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
     """Every block's ``weight |s|`` replaced by ``d's`` for the ``|d| <= weight`` that bounds more: that nearest to what
     the slope asks for, or that of the tangent at an image."""
     blocks = program.blocks
@@ -276,8 +276,8 @@ def _shrinking(weights: Array, norms: Array) -> Array:
     return np.minimum(1.0, weights / np.where(norms > 0.0, norms, 1.0))
 
 
-def _bound(terms: _Terms, program: FiniteProgram) -> float:
-    terms = _without_norms(terms, program)
+def _bound(terms: Terms, program: FiniteProgram) -> float:
+    terms = without_norms(terms, program)
     slope = terms.slope
     if not (isfinite(terms.constant) and np.isfinite(slope).all()):
         return -np.inf
@@ -294,7 +294,7 @@ def _bound(terms: _Terms, program: FiniteProgram) -> float:
     return terms.constant + float(values.sum()) - ROUND_OFF * size
 
 
-def _overshot(terms: _Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:
+def _overshot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:
     """The entries whose slope is beyond their weight by a little, `NEAR` of it, where that costs a notable share of the
     bound because their bounds are far away; ``None`` where there is none, or shrinking the multipliers is no way out
     (`_shrunk_bound`)."""

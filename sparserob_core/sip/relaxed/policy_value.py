@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import UncertainRows
-from sparserob_core.sip.inner.counterpart import Counterpart
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart
 from sparserob_core.sip.program import SemiInfiniteProgram
 
 Linear: TypeAlias = tuple[Array, Array, np.ndarray]

@@ -1,6 +1,6 @@
 """Imposed rows that must hold for every deviation: times are exchanged, deviations are all in the relaxed program.
 
-The relaxed program is the robust counterpart at the imposed indices (`inner.counterpart`, or `inner.central` where that
+The relaxed program is the robust counterpart at the imposed indices (`inner.simplex`, or `inner.central` where that
 is quicker). The lower bound is that of cuts: every row with a multiplier, at the deviation that its multipliers say
 (weak duality over the bounds of the program). Nothing is dropped: a row has variables of its own, and the last basis,
 from which the next solution starts, goes through them.
@@ -19,7 +19,7 @@ from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem
 from sparserob_core.sip.finite import INTERIOR, FiniteSolution
 from sparserob_core.sip.inner.central.interior import Interior
-from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.proof.verdict import NAMED, explained
@@ -100,7 +100,7 @@ class RobustRows(Working):
             self.calls[INTERIOR] += 1
         else:
             before = Counter(self.counterpart.answered)
-            answer = self.counterpart.solve(margin, seconds)
+            answer = self.counterpart.solve(margin, accuracy, seconds)
             self.calls += self.counterpart.answered - before
         return answer
 
@@ -203,7 +203,7 @@ class RobustRows(Working):
 
     def _closer(self, answer: Answer, violation: float, added: bool) -> bool:
         """Whether the next round can be more accurate; it is where what was added changes little."""
-        if not isinstance(self.counterpart, Interior) or self.accuracy <= FINEST * self.tolerance:
+        if not self.counterpart.approximate or self.accuracy <= FINEST * self.tolerance:
             return False
         if not added or self.price * violation < self.accuracy * size_of(self.program, answer):
             self.accuracy = max(FINEST * self.tolerance, SHARPER * self.accuracy)
@@ -283,13 +283,18 @@ class RobustRows(Working):
     def dual(self, answer: RobustAnswer, priced: bool) -> Dual:
         """What the multipliers of an answer prove, with the cuts that prove it."""
         blocks = self.counterpart.blocks
-        bound, size = robust_bound(self.program.finite, blocks, answer.y, answer.deviations, answer.mu, priced)
+        at = answer.at
+        if not priced:
+            at = None
+        elif at is None and (self.program.P is not None or self.program.finite.blocks is not None):
+            at = np.zeros(self.program.n)
+        bound, size = robust_bound(self.program.finite, blocks, answer.y, answer.deviations, answer.mu, priced, at)
         cuts = tuple(
             replace(cut, index=np.concatenate([cut.index, w]), multiplier=float(y), formulation="literal")
             for cut, y, w in zip(self.cuts, answer.y, answer.deviations, strict=True)
             if y > 0.0
         )
-        return Dual(bound - (ROUNDING + self.counterpart.spread.missed) * size, cuts, answer.mu)
+        return Dual(bound - (ROUNDING + self.counterpart.spread.missed) * size, cuts, answer.mu, at=at)
 
     @property
     def at_rest(self) -> Dual:

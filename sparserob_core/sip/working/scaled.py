@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparserob_core.sip.inner.counterpart import Counterpart
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.working.robust import left

@@ -26,14 +26,15 @@ WORDS = "; nor does any other causal policy with this dictionary exist: {} signa
 
 
 def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
-    """The result with a bound against every causal policy, where it has a policy; a run that was stopped seeks none."""
+    """The result with a bound against every causal policy, where it has a policy and costs what absolute
+    values do; a run that was stopped seeks none."""
     model = result.model
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
         return result
     from sparserob_core.control.studies.causal import CausalBound, Limits
 
     charge = model.feedback.charge
-    if not charge.causal_signals:
+    if not charge.causal_signals or not model.problem.cost.is_linear:
         return result
     try:
         search = searched(model, result.decision, active(model, result))

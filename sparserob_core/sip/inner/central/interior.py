@@ -21,7 +21,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
 from sparserob_core.sip.inner.central.layout import Block, Layout
-from sparserob_core.sip.inner.counterpart import RobustAnswer
+from sparserob_core.sip.inner.simplex.counterpart import RobustAnswer
 
 STEPS = 80  # Newton steps of one solve at most
 CORRECTIONS = 2  # of a step at most (Gondzio 1996)
@@ -62,9 +62,15 @@ class Interior:
         self.blocks.append(block)
         self._stale = True
 
+    @property
+    def approximate(self) -> bool:
+        """Whether an answer can be as accurate as is asked for."""
+        return True
+
     def fits(self) -> bool:
-        """Whether all rows are of the kind that this knows, and so many variables that it is worth it."""
+        """Whether cost and rows are of the kind that this knows, and so many variables that it is worth it."""
         plain = self.spread.is_box and not any(block.exact for block in self.blocks)
+        plain = plain and self.program.P is None and self.program.blocks is None
         return plain and self._layout.fits()
 
     def sharpen(self, x: Array) -> bool:

@@ -16,7 +16,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
 from sparserob_core.sip.inner.central import layout
 from sparserob_core.sip.inner.central.interior import Interior
-from sparserob_core.sip.inner.counterpart import Counterpart, robust_bound
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart, robust_bound
 from tests.support.problems import spring
 
 BLOCKS, EACH, JOINT = 6, 4, 5  # entries of the deviations, variables that answer each, and variables that answer none

@@ -14,6 +14,7 @@ prove the same bound, and nothing but these cuts has to be believed.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, final
@@ -23,6 +24,8 @@ import numpy as np
 from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.inner.duality import Terms, without_norms
+from sparserob_core.sip.inner.simplex.tangents import Tangents
 from sparserob_core.sip.solver import Asked, QuadraticProgram
 
 if TYPE_CHECKING:
@@ -32,6 +35,11 @@ ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
 # Residuals of an answer of somebody else, in rows of length 1. Ten times more, and a row that was imposed is violated
 # by more than the margins by which rows are tightened (1e-8); ten times less, and it is more than was asked for.
 BELIEVED = 1e-9
+# Of what is added up to the cost: by how much its tangents may be below it. HiGHS meets rows to 1e-10, and there is one
+# tangent of every term, so that ten times less may not be reached; ten times more is a tenth of a gap that is asked for
+# at 1e-8.
+FLAT = 1e-9
+TOUCHED = 60  # rounds of tangents: each quarters what squares are below, 30 leave 1e-18 of it
 ROBUST = "feedback"  # what these programs are called where a solver fails on some
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME = 1e-12  # points of a set that are closer are one
@@ -45,7 +53,8 @@ DRAWN = (
 class RobustAnswer:
     """``x (n,)``, multipliers ``y (r,)`` of all rows in order and the deviation ``(r, Q)`` of each, ``mu (e,)``;
     ``slack``: by how much the rows must be relaxed, or the factor, where that was asked for. ``solved``: whether there
-    is an answer; ``said``: the solver's words."""
+    is an answer; ``said``: the solver's words. ``at (n,)``: the decision at which the multipliers ask for the tangent
+    of a cost that is not linear."""
 
     solved: bool
     said: str
@@ -54,6 +63,7 @@ class RobustAnswer:
     deviations: Array
     mu: Array
     slack: float = 0.0
+    at: Array | None = None
 
 
 @final
@@ -103,14 +113,17 @@ class Counterpart:
         program, n = self.program, self.program.n
         low, high = program.lower, program.upper
         priced = not (self.elastic or self.scales)
+        alone = np.ones(program.weights.size) if program.blocks is None else program.blocks.number < 0
         for side, sign in ((1.0, 1.0), (-1.0, -1.0)):
             ends = (low, high) if side > 0 else (-high, -low)
-            cost = (program.weights + sign * program.q) * priced
+            cost = (program.weights * alone + sign * program.q) * priced
             self._linear.variables(np.maximum(ends[0], 0.0), np.maximum(ends[1], 0.0), cost)
         if self.elastic:
             self._linear.variables(np.full(1, self.lowest), np.full(1, np.inf), np.ones(1))
         if self.scales:
             self._linear.variables(np.zeros(1), np.full(1, self.highest), -np.ones(1))
+        curved = priced and (program.P is not None or program.blocks is not None)
+        self._tangents = Tangents(program, self._linear) if curved else None
         self._fixed = np.zeros(0, dtype=int)
         if program.b.size:
             row, column = np.nonzero(program.A)
@@ -223,25 +236,41 @@ class Counterpart:
             self._linear.rows(entries, np.full(len(limits), -np.inf), np.array(limits))
         return bool(limits)
 
-    def solve(self, margin: float = 0.0, seconds: float = np.inf) -> RobustAnswer:
-        """The optimum with every row tightened by ``margin``; where it is elastic, how far the rows must be relaxed so
-        that they can be met. It is not solved where ``seconds`` do not suffice."""
+    @property
+    def approximate(self) -> bool:
+        """Whether an answer can be as accurate as is asked for: where the cost is replaced by tangents."""
+        return self._tangents is not None
+
+    def solve(self, margin: float = 0.0, accuracy: float = 0.0, seconds: float = np.inf) -> RobustAnswer:
+        """The optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost where that has
+        tangents; where it is elastic, how far the rows must be relaxed so that they can be met. It is not solved where
+        ``seconds`` do not suffice."""
         if margin != self._margin:
             self._margin = margin
             for where, limits, parts in self._imposed:
                 if parts:
                     self._linear.limit(where, limits - margin)
-        solved, said, columns, rows = self._linear.solve(seconds)
-        self.answered[self._linear.by] += 1
-        if not solved:
-            none = np.zeros(0)
-            return RobustAnswer(False, said, none, none, np.zeros((0, 0)), none)
+        until = time.monotonic() + seconds
+        for _ in range(TOUCHED):
+            solved, said, columns, rows = self._linear.solve(until - time.monotonic())
+            self.answered[self._linear.by] += 1
+            if not solved:
+                none = np.zeros(0)
+                return RobustAnswer(False, said, none, none, np.zeros((0, 0)), none)
+            if self._tangents is None:
+                break
+            missed, decided, roots = self._tangents.below(columns)
+            if missed <= max(accuracy, FLAT * self.program.added(decided)):
+                break
+            self._tangents.sharpen(decided, roots)
         n, mu = self.program.n, rows[self._fixed]
-        y, deviations = self._multipliers(rows, mu)
+        x = columns[:n] - columns[n : 2 * n]
+        at = None if self._tangents is None else self._tangents.touching(x, rows)
+        y, deviations = self._multipliers(rows, mu, at)
         slack = float(columns[2 * n]) if self.elastic or self.scales else 0.0
-        return RobustAnswer(True, said, columns[:n] - columns[n : 2 * n], y, deviations, mu, slack)
+        return RobustAnswer(True, said, x, y, deviations, mu, slack, at)
 
-    def _multipliers(self, even: Array, mu: Array) -> tuple[Array, Array]:
+    def _multipliers(self, even: Array, mu: Array, touched: Array | None) -> tuple[Array, Array]:
         """The multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand for."""
         y, deviations = self._plain(even)
         terms = [(np.zeros(0, dtype=int), np.zeros(0))]
@@ -269,7 +298,8 @@ class Counterpart:
                 deviations[first + rows] = np.sign(block.factor[rows])[:, None] * w
             first += block.h.size
         column, value = (np.concatenate(part) for part in zip(*terms, strict=True))
-        slope = mu @ self.program.A + (0.0 if self.elastic else self.program.q)
+        priced = self.program if touched is None else self.program.tangent(touched)
+        slope = mu @ self.program.A + (0.0 if self.elastic else priced.q)
         slope = slope + np.bincount(column, value, self.program.n)
         self._balance(slope, deviations, late)
         if not self.spread.is_box:
@@ -475,14 +505,23 @@ def _both(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> tuple[np
 
 
 def robust_bound(
-    program: FiniteProgram, blocks: list[UncertainRows], y: Array, deviations: Array, mu: Array, priced: bool
+    program: FiniteProgram,
+    blocks: list[UncertainRows],
+    y: Array,
+    deviations: Array,
+    mu: Array,
+    priced: bool,
+    at: Array | None = None,
 ) -> tuple[float, float]:
     """A lower bound of the cost by weak duality, from multipliers ``y (r,) >= 0`` of rows at ``deviations (r, Q)`` and
-    ``mu (e,)``: the minimum over the bounds of the program alone. Not ``priced``: of the weighted sum of the rows,
-    which is positive only where nothing is feasible. With it the sum of the numbers that were added up."""
-    slope, constant = (program.q.copy() if priced else np.zeros(program.n)), -float(mu @ program.b)
+    ``mu (e,)``: the minimum over the bounds of the program alone; quadratic terms are replaced by their tangent ``at
+    (n,)``, of 0 unless given. Not ``priced``: of the weighted sum of the rows, which is positive only where nothing is
+    feasible. With it the sum of the numbers that were added up."""
+    cost = program.tangent(np.zeros(program.n) if at is None else at)
+    slope, constant = (cost.q.copy() if priced else np.zeros(program.n)), -float(mu @ program.b)
+    constant, size = constant + cost.constant * priced, abs(constant) + abs(cost.constant) * priced
     slope = slope + mu @ program.A
-    size, noise, first = abs(constant), np.abs(slope) + np.abs(mu) @ np.abs(program.A), 0
+    noise, first = np.abs(slope) + np.abs(mu) @ np.abs(program.A), 0
     terms = [(np.zeros(0, dtype=int), np.zeros(0))]
     for block in blocks:
         mine, w = y[first : first + block.h.size], deviations[first : first + block.h.size]
@@ -501,6 +540,9 @@ def robust_bound(
     slope = slope + np.bincount(column, value, program.n)
     noise = noise + np.bincount(column, np.abs(value), program.n)
     weights = program.weights if priced else np.zeros(program.n)
+    if priced and program.blocks is not None:
+        tilted = without_norms(Terms(constant, slope, noise, weights, None, size, at), program)
+        slope, noise, weights = tilted.slope, tilted.noise, tilted.weights
     ends = np.stack([program.lower, program.upper, np.clip(0.0, program.lower, program.upper)])
     with np.errstate(invalid="ignore"):
         least = (weights * np.abs(ends) + np.where(slope == 0.0, 0.0, slope * ends)).min(axis=0)

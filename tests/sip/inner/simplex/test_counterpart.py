@@ -1,5 +1,5 @@
-"""Guards sip/inner/counterpart.py: the counterpart of uncertain rows has the optimum of the program that is written out
-at every corner of the deviations, and its multipliers prove what the Lagrangian is at least."""
+"""Guards sip/inner/simplex: the counterpart of uncertain rows has the optimum of the program that is written out at
+every corner of the deviations, and its multipliers prove what the Lagrangian is at least."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy.optimize import linprog
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from sparserob_core.control.sets.sets import NormBall
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
-from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
+from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
 
 N, Q = 4, 3
 BOX = Spread(((1, Box(np.array([-0.5, -1.0]), np.array([0.5, 1.0]))), (1, Box(np.array([-0.25]), np.array([0.25])))))
@@ -178,6 +178,40 @@ def test_a_factor_is_the_largest_by_which_what_no_decision_answers_can_grow(seed
     )
     assert truth is not None
     assert answer.slack == pytest.approx(truth.extra, rel=1e-7)
+
+
+def convex_costs(base: FiniteProgram, kind: str) -> FiniteProgram:
+    """A quadratic form without full rank, one that is diagonal, or the norm of two variables."""
+    if kind == "block":
+        weights = np.where(np.arange(N) < 2, base.weights[0], base.weights)
+        return replace(base, weights=weights, blocks=Blocks(np.array([0, 0, -1, -1])))
+    root = np.diag([1.0, 0.0, 0.5, 2.0])
+    if kind == "full":
+        root = np.random.default_rng(0).standard_normal((N, 3))
+    return replace(base, P=csc_array(root @ root.T), constant=0.25)
+
+
+@pytest.mark.parametrize("kind", ["full", "diagonal", "block"])
+@pytest.mark.parametrize("seed", range(3))
+def test_costs_that_are_not_linear_are_met_by_their_tangents_and_proven(seed: int, kind: str) -> None:
+    """No decision near the answer, within the rows at every corner, costs less than what is proven."""
+    rng = np.random.default_rng(seed)
+    base, blocks = convex_costs(program(rng), kind), [rows(rng, "several")]
+    answer = solved(Counterpart(base, BOX), blocks)
+    assert answer.solved
+    assert answer.at is not None
+    cost = base.objective(answer.x)
+    proven, _ = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, True, answer.at)
+    assert cost - 1e-8 * (1.0 + abs(cost)) <= proven <= cost + 1e-9
+    G, h, moved = written_out(blocks[0], BOX)
+    for step in 0.1 * rng.standard_normal((300, N)):
+        x = np.clip(answer.x + step - base.A[0] * (base.A[0] @ step) / (base.A[0] @ base.A[0]), base.lower, base.upper)
+        if (G @ x <= h - moved).all() and abs(base.A @ x - base.b).max() <= 1e-9:
+            assert base.objective(x) >= proven
+    coarse = Counterpart(base, BOX)
+    coarse.add(blocks[0])
+    found = coarse.solve(accuracy=0.1)
+    assert cost - 1e-8 <= base.objective(found.x) <= cost + 0.1
 
 
 @pytest.mark.parametrize("seed", range(4))

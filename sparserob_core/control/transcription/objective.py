@@ -1,0 +1,71 @@
+"""The cost of a problem in its program: that of the control, which under feedback is the nominal one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypedDict
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.transcription.quadratic import quadratic_cost
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+
+class Quadratics(TypedDict, total=False):
+    """What the quadratic terms of a cost are in a program."""
+
+    P: csc_array
+    q: Array
+    constant: float
+    largest: float
+
+
+class Objective(Quadratics):
+    """All that a cost is in a program."""
+
+    weights: Array
+    blocks: Array | None
+
+
+def objective(problem: OptimalControlProblem, dictionary: Dictionary, images: int, variables: int) -> Objective:
+    """The cost of a program with so many ``images`` and ``variables``, which begin with the values of the control on
+    its pieces, ``(m K,)``, and with its coefficients, ``(m N,)``; the others cost nothing."""
+    weights = problem.prices(dictionary.breakpoints).ravel()
+    weights = np.append(weights, np.zeros(images - weights.size))
+    return {
+        "weights": weights,
+        "blocks": _blocks(problem, dictionary, images),
+        **quadratics(problem, dictionary, variables),
+    }
+
+
+def _blocks(problem: OptimalControlProblem, dictionary: Dictionary, images: int) -> Array | None:
+    """The number of the group and piece of every image; ``None`` where every channel counts alone."""
+    if not problem.cost.blocks:
+        return None
+    number = np.full((problem.system.controls, dictionary.pieces), -1)
+    for group, block in enumerate(problem.cost.blocks):
+        number[list(block)] = group * dictionary.pieces + np.arange(dictionary.pieces)
+    answer: Array = np.append(number.ravel(), np.full(images - number.size, -1))
+    return answer
+
+
+def quadratics(problem: OptimalControlProblem, dictionary: Dictionary, variables: int) -> Quadratics:
+    """The quadratic terms of the cost, and what a gap is relative to: the largest cost of the absolute values, and the
+    largest of the quadratic terms at a control that stays 0, or stays at one end of one channel."""
+    if not problem.cost.is_quadratic:
+        return {}
+    from scipy.sparse import block_diag, csc_array
+
+    on_pieces = quadratic_cost(problem, dictionary.breakpoints)
+    terms, axes = on_pieces.on(dictionary), np.eye(problem.system.controls)
+    reach = problem.control.reach(axes)
+    prices = problem.prices(np.array([0.0, problem.horizon]))[:, 0]
+    largest = float(prices @ reach) + on_pieces.largest(reach)
+    more = variables - terms.q.size
+    P = csc_array(block_diag([terms.P, csc_array((more, more))])) if more else terms.P
+    return {"P": P, "q": np.append(terms.q, np.zeros(more)), "constant": terms.constant, "largest": largest}

@@ -1,0 +1,1 @@
+"""The simplex method for rows that hold for every deviation, on one linear program that grows."""

@@ -1,0 +1,144 @@
+"""The convex terms of a cost in a linear program that grows: each is one variable above its tangents (Kelley 1960).
+
+A quadratic form is a sum of squares along its eigenvectors, ``x'P x / 2 = sum_i t_i^2 / 2``, and every square has a
+variable of its own: tangents of one square are exact where they touch, and nowhere further below than an eighth of the
+square of the distance to the next, so that they are as close as is wanted after a few rounds, however many squares
+there are. (One variable for the whole form would need as many rounds as there are directions.) The norm of a block is
+the largest of ``d's`` over unit vectors ``d``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import Directions, FiniteProgram
+from sparserob_core.sip.inner.norms import around
+
+Entries = list[tuple[np.ndarray, np.ndarray, Array]]
+
+# Of the largest eigenvalue one that is rounding, as LAPACK computes them. Ten times less, and rounding of P counts as
+# squares, which cost variables; ten times more, and up to 1e-14 of the cost at its bounds is left out of the program
+# (not of what is claimed: costs are recomputed, and bounds are those of tangents of P itself).
+RESOLVED = 1e-15
+
+
+class Linear(Protocol):
+    """A linear program to which columns and rows are added."""
+
+    def variables(self, lower: Array, upper: Array, cost: Array) -> np.ndarray:
+        """New columns, by number."""
+
+    def rows(self, entries: Entries, lower: Array, upper: Array) -> np.ndarray:
+        """New rows, by number."""
+
+
+@final
+@dataclass(eq=False)
+class Tangents:
+    """The norms of blocks and the squares of a program's cost over the columns of ``linear``, of which the first
+    ``2 n`` are the positive and the negative parts of the decision.
+
+    ``roots (n, c)``: ``t = roots'x`` are the squares' roots.
+    """
+
+    program: FiniteProgram
+    linear: Linear
+
+    def __post_init__(self) -> None:
+        blocks = self.program.blocks
+        self.roots = _roots(self.program)
+        count = self.roots.shape[1]
+        none, free = np.zeros(count), np.full(count, np.inf)
+        self._squares = self.linear.variables(none, free, np.ones(count))
+        self._t = self.linear.variables(-free, free, none)
+        if count:
+            row, column = np.nonzero(self.roots.T)
+            value, n = self.roots.T[row, column], self.program.n
+            split = [(row, column, value), (row, column + n, -value), (np.arange(count), self._t, -np.ones(count))]
+            self.linear.rows(split, none, none)
+        self._at: list[np.ndarray] = [np.zeros(0, dtype=int)]  # numbers of the tangents' rows
+        self._which: list[np.ndarray] = [np.zeros(0, dtype=int)]  # the square of each
+        self._touched: list[Array] = [np.zeros(0)]  # and where it touches that
+        self._along: list[tuple[np.ndarray, Directions]] = []  # numbers of the rows of directions, and these
+        if blocks is not None:
+            weights = self.program.weights[blocks.first]
+            self._norms = self.linear.variables(np.zeros(weights.size), np.full(weights.size, np.inf), weights)
+            self._directed(around(blocks))
+
+    def sharpen(self, x: Array, squares: Array) -> None:
+        """Touch every norm at ``x (n,)`` and every square at the root ``(c,)`` that the linear program has."""
+        count = squares.size
+        if count:
+            place = np.arange(count)
+            entries = [(place, self._t, squares), (place, self._squares, -np.ones(count))]
+            self._at.append(self.linear.rows(entries, np.full(count, -np.inf), squares**2 / 2.0))
+            self._which.append(place)
+            self._touched.append(squares)
+        blocks = self.program.blocks
+        if blocks is not None:
+            table, unit = blocks.table, np.append(blocks.directions(x), 0.0)
+            found = Directions(np.arange(len(table)), unit[table])
+            kept = found.vectors.any(axis=1)
+            self._directed(Directions(found.block[kept], found.vectors[kept]))
+
+    def _directed(self, directions: Directions) -> None:
+        """``d's`` is at most the norm of its block."""
+        blocks, n = self.program.blocks, self.program.n
+        assert blocks is not None
+        count = directions.block.size
+        if not count:
+            return
+        row, place = np.nonzero(directions.vectors)
+        column, value = blocks.table[directions.block[row], place], directions.vectors[row, place]
+        ones = np.arange(count), self._norms[directions.block], -np.ones(count)
+        entries = [(row, column, value), (row, column + n, -value), ones]
+        self._along.append((self.linear.rows(entries, np.full(count, -np.inf), np.zeros(count)), directions))
+
+    def below(self, columns: Array) -> tuple[float, Array, Array]:
+        """By how much the variables of a solution are below what they stand for, with its decision ``(n,)`` and the
+        roots ``(c,)`` of its squares."""
+        n, blocks = self.program.n, self.program.blocks
+        x, t = columns[:n] - columns[n : 2 * n], columns[self._t]
+        missed = float(np.maximum(t**2 / 2.0 - columns[self._squares], 0.0).sum())
+        if blocks is not None:
+            weights = self.program.weights[blocks.first]
+            missed += float(weights @ np.maximum(blocks.norms(x) - columns[self._norms], 0.0))
+        return missed, x, t
+
+    def touching(self, x: Array, multipliers: Array) -> Array:
+        """The decision ``(n,)`` at which the slope of the cost is that of all tangents with their multipliers: there
+        one tangent proves at least as much as they do together. Of a block whose entries have squares too it is only
+        nearly that of the norm."""
+        blocks, answer = self.program.blocks, x
+        if blocks is not None:
+            answer = x.copy()
+            answer[blocks.entries] = 0.0
+            for at, directions in self._along:
+                row, place = np.nonzero(directions.vectors)
+                shares = np.maximum(multipliers[at], 0.0)[row] * directions.vectors[row, place]
+                np.add.at(answer, blocks.table[directions.block[row], place], shares)
+        at, which, touched = (np.concatenate(part) for part in (self._at, self._which, self._touched))
+        wanted = np.bincount(which, np.maximum(multipliers[at], 0.0) * touched, self.roots.shape[1])
+        sizes = (self.roots**2).sum(axis=0)
+        moved: Array = answer + self.roots @ ((wanted - self.roots.T @ answer) / np.where(sizes > 0.0, sizes, 1.0))
+        return moved
+
+
+def _roots(program: FiniteProgram) -> Array:
+    """Columns ``(n, c)``, at right angles, whose squares along a decision add up to ``x'P x``."""
+    if program.P is None:
+        return np.zeros((program.n, 0))
+    if program.curvature is not None:
+        entered = np.flatnonzero(program.curvature > 0.0)
+        return np.asarray(np.eye(program.n)[:, entered] * np.sqrt(program.curvature[entered]))
+    P: Any = program.P
+    entered = np.flatnonzero(np.diff(P.indptr))
+    values, vectors = np.linalg.eigh(P[entered][:, entered].toarray())
+    kept = values > RESOLVED * entered.size * values.max(initial=0.0)
+    roots = np.zeros((program.n, int(kept.sum())))
+    roots[entered] = vectors[:, kept] * np.sqrt(values[kept])
+    return roots
