@@ -25,6 +25,7 @@ from tests.known_answers.test_feedback_rows import (
     spring_rows,
 )
 from tests.support.policy_programs import PolicyProgram
+from tests.support.problems import spring
 
 MIXED = {"mixed": {"H": [[0, 1], [0, -1]], "G": [[0.5], [-0.5]], "h": 1.1}, "from": 0.6}
 MOVING = {"box": [0.75, None], "from": 0.5, "relative_to": [[0, 0, 0], [1.3, 0.1, 0.1], [5, -0.1, 0]]}
@@ -165,11 +166,73 @@ def test_steps_that_are_too_small_are_infeasible_with_their_reason(tmp_path: Pat
     assert "control_step: the change of" in outcome.result.message
 
 
-def test_a_curved_set_of_steps_is_refused_in_one_sentence(tmp_path: Path) -> None:
-    two = {"system": {"A": [[0, 1], [-1, -0.2]], "B": [[0.4, 0], [0, 1]]}, "control": {"box": [1, 1]}}
-    with pytest.raises(sr.InputError, match="control_step with flat sides"):
-        run({**SPRING, **two, "control_step": {"norm": {"p": 2, "radius": 0.5}}}, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+TWO = {"system": {"A": [[0, 1], [-2, -0.5]], "B": [[0.4, 0.3], [0, 1]]}, "control": {"box": [1, 1]}}
+RADIUS, SIDES, FEW = 0.5, 16, 5
+ROUND = {
+    **spring(0.1, since=1.0),
+    **TWO,
+    "control_step": {"norm": {"p": 2, "radius": RADIUS}},
+    "initial_control": [0.0, 0.0],
+}
+
+
+@pytest.mark.slow
+def test_a_ball_of_steps_costs_what_polygons_around_it_and_in_it_say(tmp_path: Path) -> None:
+    outcome = run(ROUND, tmp_path / "run", "peak", pieces=FEW)
+    proven(outcome)
+
+    def polygon(radius: float) -> float:
+        independent = program(ROUND, FEW, [0.1, 0.1], [0.0, 0.0])
+        spring_rows(independent, 3, start=1.0)
+        controls = [independent.control(k) for k in range(FEW)]
+        for after, before in pairwise([np.zeros_like(controls[0]), *controls][::-1]):
+            for angle in 2 * np.pi * np.arange(SIDES) / SIDES:
+                independent.below(np.tensordot([np.cos(angle), np.sin(angle)], after - before, 1), radius)
+        return independent.solve(1.0, "peak")
+
+    around, within = polygon(RADIUS), polygon(RADIUS * np.cos(np.pi / SIDES))
+    assert around * (1 - 1e-9) <= outcome.result.cost <= within * (1 + 5e-3)
+    assert within < around * 1.04
+    assert polygon(4 * RADIUS) < 0.98 * around, "the steps matter"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "forgery",
+    [
+        lambda data: data["decision"][0].__setitem__(2, data["decision"][0][2] + 1e-3),
+        lambda data: data["gains"][1][1][0].__setitem__(0, data["gains"][1][1][0][0] + 0.1),
+        lambda data: data["multipliers"]["constraints"][0].__setitem__("multiplier", 5.0),
+    ],
+    ids=["a longer step", "a larger answer", "a larger multiplier"],
+)
+def test_a_forged_step_of_a_ball_is_refuted(
+    forgery: Callable[[dict[str, Any]], object], tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
+) -> None:
+    directory = tmp_path_factory.getbasetemp() / "round"
+    if not directory.exists():
+        run(ROUND, directory, "peak", pieces=FEW)
+    assert forged(directory, tmp_path / "copy", forgery) == "refuted"
+
+
+def test_a_ball_of_steps_across_the_seam_holds_for_every_period(tmp_path: Path) -> None:
+    """``x' = u + w`` for ever from ``|x| <= 0.3``, ``|w| <= 0.1``: every period answers what it begins with."""
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0, 0], [0, 0]], "B": [[1, 0], [0, 1]]},
+        "horizon": 1.0,
+        "initial_state": {"centre": [0, 0], "box": [0.3, 0.3]},
+        "control": {"box": [1, 1]},
+        "disturbance": {"box": [0.1, 0.1]},
+        "control_step": {"norm": {"p": 2, "radius": 1.0}},
+        "repeat": True,
+    }
+    outcome = run(problem, tmp_path / "run", "peak", pieces=2)
+    assert outcome.status == "certified", outcome.result.message
+    found = check(outcome.directory)
+    assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
+    narrow = {**problem, "control_step": {"norm": {"p": 2, "radius": 0.2}}}
+    assert run(narrow, tmp_path / "narrow", "peak", pieces=2).status == "infeasible"
 
 
 REFUTED: dict[str, dict[str, Any]] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, final
@@ -127,7 +127,9 @@ class FeedbackClaims:
         shape = self.case.problem.control
         flat = known(shape).facets
         if flat is None:
-            return self._control_turning()
+            pieces = range(len(self.loop.effects))
+            said = self._turned(shape, pieces, lambda k, rows: self.loop.heights(self.loop.inputs(k), rows))
+            return f"{len(pieces)} pieces {said}"
         worst, loop = -np.inf, self.loop
         for k, effect in enumerate(loop.effects):
             self.case.clock.check()
@@ -144,16 +146,15 @@ class FeedbackClaims:
                 worst = max(worst, over)
         return f"{len(loop.effects)} pieces in their set for every disturbance, {_to(worst)}"
 
-    def _control_turning(self) -> str:
-        """Every piece of the control in its curved set, for every disturbance."""
-        shape, loop = known(self.case.problem.control), self.loop
-        every = Directions(loop, shape, np.diag(1.0 / np.array(shape.radius)), loop.inputs)
-        m, pieces = shape.dimension, len(loop.effects)
+    def _turned(self, convex: ConvexSet, places: Sequence[int], held: Callable[[int, arb_mat], list[arb]]) -> str:
+        """What is held at every place in a curved set, for every disturbance: figures in words."""
+        shape, m = known(convex), convex.dimension
+        every = Directions(self.loop, shape, np.diag(1.0 / np.array(shape.radius)), held)
         faces = [(-np.ones(m), np.ones(m)) for _ in range(2 * m)]
         for place, (low, high) in enumerate(faces):
             low[place // 2] = high[place // 2] = 1.0 if place % 2 else -1.0
-        count, most = self._shown(every, [(k, 0.0, 0.0, *face) for k in range(pieces) for face in faces])
-        return f"{pieces} pieces in their set for every disturbance, to {most:.1e} ({count} cells of directions)"
+        count, most = self._shown(every, [(k, 0.0, 0.0, *face) for k in places for face in faces])
+        return f"in their set for every disturbance, to {most:.1e} ({count} cells of directions)"
 
     def steps(self) -> str:
         """Every change of the control in its set, for every disturbance."""
@@ -161,7 +162,7 @@ class FeedbackClaims:
         assert case.problem.control_step is not None
         shape, found = known(case.problem.control_step), steps(case.problem, case.control)
         if shape.facets is None:
-            raise Unchecked("the checker knows steps into sets with flat sides only, under feedback")
+            return f"{len(found)} steps {self._turned(case.problem.control_step, found, self._changes)}"
         rows = np.array([c for c, _ in shape.facets])
         for k in found:
             case.clock.check()
@@ -176,7 +177,7 @@ class FeedbackClaims:
                 worst = max(worst, over)
         return f"{len(found)} steps in their set for every disturbance, {_to(worst)}"
 
-    def _changes(self, k: int, rows: Array) -> list[arb]:
+    def _changes(self, k: int, rows: Array | arb_mat) -> list[arb]:
         """The largest change along every row, at the beginning of piece ``k``. Across the seam of a plan that repeats
         the last control of a period and the first one of the next are chosen apart: what each answers is another's."""
         if k < self.case.control.pieces:
@@ -385,7 +386,9 @@ class FeedbackClaims:
         if name == STEP and case.problem.control_step is not None:
             sides = known(case.problem.control_step).facets
             places = [k for k in steps(case.problem, case.control) if loop.breakpoints[k] == time]
-            if sides is None or not places:
+            if sides is None:
+                raise Unchecked("the worst direction of a curved set is not told")
+            if not places:
                 raise Broken(f"there is no step at t = {time!r}")
             found = self._changes(places[0], np.array([c for c, _ in sides]))
             slack = TOLERANCE * max(known(case.problem.control_step).units, default=1.0)
@@ -472,7 +475,7 @@ class FeedbackClaims:
         K, m = self.case.control.pieces, self.case.problem.system.controls
         return self._loop(np.zeros((m, K)), self._none)
 
-    def multiplied(self, entries: Sequence[Any], priced: bool, touched: Sequence[arb_mat] | None) -> arb:
+    def multiplied(self, entries: Sequence[Any], priced: bool, touched: Sequence[arb_mat] | None = None) -> arb:
         """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind; norms
         and quadratic terms of the nominal control are replaced by their tangents where it is ``touched``.
 

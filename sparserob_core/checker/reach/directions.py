@@ -30,12 +30,12 @@ Corner = tuple[float, ...]
 @dataclass(frozen=True, eq=False)
 class Directions:
     """The directions ``z'normals``, ``z`` in a cube, ``normals (b, d)``, of a curved set that the state of a loop must
-    stay in; or what else is ``held`` on each piece, ``(d, 1 + Q)``."""
+    stay in; or of what else is ``held`` in it, by how far that comes at a place, by number, along rows ``(r, d)``."""
 
     loop: ClosedLoop
     shape: Shape
     normals: Array
-    held: Callable[[int], arb_mat] | None = None
+    held: Callable[[int, arb_mat], list[arb]] | None = None
     about: Callable[[float], list[arb]] | None = None
     """Where the set is at a time; at rest where there is none."""
     _known: dict[tuple[int, float, Corner], arb] = field(default_factory=dict, repr=False)
@@ -66,8 +66,9 @@ class Directions:
         """``max c'x`` at a time."""
         key = piece, time, z
         if key not in self._known:
-            state = self.loop.state(piece, time) if self.held is None else self.held(piece)
-            (found,) = self.loop.heights(state, stacked([c]))
+            row = stacked([c])
+            every = self.loop.heights(self.loop.state(piece, time), row) if self.held is None else self.held(piece, row)
+            (found,) = every
             found = found if self.about is None else found - _dot(self.about(time), c)
             limit = self.shape.support(c)
             room = limit - along(self.shape.centre, c)

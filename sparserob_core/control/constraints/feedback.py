@@ -8,6 +8,7 @@ from typing import Protocol, final
 
 import numpy as np
 
+from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.explanation import TimedExplanation, combination
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
@@ -313,22 +314,54 @@ class FeedbackConstraint:
         return np.asarray((bare & (size > SAME * np.abs(self.flat.H).max())).any(axis=1)[rows.part])
 
 
+def acting(loop: ClosedLoop, places: Places, x: Array) -> tuple[Array, Array]:
+    """What the control does at places and its answers to the deviations, ``(q, m, 1 + Q)``, and the sizes of the
+    numbers that were added up. Across the seam the first control of the next period answers its own initial state."""
+    controls = loop.controls(x)
+    pieces, table = len(controls), places.table.T
+    found = (table @ controls.reshape(pieces, -1)).reshape(-1, *controls.shape[1:])
+    size = (abs(table) @ np.abs(controls).reshape(pieces, -1)).reshape(found.shape)
+    if places.seam and loop.anew:
+        first, at = controls[0], loop.begins.shape[0]
+        found[-1] = np.concatenate([first[:, :1], np.roll(first[:, 1:], -at, axis=1)], axis=1) - controls[-1]
+    found[:, :, 0] += places.offset
+    size[:, :, 0] += np.abs(places.offset)
+    return found, size
+
+
+def rows_at(
+    loop: ClosedLoop, places: Places, place: int, H: Array, h: Array, extra: Array | None = None
+) -> UncertainRows:
+    """The rows ``H a <= h`` of what the control does at one place, for every deviation; ``extra (r, n)`` is added on
+    the left."""
+    column = places.table[:, [place]].tocoo()
+    pairs = sorted(zip(column.row.tolist(), column.data.tolist(), strict=True), reverse=True)
+    following = places.seam and loop.anew and place == places.starts.size - 1
+    (piece, share), *others = pairs
+    rows = loop.control_rows(piece, share * H, h - H @ places.offset[place], extra)
+    for piece, share in others:
+        rows = loop.with_control(rows, share * H, np.full(h.size, piece), following=following)
+    return rows
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class FeedbackControl:
-    """``H u_k <= h`` on every piece for every disturbance; with ``bound``, the first of the variables ``p (m, K)``,
-    ``H u_k <= p_k`` instead. An index is the middle of a piece, or with the deviations ``(t, w)``."""
+    """``H a <= h`` of what the control does at ``places`` for every disturbance: of its value on every piece, or its
+    change at every step; with ``bound``, the first of the variables ``p (m, K)``, ``H u_k <= p_k`` instead. An index is
+    the time of a place, or with the deviations ``(t, w)``."""
 
     name: str
     loop: ClosedLoop
+    places: Places
     H: Array
     h: Array
     bound: int | None = None
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
-        horizon = float(self.breakpoints[-1])
-        family = indexed(self, Box(np.array([0.0]), np.array([horizon])), self.middles[:, None], self)
+        index_set = Box(self.places.starts[:1], np.array([self.places.stop]))
+        family = indexed(self, index_set, self.places.times[:, None], self)
         family = replace(family, scaled=self.scaled) if self.loop.scales else family
         return family if self.bound is None else replace(family, defines=True)
 
@@ -336,39 +369,24 @@ class FeedbackControl:
         """The same where deviations are ``factor`` times as large."""
         return replace(self, loop=self.loop.scaled(factor)).family()
 
-    @property
-    def breakpoints(self) -> Array:
-        """Where the control may change."""
-        return self.loop.functionals.dictionary.breakpoints
-
-    @property
-    def middles(self) -> Array:
-        """A time of every piece."""
-        return (self.breakpoints[:-1] + self.breakpoints[1:]) / 2
-
-    def pieces(self, times: Array) -> np.ndarray:
-        """The piece that each time is in."""
-        return np.clip(np.searchsorted(self.breakpoints, times, side="right") - 1, 0, self.breakpoints.size - 2)
-
     def limits(self, x: Array) -> Array:
-        """The right-hand sides ``(K, r)``."""
-        K = self.breakpoints.size - 1
+        """The right-hand sides ``(q, r)``."""
+        q = self.places.times.size
         if self.bound is None:
-            return np.broadcast_to(self.h, (K, self.h.size))
-        p = x[self.bound : self.bound + self.H.shape[1] * K].reshape(-1, K)
+            return np.broadcast_to(self.h, (q, self.h.size))
+        p = x[self.bound : self.bound + self.H.shape[1] * q].reshape(-1, q)
         return np.asarray((np.abs(self.H) @ p).T, dtype=float)
 
     def heights(self, x: Array) -> tuple[Array, Array]:
-        """Violations ``(K, r)`` on all pieces, and the sizes of the numbers that were added up."""
-        nominal, effects, limits = (self.H @ self.loop.nominal(x)).T, self.H @ self.loop.effects(x), self.limits(x)
-        found = nominal + self.loop.spread.support(effects) - limits
-        size = np.abs(nominal) + np.abs(effects) @ self.loop.spread.radii + np.abs(limits)
-        return found, size
+        """Violations ``(q, r)`` at all places, and the sizes of the numbers that were added up."""
+        (found, size), limits = acting(self.loop, self.places, x), self.limits(x)
+        radii = np.concatenate([[1.0], self.loop.spread.radii])
+        return self.loop.height(self.H @ found) - limits, np.abs(self.H) @ size @ radii + np.abs(limits)
 
     def settled(self, x: Array) -> Array:
         """The same decision with the peaks at what they bound."""
         assert self.bound is not None
-        peaks = np.zeros((self.H.shape[1], self.breakpoints.size - 1))
+        peaks = np.zeros((self.H.shape[1], self.places.times.size))
         found = self.heights(np.concatenate([x[: self.bound], peaks.ravel()]))[0]
         for row, channel in enumerate(np.abs(self.H).argmax(axis=1)):
             peaks[channel] = np.maximum(peaks[channel], found[:, row])
@@ -376,148 +394,54 @@ class FeedbackControl:
         return settled
 
     def excess(self, x: Array, indices: Array) -> Array:
-        """Violations ``(k, r)`` on the pieces of times ``(k, 1)`` under the worst disturbances."""
-        found: Array = self.heights(x)[0][self.pieces(indices[:, 0])]
+        """Violations ``(k, r)`` at the places of times ``(k, 1)`` under the worst disturbances."""
+        found: Array = self.heights(x)[0][self.places.at(indices[:, 0])]
         return found
 
     def uncertain(self, index: Array) -> UncertainRows:
-        """The rows on the piece of one time."""
-        piece = int(self.pieces(index[:1])[0])
+        """The rows at the place of one time."""
+        (place,) = self.places.at(index[:1]).tolist()
         if self.bound is None:
-            return self.loop.control_rows(piece, self.H, self.h)
-        K, extra = self.breakpoints.size - 1, np.zeros((self.h.size, self.loop.variables))
+            return rows_at(self.loop, self.places, place, self.H, self.h)
+        K, extra = self.places.times.size, np.zeros((self.h.size, self.loop.variables))
         for row, channel in enumerate(np.abs(self.H).argmax(axis=1)):
-            extra[row, self.bound + channel * K + piece] = -np.abs(self.H[row, channel])
-        return self.loop.control_rows(piece, self.H, self.h, extra)
+            extra[row, self.bound + channel * K + place] = -np.abs(self.H[row, channel])
+        return rows_at(self.loop, self.places, place, self.H, self.h, extra)
 
     def worst(self, x: Array) -> Separation:
-        """The worst row of every piece, worst first."""
-        return worst_of_each(self.heights(x)[0], self.middles)
+        """The worst row of every place, worst first."""
+        return worst_of_each(self.heights(x)[0], self.places.times)
 
     @property
     def cells(self) -> tuple[Array, Array]:
-        """The pieces."""
-        return self.breakpoints[:-1, None], self.breakpoints[1:, None]
+        """From each place to the next."""
+        lower, upper = self.places.spans
+        return lower[:, None], upper[:, None]
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """The violation itself: the control is constant on a piece."""
+        """The violation itself: nothing changes between places."""
         found, size = self.heights(x)
-        bounds = (found + ROUND_OFF * size).max(axis=1)[self.pieces((lower[:, 0] + upper[:, 0]) / 2)]
+        bounds = (found + ROUND_OFF * size).max(axis=1)[self.places.at((lower[:, 0] + upper[:, 0]) / 2)]
         return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
 
     @property
     def measured(self) -> tuple[str, ...]:
         """The unit of every row, empty where it has none that is known."""
-        return _of_controls(self)
+        return tuple(measured_in(normal, self.loop.functionals.names, 0).strip() for normal in self.H)
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people."""
-        time, direction, names = float(index[0]), self.H[row], self.loop.functionals.names
-        terms = combination(direction, names, f"({time:.6g})", 0)
+        names, direction = self.loop.functionals.names, self.H[row]
+        time = float(self.places.times[self.places.at(index[:1])[0]]) if self.places.steps else float(index[0])
+        if self.places.steps:
+            at = f"{time:.6g} {names.time}".rstrip()
+            terms = f"the change of {combination(direction, names, states=0)} at {at}"
+        else:
+            terms = combination(direction, names, f"({time:.6g})", 0)
         right = f"{self.h[row] + 0.0:.6g} {self.measured[row]}".rstrip() if self.bound is None else "its peak"
         text = f"{self.name}: {terms} <= {right}"
         said = TimedExplanation(text, self.name, text, time, direction)
         return told(said, self.loop, index[1:], controls=True)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class FeedbackSteps:
-    """``H (u_k - u_{k-1}) <= h`` at every breakpoint for every disturbance, from the control ``before (m,)`` time 0 on
-    where that is told; with a ``seam`` from any last control to any first one of the next period, at the horizon. An
-    index is the time of a step, or with the deviations ``(t, w)``."""
-
-    name: str
-    loop: ClosedLoop
-    H: Array
-    h: Array
-    before: Array | None
-    seam: bool = False
-
-    def family(self) -> ConstraintFamily:
-        """The constraint as a family."""
-        index_set = Box(self.times[:1], self.loop.functionals.dictionary.breakpoints[-1:])
-        family = indexed(self, index_set, self.times[:, None], self)
-        return replace(family, scaled=self.scaled) if self.loop.scales else family
-
-    def scaled(self, factor: float) -> ConstraintFamily:
-        """The same where deviations are ``factor`` times as large."""
-        return replace(self, loop=self.loop.scaled(factor)).family()
-
-    @property
-    def times(self) -> Array:
-        """When the steps are taken, ``(q,)``."""
-        points = self.loop.functionals.dictionary.breakpoints
-        return points[int(self.before is None) : points.size - (not self.seam)]
-
-    def _steps(self, times: Array) -> np.ndarray:
-        """The step that each time follows."""
-        return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, self.times.size - 1)
-
-    def _heights(self, x: Array) -> tuple[Array, Array]:
-        """Violations ``(q, r)`` of all steps, and the sizes of the numbers that were added up."""
-        controls = self.loop.controls(x)
-        first = np.zeros_like(controls[:1])
-        if self.before is not None:
-            first[0, :, 0] = self.before
-            controls = np.concatenate([first, controls])
-        if self.seam:  # the first control again, which answers another initial state
-            again, at = self.loop.controls(x)[:1], self.loop.begins.shape[0]
-            controls = np.concatenate([controls, np.concatenate([again[..., :1], np.roll(again[..., 1:], -at, 2)], 2)])
-        along = self.H @ np.diff(controls, axis=0)
-        size = np.abs(self.H) @ (np.abs(controls[1:]) + np.abs(controls[:-1]))
-        radii = np.concatenate([[1.0], self.loop.spread.radii])
-        return self.loop.height(along) - self.h, size @ radii + np.abs(self.h)
-
-    def excess(self, x: Array, indices: Array) -> Array:
-        """Violations ``(k, r)`` of the steps at times ``(k, 1)`` under the worst disturbances."""
-        return np.asarray(self._heights(x)[0][self._steps(indices[:, 0])])
-
-    def uncertain(self, index: Array) -> UncertainRows:
-        """The rows of one step."""
-        place = int(self._steps(index[:1])[0])
-        piece = place + int(self.before is None)
-        last = self.loop.functionals.dictionary.pieces - 1
-        if piece > last:
-            rows = self.loop.control_rows(last, -self.H, self.h)
-            return self.loop.with_control(rows, self.H, np.zeros(self.h.size, dtype=int), following=self.loop.anew)
-        rows = self.loop.control_rows(piece, self.H, self.h)
-        if piece == 0 and self.before is not None:
-            return replace(rows, h=rows.h + self.H @ self.before)
-        return self.loop.with_control(rows, -self.H, np.full(self.h.size, piece - 1))
-
-    def worst(self, x: Array) -> Separation:
-        """The worst row of every step, worst first."""
-        return worst_of_each(self._heights(x)[0], self.times)
-
-    @property
-    def cells(self) -> tuple[Array, Array]:
-        """From each step to the next."""
-        return self.times[:, None], np.append(self.times[1:], self.loop.functionals.dictionary.breakpoints[-1])[:, None]
-
-    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """The violation itself."""
-        found, size = self._heights(x)
-        bounds = (found + ROUND_OFF * size).max(axis=1)[self._steps((lower[:, 0] + upper[:, 0]) / 2)]
-        return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
-
-    @property
-    def measured(self) -> tuple[str, ...]:
-        """The unit of every row, empty where it has none that is known."""
-        return _of_controls(self)
-
-    def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint for people."""
-        time, names = float(self.times[self._steps(index[:1])[0]]), self.loop.functionals.names
-        at = f"{time:.6g} {names.time}".rstrip()
-        limit = f"{self.h[row] + 0.0:.6g} {self.measured[row]}".rstrip()
-        text = f"{self.name}: the change of {combination(self.H[row], names, states=0)} at {at} <= {limit}"
-        return told(TimedExplanation(text, self.name, text, time, self.H[row]), self.loop, index[1:], True)
-
-
-def _of_controls(one: FeedbackControl | FeedbackSteps) -> tuple[str, ...]:
-    """The unit of every row on the control."""
-    return tuple(measured_in(normal, one.loop.functionals.names, 0).strip() for normal in one.H)
 
 
 def worst_of_each(found: Array, times: Array) -> Separation:

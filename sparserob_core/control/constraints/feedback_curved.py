@@ -14,9 +14,10 @@ from typing import final
 
 import numpy as np
 
+from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.curved import STEP, CurvedConstraint
 from sparserob_core.control.constraints.explanation import TimedExplanation
-from sparserob_core.control.constraints.feedback import STATES, FeedbackConstraint, indexed, told
+from sparserob_core.control.constraints.feedback import STATES, FeedbackConstraint, acting, indexed, rows_at, told
 from sparserob_core.control.constraints.local_maxima import climb, highest_at, ridden, turns
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
 from sparserob_core.control.sets.directions import faces, neighbours, on_surface, sampled, unit
@@ -282,10 +283,11 @@ class FeedbackCurved(Turning):
 @final
 @dataclass(frozen=True, eq=False)
 class FeedbackCurvedControl(Turning):
-    """``u_k`` in a curved set on every piece for every disturbance."""
+    """What the control does at ``places``, on every piece or at every step, in a curved set for every disturbance."""
 
     convex: ConvexSet
     called: str
+    places: Places
 
     @property
     def name(self) -> str:
@@ -301,32 +303,28 @@ class FeedbackCurvedControl(Turning):
 
     @property
     def times(self) -> Array:
-        return (self.spans[0] + self.spans[1]) / 2
+        return self.places.times
 
     @property
     def spans(self) -> tuple[Array, Array]:
-        ends = self.loop.functionals.dictionary.breakpoints
-        return ends[:-1], ends[1:]
-
-    def _pieces(self, times: Array) -> np.ndarray:
-        starts = self.spans[0]
-        return np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 1)
+        return self.places.spans
 
     def answers(self, x: Array, times: Array) -> Array:
-        return np.asarray(self.loop.controls(x)[self._pieces(times)])
+        return np.asarray(acting(self.loop, self.places, x)[0][self.places.at(times)])
 
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
-        along = self.answers(x, (lower + upper) / 2)
-        size = np.abs(H) @ np.abs(along) @ np.concatenate([[1.0], self.loop.spread.radii])
-        found = self.loop.height(H @ along) + ROUND_OFF * size
+        at = self.places.at((lower + upper) / 2)
+        along, size = (each[at] for each in acting(self.loop, self.places, x))
+        lost = np.abs(H) @ size @ np.concatenate([[1.0], self.loop.spread.radii])
+        found = self.loop.height(H @ along) + ROUND_OFF * lost
         return found, np.zeros(found.shape)
 
     def rows(self, time: float, H: Array, h: Array) -> UncertainRows:
-        return self.loop.control_rows(int(self._pieces(np.array([time]))[0]), H, h)
+        return rows_at(self.loop, self.places, int(self.places.at(np.array([time]))[0]), H, h)
 
     def worst(self, x: Array) -> Separation:
-        """Every piece in its worst direction, worst first."""
-        every, (z, c, reach) = self.loop.controls(x), self._lattice
+        """Every place in its worst direction, worst first."""
+        every, (z, c, reach) = acting(self.loop, self.places, x)[0], self._lattice
         start = z[(self.loop.height(c @ every) - reach).argmax(axis=1)]
 
         def excess(at: Array, which: np.ndarray) -> Array:
@@ -340,8 +338,8 @@ class FeedbackCurvedControl(Turning):
         return Separation(indices, np.zeros(order.size, dtype=int), found[order])
 
     def explained(self, index: Array) -> TimedExplanation:
-        time = float(index[0])
-        text = f"{self.name}: u({time:.6g}) in the {self.set.kind}"
+        time = float(self.places.times[self.places.at(index[:1])[0]]) if self.places.steps else float(index[0])
+        text = f"{self.name}: {self.places.words(time)} in the {self.set.kind}"
         return TimedExplanation(text, self.name, text, time, self.normals(index[None, 1:])[0])
 
 

@@ -8,9 +8,9 @@ from functools import reduce
 
 import numpy as np
 
-from sparserob_core.control.constraints.control import of_control
+from sparserob_core.control.constraints.control import STEP, Places, held_at, of_control
 from sparserob_core.control.constraints.effort import FeedbackEffort
-from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl, FeedbackSteps
+from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
@@ -29,14 +29,13 @@ from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.objective import objective
 from sparserob_core.control.transcription.own_units import extent, reaches, units_of_sides
 from sparserob_core.control.transcription.record import Feedback, Transcription
-from sparserob_core.control.transcription.steps import before
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import ConstraintFamily, OwnUnits, SemiInfiniteProgram
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
-EQUALS, STEP = "equals", "control_step"  # those of the terminal equalities, and of the control's steps
+EQUALS = "equals"  # the name of that of the terminal equalities
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
@@ -77,11 +76,10 @@ def with_feedback(
     repeated = own.control.pieces
 
     def in_users(one: Transcription, charge: Charge) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-        steps = _steps(one.problem, repeated, own=False)
-        return _program(one, charge, known, (acting, theirs_observed), fixed[0], steps)
+        return _program(one, charge, known, (acting, theirs_observed), fixed[0], own=False)
 
     def in_own(one: Transcription, charge: Charge) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-        return _program(one, charge, scaled, (pieces, observed), fixed[1], _steps(one.problem, repeated, own=True))
+        return _program(one, charge, scaled, (pieces, observed), fixed[1], own=True)
 
     charge = policy.charge
     mine, theirs = in_users(model, charge), in_own(own, charge)
@@ -153,7 +151,8 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
     disturbed = problem.disturbance is not None
     paths = [entry for entry in problem.path if isinstance(entry, PathConstraint | MixedConstraint)]
     sets = [entry.set for entry in paths] + [end for end in problem.terminal if not isinstance(end, Equality)]
-    curved = [one.kind for one in (*sets, problem.control) if one.halfspaces() is None]
+    steps = [] if problem.control_step is None else [problem.control_step]
+    curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     kind, bound = problem.disturbance_class, problem.disturbance
     measurable = bound is not None and kind == "measurable"
@@ -185,7 +184,6 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         "whole state that is measured without noise where a plan with a control_step repeats": bool(problem.repeat)
         and problem.control_step is not None
         and problem.measurements is not None,
-        "control_step with flat sides": problem.control_step is not None and problem.control_step.halfspaces() is None,
         f"cost of single channels where the policy is charged {cost}: without group": bool(problem.cost.blocks)
         and cost != "nominal",
     }
@@ -211,10 +209,10 @@ def _program(
     known: Answers,
     acting: tuple[MeasurablePieces | None, Observer | None],
     fixed: tuple[Array, Array],
-    steps: Callable[[ClosedLoop], FeedbackSteps] | None,
+    own: bool,
 ) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-    """The program of one transcription, in its units; ``fixed``: the rows of its terminal equalities, ``steps``: what
-    its control's steps are."""
+    """The program of one transcription, in its units; ``fixed``: the rows of its terminal equalities; ``own``: whether
+    rows of steps are divided by their units."""
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
     size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
@@ -228,14 +226,14 @@ def _program(
         )
         families.append(equal.family())
         settled.append(equal.met)
-    flat = problem.control.halfspaces()
-    within = (
-        FeedbackCurvedControl(loop, problem.control, of_control(problem))
-        if flat is None
-        else FeedbackControl(of_control(problem), loop, *flat)
-    )
-    families.append(within.family())
-    families += [] if steps is None else [steps(loop).family()]
+    breakpoints = model.control.breakpoints
+    for name, convex, places in held_at(problem, breakpoints, answering=True):
+        flat = convex.halfspaces()
+        if flat is None:
+            families.append(FeedbackCurvedControl(loop, convex, name, places).family())
+            continue
+        H, h = _divided(problem, *flat, convex) if own and places.steps else flat
+        families.append(FeedbackControl(name, loop, places, H, h).family())
     axes = np.eye(problem.system.controls)
     low, high = -problem.control.support(-axes), problem.control.support(axes)
     most = (high - low)[known.channel] / loop.spread.chords[known.entry]
@@ -245,8 +243,8 @@ def _program(
     weights, cost = np.zeros(size), priced["weights"][:nominal]
     guide, among = None, None
     if charge.cost == "peak":
-        both = np.vstack([axes, -axes])
-        peaks = FeedbackControl(PEAK, loop, both, np.zeros(len(both)), first)
+        both, every = np.vstack([axes, -axes]), Places.of_values(breakpoints, len(axes))
+        peaks = FeedbackControl(PEAK, loop, every, both, np.zeros(len(both)), first)
         families.append(peaks.family())
         settled.append(peaks.settled)
         weights[first:] = cost
@@ -256,7 +254,7 @@ def _program(
         effort = FeedbackEffort(EFFORT, loop, cost, first)
         families.append(effort.family())
         settled.append(effort.settled)
-        guide = (_program(model, replace(charge, cost="peak"), known, acting, fixed, steps)[0], first)
+        guide = (_program(model, replace(charge, cost="peak"), known, acting, fixed, own)[0], first)
         weights[first:] = 1.0
         lower = np.append(lower, 0.0)
         most_effort = float(cost @ np.maximum(np.abs(low), np.abs(high)))
@@ -266,7 +264,7 @@ def _program(
         weights[:nominal] = cost
         if charge.among == "peak" and problem.cost.is_linear:
             peak = replace(charge, cost="peak")
-            among = (_program(model, peak, known, acting, fixed, steps)[0], first)
+            among = (_program(model, peak, known, acting, fixed, own)[0], first)
     priced["weights"] = weights
     program = SemiInfiniteProgram(
         n=size,
@@ -318,7 +316,7 @@ def _told_by(
         rows = np.ones(1)
     else:
         mine, others = family.source, theirs.source
-        assert isinstance(mine, FeedbackControl | FeedbackSteps) and isinstance(others, FeedbackControl | FeedbackSteps)
+        assert isinstance(mine, FeedbackControl) and isinstance(others, FeedbackControl)
         rows = _shares(mine.H, others.H * units.controls)
 
     def told(one: ConstraintFamily, scale: Array) -> ConstraintFamily:
@@ -337,15 +335,11 @@ def _told_by(
     return replace(reduced, literal=replace(told(literal, np.concatenate([index, deviations])), reduced=reduced))
 
 
-def _steps(problem: OptimalControlProblem, pieces: int, own: bool) -> Callable[[ClosedLoop], FeedbackSteps] | None:
-    """The steps of the control, every row divided by its ``own`` unit where that is asked for; ``None`` for none."""
-    step, first, around = problem.control_step, before(problem), bool(problem.repeat)
-    flat = None if step is None else step.halfspaces()
-    if step is None or flat is None or (pieces == 1 and first is None and not around):
-        return None
-    (H, h), far = flat, 2.0 * np.abs(flat[0]) @ extent(problem.control)
-    unit = units_of_sides(H, h, np.minimum(step.reach(H), far), far) if own else np.ones(h.size)
-    return lambda loop: FeedbackSteps(STEP, loop, H / unit[:, None], h / unit, first, around)
+def _divided(problem: OptimalControlProblem, H: Array, h: Array, step: ConvexSet) -> tuple[Array, Array]:
+    """The sides ``H a <= h`` of the control's steps, every row divided by its own unit."""
+    far = 2.0 * np.abs(H) @ extent(problem.control)
+    unit = units_of_sides(H, h, np.minimum(step.reach(H), far), far)
+    return H / unit[:, None], h / unit
 
 
 def _shares(mine: Array, theirs: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.control.constraints.control import differences
+from sparserob_core.control.constraints.control import before, differences
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import power_of_two
@@ -85,11 +85,6 @@ class Steps:
             (float(self.times[k]), np.sign(table[row, k]) * self.H[row], abs(float(table[row, k])))
             for row, k in np.argwhere(table)
         ]
-
-
-def before(problem: OptimalControlProblem) -> Array | None:
-    """The control ``(m,)`` before time 0, where it is told."""
-    return None if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
 
 
 def seam(problem: OptimalControlProblem, dictionary: Dictionary) -> bool:

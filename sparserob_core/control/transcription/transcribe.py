@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sparserob_core.control.constraints.control import ControlConstraint, of_control
+from sparserob_core.control.constraints.control import ControlConstraint, held_at
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.literal import LiteralConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
@@ -45,7 +45,7 @@ from sparserob_core.control.transcription.own_units import (
 )
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import RowUnits, Transcription
-from sparserob_core.control.transcription.steps import Steps, before, paired, refuse_without_steps, seam
+from sparserob_core.control.transcription.steps import Steps, paired, refuse_without_steps
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, OwnUnits, SemiInfiniteProgram
@@ -197,14 +197,10 @@ def _assembled(
     if functionals.execution is not None:
         S, lower, upper = _with_sizes(S, lower, upper, functionals)
     families = [family_of(constraint) for constraint in constraints]
-    held = []
-    if problem.control.halfspaces() is None:
-        held.append(ControlConstraint.of_values(problem.control, control, of_control(problem)))
-    step, first = problem.control_step, before(problem)
-    if step is not None and step.halfspaces() is None and (control.pieces > 1 or first is not None):
-        held.append(ControlConstraint.of_steps(step, control, first, seam(problem, control)))
     beside = functionals.variables - functionals.coefficients
-    families += [replace(one, beside=beside).family() for one in held]
+    for name, convex, places in held_at(problem, control.breakpoints, answering=False):
+        if convex.halfspaces() is None:  # sides are rows of the image
+            families.append(ControlConstraint.of(name, convex, places, control, beside).family())
     if formulation == "literal":
         families = [family.literal or family for family in families]
     program = SemiInfiniteProgram(

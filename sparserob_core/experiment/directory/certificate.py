@@ -334,9 +334,8 @@ def _driven(experiment: ControlExperiment, said: TimedExplanation, decision: Arr
     feedback = experiment.transcription.feedback
     if feedback is None or experiment.problem.disturbance_class != "piecewise_constant":
         return said
-    from sparserob_core.control.constraints.control import of_control
+    from sparserob_core.control.constraints.control import STEP, of_control
     from sparserob_core.control.constraints.feedback import told
-    from sparserob_core.control.transcription.feedback import STEP
 
     loop, time, controls = feedback.loop, said.time, feedback.loop.controls(decision)
     piece = int(np.searchsorted(experiment.control.breakpoints[1:-1], time, side="right"))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparserob_core.control.constraints.control import ControlConstraint
+from sparserob_core.control.constraints.control import ControlConstraint, Places
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -261,7 +261,9 @@ def test_the_slope_at_a_breakpoint_is_from_the_left_and_at_the_start_from_the_ri
 @pytest.mark.parametrize("sets", sorted(CURVED))
 def test_a_curved_set_of_controls_has_slopes_in_its_direction(sets):
     rng = np.random.default_rng(15)
-    family = ControlConstraint.of_values(CURVED[sets], GRIDS["uneven"]).family()
+    grid = GRIDS["uneven"]
+    places = Places.of_values(grid.breakpoints, CURVED[sets].dimension)
+    family = ControlConstraint.of("control", CURVED[sets], places, grid).family()
     indices = indices_in(rng, family, 20)
     assert_it_is_the_derivative(family, rng.normal(size=12), indices, np.zeros(20, dtype=int))
 
