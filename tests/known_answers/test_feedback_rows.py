@@ -341,3 +341,21 @@ def test_a_simplex_of_disturbances_has_one_middle_in_all_units(tmp_path: Path) -
         "terminal": [{"box": [4000.0, 4000.0, 4000.0]}],
     }
     proven(run(problem, tmp_path / "run", "nominal", 6))
+
+
+@pytest.mark.slow
+def test_functions_that_span_every_value_are_as_good_as_their_pieces(tmp_path: Path) -> None:
+    """What is written of Haar's functions are the values on their pieces; fewer functions are refused by name."""
+    found = {}
+    for name in ("piecewise_constant", "haar"):
+        dictionaries = {"control": {"name": name, "pieces": 4}}
+        outcome = sr.run(
+            {**config(SPRING, "peak"), "dictionaries": dictionaries}, out=tmp_path / name, quiet=True, figures=False
+        )
+        assert check(outcome.directory).status == "verified"
+        found[name] = json.loads((outcome.directory / "certificate.json").read_text())
+    assert found["haar"]["decision"] == found["piecewise_constant"]["decision"]
+    assert forged(tmp_path / "haar", tmp_path / "copy", lambda data: data["decision"][0].reverse()) == "refuted"
+    few = {"control": {"name": "haar", "pieces": 4, "functions": 2}}
+    with pytest.raises(sr.InputError, match="any value on every piece"):
+        sr.run({**config(SPRING), "dictionaries": few}, quiet=True)

@@ -57,6 +57,9 @@ class Case:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "problem", integrating(self.problem))
+        if self.policy is not None and self.control.functions == self.control.pieces:
+            # functions that are independent, as many as there are pieces, make all controls on these: written are values
+            object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))
 
     @cached_property
     def of_control(self) -> str:

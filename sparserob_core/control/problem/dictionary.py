@@ -87,6 +87,12 @@ class Dictionary:
     def _keep(self, **kept: object) -> None:
         self.__dict__.update(kept)
 
+    def by_values(self) -> Dictionary:
+        """Indicators of the pieces, where the functions span every value there: the same controls, written as what they
+        are on each piece; itself where they do not."""
+        full = self.functions == self.pieces and not self.is_indicators
+        return Dictionary._made(self.breakpoints, _owner=np.arange(self.pieces)) if full else self
+
     def on(self, breakpoints: npt.ArrayLike) -> Dictionary:
         """The same functions on as many pieces between other ``breakpoints (K + 1,)``."""
         times = _times(breakpoints)

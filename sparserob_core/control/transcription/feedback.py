@@ -158,7 +158,9 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
     measurable = bound is not None and kind == "measurable"
     ends = any(isinstance(end, Equality) for end in problem.terminal)
     reasons = {
-        "control in indicators of its pieces (piecewise_constant)": not control.is_indicators,
+        "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
+            not control.is_indicators
+        ),
         "system without uncertain parameters: else what is measured is not the disturbance alone": bool(
             problem.system.parameter_count
         ),

@@ -111,6 +111,7 @@ def prepare(
     if policy is not None and mask.any():
         from sparserob_core.control.transcription.feedback import refuse
 
+        control = control.by_values()  # what answers a measurement is a value, which must not reach back before it
         refuse(problem, control, disturbance, policy.charge.cost)
         if formulation != "reduced":
             raise InputError(
