@@ -58,7 +58,7 @@ class Case:
     def __post_init__(self) -> None:
         object.__setattr__(self, "problem", integrating(self.problem))
         if self.policy is not None and self.control.functions == self.control.pieces:
-            # functions that are independent, as many as there are pieces, make all controls on these: written are values
+            # as many functions as pieces, which are independent, make all controls on these: what is written are values
             object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))
 
     @cached_property

@@ -321,9 +321,10 @@ def acting(loop: ClosedLoop, places: Places, x: Array) -> tuple[Array, Array]:
     pieces, table = len(controls), places.table.T
     found = (table @ controls.reshape(pieces, -1)).reshape(-1, *controls.shape[1:])
     size = (abs(table) @ np.abs(controls).reshape(pieces, -1)).reshape(found.shape)
-    if places.seam and loop.anew:
-        first, at = controls[0], loop.begins.shape[0]
-        found[-1] = np.concatenate([first[:, :1], np.roll(first[:, 1:], -at, axis=1)], axis=1) - controls[-1]
+    if places.seam:  # of a single piece too, whose value and the next are no difference of the table
+        first, at = controls[0], loop.begins.shape[0] * loop.anew
+        first = np.concatenate([first[:, :1], np.roll(first[:, 1:], -at, axis=1)], axis=1)
+        found[-1], size[-1] = first - controls[-1], np.abs(first) + np.abs(controls[-1])
     found[:, :, 0] += places.offset
     size[:, :, 0] += np.abs(places.offset)
     return found, size
@@ -336,7 +337,10 @@ def rows_at(
     the left."""
     column = places.table[:, [place]].tocoo()
     pairs = sorted(zip(column.row.tolist(), column.data.tolist(), strict=True), reverse=True)
-    following = places.seam and loop.anew and place == places.starts.size - 1
+    around = places.seam and place == places.starts.size - 1
+    if around:
+        pairs = [(places.table.shape[0] - 1, -1.0), (0, 1.0)]
+    following = around and loop.anew
     (piece, share), *others = pairs
     rows = loop.control_rows(piece, share * H, h - H @ places.offset[place], extra)
     for piece, share in others:
