@@ -95,8 +95,7 @@ def _longest(case: Case, block: Sequence[int]) -> arb:
 
 def _whole(case: Case, total: arb) -> float:
     """A bound of the time of action as a share of the largest, rounded up where all that counts, counts the same."""
-    counts = _counts(case)
-    table = np.array([counts[block].sum(axis=0) for block in case.price.blocks])
+    table = _vectors(case)
     bound = float(np.nextafter(float(total.lower()), -np.inf))
     if np.ptp(table) <= EQUAL * table.max():
         one = float(table.mean())
@@ -155,6 +154,12 @@ def _counts(case: Case) -> np.ndarray:
     return np.asarray(np.outer(case.price.counts, np.diff(case.control.breakpoints)))
 
 
+def _vectors(case: Case) -> np.ndarray:
+    """What every piece of every vector of channels counts, ``(b, K)``."""
+    counts = _counts(case)
+    return np.array([counts[block].sum(axis=0) for block in case.price.blocks])
+
+
 def largest(case: Case) -> float:
     """The longest time that a control can act, weighted over its channels."""
     return float(_counts(case).sum())
@@ -179,32 +184,36 @@ def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, An
         if "multipliers" in node:
             answer = min(answer, _leaf(case, node.get("feasible") is not False, parts, weighted(node)))
             continue
-        place, halves = _divided(case, node, parts)
+        halves = _divided(case, node, parts)
         for key, half in zip(("first", "second"), halves, strict=True):
             child = node.get(key)
             if type(child) is not int:
                 raise Broken("tree: expected the numbers of two nodes")
-            waiting.append((child, {**parts, place: half}))
+            waiting.append((child, {**parts, **half}))
     return answer
 
 
 def _divided(
     case: Case, node: Mapping[str, Any], parts: Mapping[tuple[int, int], Part]
-) -> tuple[tuple[int, int], tuple[Part, Part]]:
-    """The piece of a channel where a part is divided, and its two halves, which hold every control of the part."""
+) -> tuple[dict[tuple[int, int], Part], dict[tuple[int, int], Part]]:
+    """Two halves that hold every control of a part: of one channel's values on a piece, or where channels make one
+    vector, that this is 0 there, and that it counts."""
     channel, piece = node.get("channel"), node.get("piece")
     m, K = case.problem.system.controls, case.control.pieces
     if type(channel) is not int or type(piece) is not int or not (0 <= channel < m and 0 <= piece < K):
         raise Broken(f"tree: there is no piece {piece!r} of channel {channel!r}")
-    low, high, on = parts.get((channel, piece), ANY)
     if case.letters is None:
-        return (channel, piece), ((0.0, 0.0, False), (low, high, True))
+        (block,) = (block for block in case.price.blocks if channel in block)
+        known = {(c, piece): parts.get((c, piece), ANY) for c in block}
+        return dict.fromkeys(known, (0.0, 0.0, False)), {at: (low, high, True) for at, (low, high, _) in known.items()}
+    low, high, on = parts.get((channel, piece), ANY)
     at = node.get("at")
     if not (isinstance(at, list) and len(at) == 2 and all(value in case.letters for value in at) and at[0] < at[1]):
         raise Broken(f"tree: expected two letters, got {at!r}")
     if any(at[0] < letter < at[1] for letter in case.letters):
         raise Broken(f"tree: {at} are no neighbours")
-    return (channel, piece), ((low, min(high, float(at[0])), on), (max(low, float(at[1])), high, on))
+    place = channel, piece
+    return {place: (low, min(high, float(at[0])), on)}, {place: (max(low, float(at[1])), high, on)}
 
 
 def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], rows: Rows) -> float:
@@ -220,7 +229,7 @@ def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], row
         if not total > 0:
             raise Broken(f"tree: multipliers of a part prove {float(total.lower()):.3g}, expected a positive number")
         return float("inf")
-    table = _counts(case)
+    table = _vectors(case)
     bound = float(np.nextafter(float(total.lower()), -np.inf))
     if np.ptp(table) <= EQUAL * table.max():
         return float(max(0.0, np.ceil(bound / float(table.mean()) - NEARLY))) * float(table.mean())

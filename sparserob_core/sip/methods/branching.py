@@ -26,7 +26,7 @@ from sparserob_core.sip.inner.solve import elastic_program, unrelaxed
 from sparserob_core.sip.inner.vertex import Corner, simplex
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
-from sparserob_core.sip.working.counting import MISSED, convex_below, prices_of, whole
+from sparserob_core.sip.working.counting import MISSED, convex_below, prices_of, vectors, whole
 
 SECONDS = 20.0  # that a mixed-integer program may take
 INTEGRAL = 1e-6  # of an entry's range, within which it is 0 or a letter
@@ -37,8 +37,8 @@ INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding d
 @dataclass(frozen=True, eq=False)
 class Part:
     """One part of the decisions: the change of one image's bounds (``lower``, ``upper``), or that it counts (``on``),
-    from the part ``above`` it; and what was found: the count is at least ``bound`` there, ``x (n,)`` is where to look
-    next."""
+    from the part ``above`` it, and with it of all that count together with it: that they are 0, or count; and what was
+    found: the count is at least ``bound`` there, ``x (n,)`` is where to look next."""
 
     above: int
     image: int
@@ -65,7 +65,7 @@ class Branching:
 
     def __post_init__(self) -> None:
         base = self.program.finite
-        self.prices = prices_of(self.program)
+        self.prices, self._vectors = prices_of(self.program), vectors(self.program)
         whole = Part(-1, 0, float(base.lower[0]), float(base.upper[0]), False)
         self.parts, self.nodes = [whole], [Leaf(NO_BOUND)]
         self._heap = [(self._renewed(0), 0)]
@@ -186,6 +186,11 @@ class Branching:
             if part.image not in seen:
                 lower[part.image], upper[part.image], on[part.image] = part.lower, part.upper, part.on
                 seen.add(part.image)
+                for image in np.flatnonzero(self._vectors == self._vectors[part.image]).tolist():
+                    if image not in seen:  # nothing else was said of it, so that its bounds are those of the program
+                        lower[image], upper[image] = (lower[image], upper[image]) if part.on else (0.0, 0.0)
+                        on[image] = part.on
+                        seen.add(image)
             part = self.parts[part.above]
         return lower, upper, on
 
@@ -240,7 +245,8 @@ def proposed(
     finite, prices = relaxed.finite(rows.G, rows.h, 0.0), prices_of(program)
     n, unit = program.n, prices[prices > 0.0].min()
     S = csr_array(eye_array(n)) if finite.S is None else csr_array(finite.S)
-    blocks = _off_or_on(S, finite, prices) if letters is None else _spelt(S, letters, prices)
+    together = vectors(program)
+    blocks = _off_or_on(S, finite, prices, together) if letters is None else _spelt(S, letters, prices)
     cost, couplings = blocks[0] / unit, list(blocks[1])
     count, left = cost.size, relaxed.deadline.left
     plain = [(S, finite.lower, finite.upper), (finite.G, -np.inf, finite.h), (finite.A, finite.b, finite.b)]
@@ -278,17 +284,27 @@ def _silent() -> Iterator[None]:
         os.close(kept)
 
 
-def _off_or_on(S: Any, finite: FiniteProgram, prices: Array) -> tuple[Array, list[Any]]:
-    """``lower b <= s <= upper b`` with ``b`` 0 or 1, and what every ``b`` costs."""
+def _off_or_on(S: Any, finite: FiniteProgram, prices: Array, together: np.ndarray) -> tuple[Array, list[Any]]:
+    """``lower b <= s <= upper b`` with ``b`` 0 or 1, the same for all that count ``together (k,)``, and what every
+    ``b`` costs."""
     from scipy.optimize import LinearConstraint
-    from scipy.sparse import diags_array, hstack
+    from scipy.sparse import csr_array, diags_array, hstack
 
     either = np.flatnonzero((prices > 0.0) & (finite.lower <= 0.0) & (finite.upper >= 0.0))
     above, below = (diags_array(-side[either]) for side in (finite.upper, finite.lower))
-    return prices[either], [
+    couplings = [
         LinearConstraint(hstack([S[either], above], format="csr"), -np.inf, 0.0),
         LinearConstraint(hstack([S[either], below], format="csr"), 0.0, np.inf),
     ]
+    _, first, which = np.unique(together[either], return_index=True, return_inverse=True)
+    others = np.flatnonzero(first[which] != np.arange(either.size))
+    if others.size:
+        row = np.arange(others.size)
+        place = np.concatenate([others, first[which[others]]]) + S.shape[1]
+        value = np.repeat([1.0, -1.0], others.size)
+        same = csr_array((value, (np.tile(row, 2), place)), shape=(others.size, S.shape[1] + either.size))
+        couplings.append(LinearConstraint(same, 0.0, 0.0))
+    return prices[either], couplings
 
 
 def _spelt(S: Any, letters: Array, prices: Array) -> tuple[Array, list[Any]]:

@@ -32,7 +32,7 @@ from sparserob_core.sip.proof.verdict import verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.counting import DUST, count, counted_below, prices_of
+from sparserob_core.sip.working.counting import DUST, count, count_of, counted_below, prices_of
 from sparserob_core.sip.working.ledger import unproven
 from sparserob_core.sip.working.securing import PAID
 
@@ -75,8 +75,8 @@ class SparsestMethod(Method, Options):
         return sorted(value)
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        if program.finite.blocks is not None:
-            raise InputError("method: sparsest counts channels one by one; expected a cost without groups")
+        if program.finite.blocks is not None and self.alphabet is not None:
+            raise InputError("method: sparsest.alphabet spells channels one by one; expected a cost without groups")
         if program.activity is None or program.n != program.activity.size:
             raise InputError(
                 "method: sparsest counts pieces, for which a control needs a function per piece; expected a dictionary"
@@ -209,7 +209,7 @@ class _Search:
         if self.letters is not None:
             return self._exactly(self._spelt(image))
         key = np.packbits(acts[prices > 0.0]).tobytes()
-        if float(prices[acts].sum()) >= self.least * (1.0 - SAME) or key in self.tried:
+        if count_of(self.program, acts) >= self.least * (1.0 - SAME) or key in self.tried:
             return False
         self.tried.add(key)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)

@@ -88,17 +88,21 @@ def count(program: SemiInfiniteProgram, x: Array) -> float:
     """The count of a decision ``x (n,)``, in the user's units: entries that make one vector count together."""
     base = program.finite
     terms = np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
-    acts = np.abs(base.image(x)) > ROUNDED * terms
-    return math.fsum(together(program)[np.unique(_numbers(program)[acts & (prices_of(program) > 0.0)])])
+    return count_of(program, np.abs(base.image(x)) > ROUNDED * terms)
+
+
+def count_of(program: SemiInfiniteProgram, acts: np.ndarray) -> float:
+    """The count, in the user's units, where these images ``(k,)`` are not 0."""
+    return math.fsum(together(program)[np.unique(vectors(program)[acts & (prices_of(program) > 0.0)])])
 
 
 def together(program: SemiInfiniteProgram) -> Array:
     """What counts together, ``(g,)``: every block of entries, and every entry that counts alone; 0 where none does."""
-    return np.asarray(np.bincount(_numbers(program), prices_of(program)), dtype=float)
+    return np.asarray(np.bincount(vectors(program), prices_of(program)), dtype=float)
 
 
-def _numbers(program: SemiInfiniteProgram) -> np.ndarray:
-    """With which others each image counts, ``(k,)``."""
+def vectors(program: SemiInfiniteProgram) -> np.ndarray:
+    """With which others each image counts, ``(k,)``: the number of the first image of its vector."""
     alone, blocks = np.arange(program.finite.weights.size), program.finite.blocks
     if blocks is None:
         return alone
