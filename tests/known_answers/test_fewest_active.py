@@ -4,6 +4,7 @@ linear program, and mixed-integer answers that nobody here tuned."""
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -145,5 +146,30 @@ def test_channels_that_are_one_vector_act_together(tmp_path: Path) -> None:
     boxed = integrator([0.6, 0.8], {"box": 1.0}, terminal=[{"equals": [0, 0]}], cost={"group": "all"})
     _, interval = solved(boxed, 20, tmp_path / "boxed")
     assert 1.0 / np.sqrt(8.0) <= interval["lower"] <= 0.4 + 1e-12 <= interval["upper"] + 2e-12
+    spelt = {"name": "sparsest", "alphabet": [-1.0, 0.0, 1.0]}
     with pytest.raises(sr.InputError, match="without groups"):
-        solved({**problem, "cost": {"group": "all"}}, 20, tmp_path / "refused", method={"name": "sparsest"})
+        solved(boxed, 20, tmp_path / "refused", method=spelt)
+
+
+@pytest.mark.slow
+def test_the_fewest_pieces_of_a_vector_are_divided_and_counted_together(tmp_path: Path) -> None:
+    """A way of 0.05 and 0.7 at a speed of at most 1 each, on pieces of 0.4: the second channel needs two of five, where
+    the first may act too. A third channel that counts alone needs one."""
+    boxed = integrator([0.05, 0.7], {"box": 1.0}, terminal=[{"equals": [0, 0]}], cost={"group": "all"})
+    outcome, interval = solved(boxed, 5, tmp_path / "run", method={"name": "sparsest"})
+    assert outcome.status == "certified"
+    assert (interval["lower"], interval["upper"]) == pytest.approx((0.4, 0.4), abs=1e-12)
+    acts = np.load(outcome.directory / "solution.npz")["control"] != 0.0
+    assert acts.any(axis=0).sum() == 2
+    copy = tmp_path / "copy"
+    shutil.copytree(outcome.directory, copy)
+    data = json.loads((copy / "certificate.json").read_text())
+    branches = [node for node in data["tree"]["nodes"] if "first" in node]
+    assert branches, "the bound of the root alone is too low"
+    branches[0]["first"] = branches[0]["second"]
+    (copy / "certificate.json").write_text(json.dumps(data))
+    assert sr.check(copy).status == "refuted"
+    apart = {**boxed, "system": {"A": np.zeros((3, 3)).tolist(), "B": np.eye(3).tolist()}}
+    apart |= {"initial_state": [0.05, 0.7, 0.3], "terminal": [{"equals": [0, 0, 0]}], "cost": {"group": [[1, 2]]}}
+    _, interval = solved(apart, 5, tmp_path / "apart", method={"name": "sparsest"})
+    assert interval["lower"] == pytest.approx((2 * 2 + 1) / 15, abs=1e-9)
