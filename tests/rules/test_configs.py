@@ -16,6 +16,11 @@ from tests.support.places import CONFIGS
 EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "atv_transfer": ("certified", 10.920731, 1e-7),
     "simbol_x_transfer": ("certified", 1.813578, 3e-7),
+    "atv_box": ("certified", None, 0.0),
+    "simbol_x_box": ("certified", None, 0.0),
+    "prisma_box": ("certified", None, 0.0),
+    "atv_execution": ("certified", None, 0.0),
+    "atv_feedback": ("certified", None, 0.0),
     "breakpoints": ("certified", None, 0.0),
     "cart_pendulum": ("certified", 0.3281469, 2e-7),
     "coupled_masses": ("certified", 1.057952, 5e-6),
@@ -65,6 +70,11 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
 UNCHECKED = {("experiment1_scenario", "lower bound")}  # its constraints are samples
 ELSEWHERE = {"experiment1_paper"}  # what is found by it is tested in known_answers/test_paper.py
 SLOW = {  # every status, formulation and kind of uncertainty has a lighter config
+    "atv_box",
+    "simbol_x_box",
+    "prisma_box",
+    "atv_execution",
+    "atv_feedback",
     "atv_transfer",
     "prisma_transfer",
     "simbol_x_transfer",

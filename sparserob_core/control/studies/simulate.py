@@ -177,9 +177,15 @@ def trajectories_at_once(response: Response, uncertain: bool) -> int:
 
 def _transitions(A: Array, lengths: Array) -> tuple[Array, Array]:
     """``e^{A r}`` and its integral for every distinct length, ``(q, d, d)``, or ``(q, d, d, n)`` for ``n`` matrices
-    ``(d, d, n)``."""
+    ``(d, d, n)``. A known system is taken in units in which it is small, powers of two: in metres and seconds an orbit
+    is known a hundred times better so."""
+    from scipy.linalg import matrix_balance
+
     if A.ndim == 2:
-        return transitions(A[None], lengths)
+        balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
+        back = units[:, None] / units
+        flows, integrals = transitions(balanced[None], lengths)
+        return flows * back, integrals * back
     flows, integrals = transitions(np.moveaxis(A, -1, 0)[None], lengths[:, None])
     return np.ascontiguousarray(np.moveaxis(flows, 1, -1)), np.ascontiguousarray(np.moveaxis(integrals, 1, -1))
 

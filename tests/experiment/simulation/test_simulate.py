@@ -411,3 +411,19 @@ def test_a_directory_that_takes_no_result_is_refused_before_anything_is_computed
 
     with pytest.raises(sr.InputError, match="cannot be written to; expected a directory that takes the result"):
         require_room(tmp_path)
+
+
+def test_an_orbit_in_metres_and_seconds_is_walked_to_rounding() -> None:
+    from flint import arb, arb_mat, ctx
+
+    from sparserob_core.control.response.response import Response, TimeGrid
+
+    n, horizon, begin = 1.13e-3, 6000.0, [-3e4, 500.0, 8.5, 0.0]
+    A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 2 * n], [0, 3 * n * n, -2 * n, 0]])
+    grid = TimeGrid(np.linspace(0.0, horizon, 25), np.arange(24), np.arange(24))
+    response = Response(sr.LinearSystem(A, np.eye(4)[:, 2:]), grid, np.array(begin))
+    *_, state = walk(response, np.zeros((2, 24)), np.zeros((1, 0)), None)
+    with ctx.workprec(200):
+        power = arb_mat([[arb(v) * horizon for v in row] for row in A.tolist()]).exp()
+        exact = [float(v) for v in (power * arb_mat([[arb(v)] for v in begin])).entries()]
+    assert np.abs(state[:2, 0] - exact[:2]).max() < 1e-8  # of 30 km; in metres and seconds it is 2e-7
