@@ -33,6 +33,8 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb_mat
 
+    from sparserob_core.checker.reach.adjoint import Adjoint
+
 RETURN, EQUALS, STEP = "return", "equals", "control_step"
 INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: ten times what counts as no violation, so
 # that none is handed on from period to period
@@ -329,6 +331,11 @@ class Case:
     @cached_property
     def price(self) -> Price:
         return Price(self.problem, self.control, self.clock, self.changing)
+
+    @cached_property
+    def adjoints(self) -> dict[bytes, Adjoint]:
+        """Rows that were followed before."""
+        return {}
 
     @cached_property
     def rows(self) -> dict[tuple[object, ...], Row]:

@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.case import Case, listed, number, numbers, written_policy
-from sparserob_core.checker.claims.constraints import bounded, equalities
+from sparserob_core.checker.claims.constraints import bounded, equalities, is_followed
 from sparserob_core.checker.claims.duality import Row, before, steps
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
@@ -153,7 +153,8 @@ def _policy(case: Case) -> str:
 
 
 def _kept(case: Case, window: Window) -> str:
-    return _feedback(case).bounded(window) if _looped(case) else bounded(case, window)
+    along_rows = is_followed(case, window)
+    return bounded(case, window) if along_rows or not _looped(case) else _feedback(case).bounded(window)
 
 
 def _equalities(case: Case) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 
 LEAPS = 64  # times in a row that a lag is carried on from the one before
+STEPS_KEPT = 64  # lengths whose exponentials are remembered from row to row: of 300 states each takes 10 MB
 
 
 @final
@@ -55,6 +56,7 @@ class Duality:
     control: Dictionary
     changes: list[float] | None
     varying: VaryingFlow | None = None
+    _steps: dict[tuple[tuple[float, ...], int, tuple[float, float]], arb_mat] = field(default_factory=dict, repr=False)
 
     @property
     def nothing(self) -> arb:
@@ -176,7 +178,6 @@ class Duality:
         """``c'e^{A (t - s)}`` and its integrals from each of the times ``since`` to ``time``, times ``B`` and ``E``;
         back through the systems that took turns until then. From one time to the next by the exponential of the step,
         which is the same wherever pieces are equally long; every `LEAPS` times anew, since balls grow."""
-        from flint import arb_mat
 
         switches, d = self.problem.system.switches, direction.size
         matrices = [_joined(flow) for flow in every]
@@ -184,15 +185,18 @@ class Duality:
         for leg in range(bisect_left(switches, time), -1, -1):
             begin, end = (0.0, *switches)[leg], min((*switches, time)[leg], time)
             row, totals = stacked([[v] for v in column[:d]] + [[_exact(0.0)] for _ in column[d:]]), column[d:]
-            steps, latest, moved = dict[tuple[float, float], arb_mat](), end, row
+            latest, moved = end, row
             for number, s in enumerate(sorted({begin, *(s for s in since if begin <= s < end)}, reverse=True)):
                 if number % LEAPS == 0:
                     moved = (matrices[leg] * (_exact(end) - _exact(s))).exp() * row
                 else:
-                    length = difference(latest, s)
-                    if length not in steps:
-                        steps[length] = (matrices[leg] * (_exact(latest) - _exact(s))).exp()
-                    moved = steps[length] * moved
+                    length = (every[leg].centre, leg, difference(latest, s))
+                    if length not in self._steps:
+                        step = (matrices[leg] * (_exact(latest) - _exact(s))).exp()
+                        if len(self._steps) >= STEPS_KEPT:
+                            self._steps.clear()
+                        self._steps[length] = step
+                    moved = self._steps[length] * moved
                 latest, lag = s, moved.entries()
                 found[s] = lag[:d] + [a + b for a, b in zip(lag[d:], totals, strict=True)]
             column = found[begin]

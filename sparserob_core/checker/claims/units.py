@@ -62,10 +62,10 @@ class RowUnits:
         flat = known(self.shape).facets
         assert flat is not None
         heights = np.array([abs(float(b.mid())) for _, b in flat])
-        reach, sums = self._measured(self._middle)
+        reach, sums = self._measured(self._middle, states=False)
         near = np.array([smallest(pair) for pair in zip(heights.tolist(), widths(flat), strict=True)])
         if (reach[: near.size] < np.where(near > 0.0, near, np.inf)).any():  # elsewhere a row may reach further
-            others = [self._measured(point)[0] for point in self._elsewhere]
+            others = [self._measured(point, states=False)[0] for point in self._elsewhere]
             reach = np.max([reach, *others], axis=0)
         unit = [smallest(pair) for pair in zip(near.tolist(), reach.tolist(), strict=False)]
         least = RESOLVED * sums[: near.size]
@@ -75,7 +75,7 @@ class RowUnits:
     @cached_property
     def sums(self) -> Array:
         """The largest numbers ``(d,)`` that are added up to a state within the window."""
-        return self._measured(self._middle)[1][-self.problem.system.states :]
+        return self._measured(self._middle, states=True)[1]
 
     def slack(self, direction: Array, limit: arb) -> float:
         """What counts as none in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its facet, or
@@ -100,37 +100,45 @@ class RowUnits:
         axes = np.vstack([np.eye(bound.dimension)[:MOST_AXES], np.ones((1, bound.dimension))])
         return [tuple(map(float, point)) for point in bound.support_point(np.vstack([axes, -axes]))]
 
-    def _measured(self, parameter: tuple[float, ...]) -> tuple[Array, Array]:
-        """How far the normal of every facet, and every state, reach at one parameter ``(k + d,)``, and the largest sums
-        of absolute numbers from which these are computed; by one walk back through the pieces from every time that is
-        looked at, as many of them together as fit."""
-        if parameter not in self._known:
+    def _measured(self, parameter: tuple[float, ...], states: bool) -> tuple[Array, Array]:
+        """How far the normal of every facet, or every one of the ``states``, reaches at one parameter, and the largest
+        sums of absolute numbers from which these are computed, ``(k,)`` each; by one walk back through the pieces from
+        every time that is looked at, as many of them together as fit."""
+        if (parameter, states) not in self._known:
             with np.errstate(over="ignore", invalid="ignore"):
                 nodes, places = self._nodes()
-                each = len(nodes) * (len(known(self.shape).facets or []) + self.problem.system.states)
+                each = len(nodes) * len(self._rows_of(states)[0])
                 each *= self.problem.system.controls + 1 + self.problem.system.disturbances
                 parts = np.array_split(places, min(places.size, -(-places.size * each // MOST_HELD)))
-                every = [self._walked(parameter, nodes[: part[-1] + 1], part) for part in parts]
+                every = [self._walked(parameter, states, nodes[: part[-1] + 1], part) for part in parts]
                 found = np.max([one for one, _ in every], axis=0), np.max([sums for _, sums in every], axis=0)
             if not all(np.isfinite(numbers).all() for numbers in found):
                 raise Unchecked("the response grows beyond what numbers can hold")
-            self._known[parameter] = found
-        return self._known[parameter]
+            self._known[parameter, states] = found
+        return self._known[parameter, states]
 
     @cached_property
-    def _known(self) -> dict[tuple[float, ...], tuple[Array, Array]]:
+    def _known(self) -> dict[tuple[tuple[float, ...], bool], tuple[Array, Array]]:
         return {}
 
-    def _walked(
-        self, parameter: tuple[float, ...], nodes: list[float], places: npt.NDArray[np.intp]
-    ) -> tuple[Array, Array]:
-        system, bound = self.problem.system, self.problem.disturbance
-        d, m, columns = system.states, system.controls, system.controls + (system.c is not None)
+    def _rows_of(self, states: bool) -> tuple[Array, Array]:
+        """The normals of the facets on the state and on the control, or every state: ``(k, d)``, ``(k, m)``."""
+        d = self.problem.system.states
+        if states:
+            return np.eye(d), np.zeros((d, 0))
         normals, gains = np.split(
             np.array([c for c, _ in known(self.shape).facets or []]).reshape(-1, self.shape.dimension), [d], 1
         )
+        return normals, gains
+
+    def _walked(
+        self, parameter: tuple[float, ...], states: bool, nodes: list[float], places: npt.NDArray[np.intp]
+    ) -> tuple[Array, Array]:
+        system, bound = self.problem.system, self.problem.disturbance
+        d, m, columns = system.states, system.controls, system.controls + (system.c is not None)
+        rows, gains = self._rows_of(states)
         step = _Steps(self.problem, parameter, columns, self.scene.tick, self.varying)
-        v = np.tile(np.vstack([normals, np.eye(d)]), (len(places), 1, 1))
+        v = np.tile(rows, (len(places), 1, 1))
         count = len(nodes) - 1
         driven = np.zeros((count, *v.shape[:2], columns))
         pushed = np.zeros((count, *v.shape[:2], system.disturbances))
@@ -167,13 +175,11 @@ class RowUnits:
         if self.reference is not None:
             at, (times, *points) = np.array(nodes)[places], self.reference.T
             moved = np.stack([np.interp(at, times, column) for column in points], axis=1)
-            off = moved @ np.vstack([normals, np.eye(d)]).T
+            off = moved @ rows.T
             high, low, sums = high - off, low + off, sums + np.abs(off)
         if gains.shape[1]:
-            own, count = self.problem.control, len(normals)
-            up, down = own.support(gains), own.support(-gains)
-            high[:, :count], low[:, :count] = high[:, :count] + up, low[:, :count] + down
-            sums[:, :count] += np.maximum(np.abs(up), np.abs(down))
+            up, down = self.problem.control.support(gains), self.problem.control.support(-gains)
+            high, low, sums = high + up, low + down, sums + np.maximum(np.abs(up), np.abs(down))
         return np.maximum(np.abs(high), np.abs(low)).max(axis=0), sums.max(axis=0)
 
     def _joined(self, nodes: list[float], pushed: Array) -> Array:

@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     from flint import arb_mat
 
 ORDER = 13  # of the polynomials
-SHORT = 1.0  # growth times length of a step, at most: what is left of them is then 3e-11 of a row's largest term
+SHORT = 0.5  # growth times length of a step, at most: what is left of them is then 1e-15 of a row's largest term
 BENDING = 7  # terms of the bounds of second derivatives
 MOST_STEPS = 2**17
+BLOCK = 64  # rows in one ball matrix, a power of two: fewer take more calls, more make more that are not needed
 MOST = 2**27  # numbers that the rows of all steps take
 AT_ONCE = 2**22  # numbers of rows that are worked on at once
 
@@ -66,11 +67,19 @@ class Adjoint:
             raise Unchecked("the system is too fast for its horizon to be followed")
         unit = arb_mat(d, d, [int(i == j) for i in range(d) for j in range(d)])
         power, found = (A * arb(step)).exp(), [[arb(float(v)) for v in c]]
-        while len(found) <= count:
+        while len(found) < BLOCK:
             clock.check()
             found += (stacked(found) * power).tolist()
             power = power * power
-        nodes = Enclosed.of(stacked(found[: count + 1]))
+        blocks = [stacked(found)]
+        while len(blocks) * BLOCK <= count:
+            clock.check()
+            blocks += [block * power for block in blocks[: -(-(count + 1) // BLOCK) - len(blocks)]]
+            power = power * power
+        parts = [Enclosed.of(block) for block in blocks]
+        nodes = Enclosed(
+            *(np.concatenate(one)[: count + 1] for one in zip(*((p.mid, p.rad) for p in parts), strict=True))
+        )
         terms, driven = [unit], [F]
         for order in range(1, ORDER + 1):
             clock.check()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
@@ -13,14 +13,13 @@ from sparserob_core.checker.arithmetic.balls import above, balls, below
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.cells import Work, prove
 from sparserob_core.checker.claims.claims import FIGURES, judged, precision_of
-from sparserob_core.checker.claims.constraints import covered, cut, parameters_of, tubes
+from sparserob_core.checker.claims.constraints import along, beside, covered, cut, followed, parameters_of, tubes
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
-from sparserob_core.checker.reach.adjoint import Adjoint, Worst
-from sparserob_core.checker.reach.flow import flows, stacked
+from sparserob_core.checker.reach.adjoint import Worst
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.sides import Bounded, Sides
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Polytope
@@ -29,9 +28,6 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-MOST_CELLS = 400_000  # of time, examined for one row
-PARTS = 8  # into which a cell is cut that is not bounded: a tenth of a chord's distance is left, and less
-HALVINGS = 16  # rounds of cuts: cells are then rounding
 SHARE = 1e-3  # of a bound, the unit of a row: what is forgiven of it is a thousandth of what bounds are apart at best
 OUTPUT, STATE = "output", "state"  # what rows are called that no constraint asks for
 
@@ -44,10 +40,6 @@ class Asked:
     window: Window
     direction: Array
     wall: arb | None
-
-
-Made: TypeAlias = dict[bytes, Adjoint]
-"""Adjoints by their rows: what bounds a quantity from both sides has one."""
 
 
 def check_suprema(case: Case) -> list[Finding]:
@@ -64,10 +56,9 @@ def check_suprema(case: Case) -> list[Finding]:
             return f"{len(entries)} rows, each of the problem's once"
 
         found.append(judged("rows", every))
-        made: Made = {}
         for asked, entry in entries:
             name = f"{asked.window.name}: {_sense(asked)} {entry.get('quantity')}"
-            found.append(judged(name, lambda asked=asked, entry=entry: _enclosed(case, asked, entry, made)))  # type: ignore[misc]
+            found.append(judged(name, lambda asked=asked, entry=entry: _enclosed(case, asked, entry)))  # type: ignore[misc]
         return found
 
 
@@ -113,7 +104,7 @@ def _matched(case: Case) -> list[tuple[Asked, Mapping[str, Any]]]:
     return found
 
 
-def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any], made: Made) -> str:
+def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any]) -> str:
     """Both sides of one row; a sentence with the figures."""
     sense = _sense(asked)
     if entry.get("sense") != sense:
@@ -128,18 +119,18 @@ def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any], made: Made) ->
     low, high = sign * reached_side, None if proven_side is None else sign * proven_side
     _margin(asked, entry, sign, high)
     case.clock.check()
-    followed = _followed(case, asked, made)
-    value = _witnessed(case, asked, entry, followed)
+    worst = _followed(case, asked)
+    value = _witnessed(case, asked, entry, worst)
     if not value[0] >= low:
         raise Broken(f"{reached_side!r} is written, its witness reaches {sign * value[0]!r}")
     if high is None:
         raise Unchecked(f"{reached_side:.9g} is reached, and no bound is written on the other side")
     if value[0] > high:
         raise Broken(f"{proven_side!r} is written, its witness reaches {sign * value[0]!r}")
-    if followed is None:
+    if worst is None:
         count = _proven_in_cells(case, asked, high)
     else:
-        count = _proven(case, asked, followed, high)
+        count, _ = along(case, asked.window, asked.direction, worst, high)
     side = "above" if sense == "sup" else "below"
     return f"{reached_side:.9g} is reached, nothing is {side} {proven_side:.9g} ({count} cells)"
 
@@ -162,51 +153,16 @@ def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | N
         raise Broken(f"a margin of {margin!r} is written, {written - high!r} follows")
 
 
-def _followed(case: Case, asked: Asked, made: Made) -> Worst | None:
+def _followed(case: Case, asked: Asked) -> Worst | None:
     """The row by its adjoint, where the system is known and does not change; ``None`` elsewhere."""
-    system, problem = case.problem.system, case.problem
+    system = case.problem.system
     if isinstance(system, VaryingSystem):
         raise Unchecked("worst cases of a system that changes with time are not derived")
     if problem.execution is not None and case.theta.any():
         raise Unchecked("worst cases of a control that is delivered with errors are not derived")
     if not isinstance(system, LinearSystem) or system.parameter_count:
         return None
-    parts = flows(system, [])[0].parts
-    A, B, E = (parts[name][0] for name in ("A", "B", "E"))
-    pushed = problem.disturbance
-    F = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)]) if pushed is not None else B
-    drives = [u.entries() for u in case.scene.control]
-    table = Enclosed.of(stacked([list(row) for row in zip(*drives, strict=True)]))
-    jumps = None if case.measurable else case.changes
-    state = asked.window.split(asked.direction)[0]
-    if (-state).tobytes() in made:
-        made[state.tobytes()] = made[(-state).tobytes()].reversed()
-    elif state.tobytes() not in made:
-        made[state.tobytes()] = Adjoint.of(A, F, state, case.grid[-1], case.clock)
-    return Worst(
-        made[state.tobytes()],
-        np.asarray(problem.initial_state, dtype=float),
-        problem.initial_set,
-        np.array(case.grid),
-        replace(table, rad=np.where(table.rad > 1e-290, table.rad, 0.0)),
-        pushed,
-        None if jumps is None else np.append(jumps, problem.horizon),
-    )
-
-
-def _beside(case: Case, asked: Asked, time: float, inside: float) -> tuple[float, float]:
-    """What stands beside the state in the row at a time, with the control of the piece that holds ``inside``, between
-    bounds."""
-    window = asked.window
-    state, gains = window.split(asked.direction)
-    offset, _ = window.moved(time, time)
-    total = -sum((a * b for a, b in zip(balls(state), offset, strict=True)), balls([0.0])[0])
-    if window.is_mixed:
-        ends = case.control.breakpoints
-        piece = int(np.clip(np.searchsorted(ends, inside, side="right") - 1, 0, case.control.pieces - 1))
-        window.meets(ends.tolist(), piece, time)
-        total = total + sum((a * u for a, u in zip(balls(gains), case.pieces[piece].entries(), strict=True)), 0 * total)
-    return below(total), above(total)
+    return followed(case, asked.window.split(asked.direction)[0])
 
 
 def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Worst | None) -> tuple[float, float]:
@@ -226,7 +182,7 @@ def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Wor
     if problem.initial_set is not None and not known(problem.initial_set).contains(deviation):
         raise Broken("the deviation of the initial state is not shown to be in its set")
     changes, signal = _signal(case, entry)
-    low, high = _beside(case, asked, time, time)
+    low, high = beside(case, window, asked.direction, time, time)
     if followed is not None:
         value = followed.along(time, deviation, changes, signal)
         return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
@@ -260,64 +216,6 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
             raise Broken(f"the disturbance {list(value)} is not shown to be in its set")
         seen.add(value)
     return changes, signal
-
-
-def _proven(case: Case, asked: Asked, followed: Worst, limit: float) -> int:
-    """Show that a row is nowhere above ``limit``; the number of cells that this took."""
-    window = asked.window
-    breaks = case.control.breakpoints.tolist()
-    more = [window.start, window.stop, *window.cuts(breaks)]
-    times = followed.cuts(more)
-    times = times[(times >= window.start) & (times <= window.stop)]
-    start, stop = (times[:-1], times[1:]) if times.size > 1 else (times, times)
-    count = 0
-    plain = window.reference is None and not window.is_mixed
-    for _ in range(HALVINGS):
-        case.clock.check()
-        count += start.size
-        if count > MOST_CELLS:
-            break
-        tops = followed.over(start, stop, 0.0 if plain else _added(case, asked, start, stop))
-        open_ = ~(tops <= limit)
-        if not open_.any():
-            return count
-        _refute(case, asked, followed, start[open_], stop[open_], limit)
-        start, stop = _parts(start[open_], stop[open_])
-        if not start.size:
-            break
-    raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
-
-
-def _added(case: Case, asked: Asked, start: Array, stop: Array) -> Array:
-    """What stands beside the state at both ends of cells, ``(2, k)``, at most."""
-    cells = case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
-    return np.array([[_beside(case, asked, t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
-
-
-def _refute(case: Case, asked: Asked, followed: Worst, start: Array, stop: Array, limit: float) -> None:
-    """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell, with sets whose support
-    functions are sharp."""
-    sets = (case.problem.initial_set, case.problem.disturbance)
-    if any(one is not None and known(one).facets is None for one in sets):
-        return
-    middles = (start + stop) / 2
-    top, wide = followed.most(middles)
-    least = (top - wide) - HALF_ULP * 8.0 * np.abs(top)
-    if asked.window.reference is not None or asked.window.is_mixed:
-        beside = [_beside(case, asked, t, t)[0] for t in middles.tolist()]
-        least = least + np.array(beside) - HALF_ULP * 8.0 * np.abs(beside)
-    worst = int(least.argmax())
-    if least[worst] > limit:
-        raise Broken(f"{limit!r} is exceeded, by {least[worst] - limit:.3g} at t = {middles[worst]:.6g}")
-
-
-def _parts(start: Array, stop: Array) -> tuple[Array, Array]:
-    """Cells in equal parts; none where these are rounding."""
-    ends = start[:, None] + (stop - start)[:, None] * (np.arange(PARTS + 1) / PARTS)
-    ends[:, 0], ends[:, -1] = start, stop
-    if not (np.diff(ends, axis=1) > 0.0).all():
-        return np.zeros(0), np.zeros(0)
-    return ends[:, :-1].ravel(), ends[:, 1:].ravel()
 
 
 def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
