@@ -158,7 +158,7 @@ def _followed(case: Case, asked: Asked) -> Worst | None:
     system = case.problem.system
     if isinstance(system, VaryingSystem):
         raise Unchecked("worst cases of a system that changes with time are not derived")
-    if problem.execution is not None and case.theta.any():
+    if case.problem.execution is not None and case.theta.any():
         raise Unchecked("worst cases of a control that is delivered with errors are not derived")
     if not isinstance(system, LinearSystem) or system.parameter_count:
         return None
