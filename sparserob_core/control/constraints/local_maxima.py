@@ -82,7 +82,7 @@ def beside_kinks(values: Array, times: Array, kinks: np.ndarray, kept: int) -> n
     turns or jumps, where the violation may rise above 0 before the next samples, at most ``kept`` before and ``kept``
     behind such times: a parabola across a kink does not see that, one on either side of it does."""
     found = [np.zeros((0, 3), dtype=int)]
-    for step in (-1, 1):
+    for step in (-1, 1) if times.size > 2 else ():
         at = kinks[(kinks + 2 * step >= 0) & (kinks + 2 * step < times.size)]
         near, far = (np.abs(times[at + k * step] - times[at]) for k in (1, 2))
         here, next_, last = (values[:, :, at + k * step] for k in (0, 1, 2))

@@ -25,7 +25,7 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.solver import AUTO, Solver
+from sparserob_core.sip.solver import AUTO, Auto, Solver
 from sparserob_core.sip.solver import named as named_solver
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def _named(choice: object) -> str:
 def _solver(registry: Registry, choice: object) -> Solver:
     """The solver of a choice: one that is named answers every program, and `Auto` where it does not."""
     solver: Solver = component(registry, "solver", choice, Solver)
-    return named_solver(solver, _named(choice), registry.build("solver", AUTO))
+    return solver if isinstance(solver, Auto) else named_solver(solver, _named(choice), registry.build("solver", AUTO))
 
 
 def _stated(

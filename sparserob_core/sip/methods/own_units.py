@@ -208,10 +208,12 @@ class UsersUnits:
 
     def _cuts(self, own: Sequence[Cut]) -> tuple[Cut, ...]:
         return tuple(
-            replace(
-                cut,
-                index=cut.index * self._index_units(cut.family, cut.formulation, cut.index.size),
-                multiplier=cut.multiplier * self._price(cut),
+            Cut(
+                cut.family,
+                cut.index * self._index_units(cut.family, cut.formulation, cut.index.size),
+                cut.row,
+                cut.multiplier * self._price(cut),
+                cut.formulation,
             )
             for cut in own
         )

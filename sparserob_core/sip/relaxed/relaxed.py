@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -43,6 +44,11 @@ class Rows:
     G: Array
     h: Array
     cuts: tuple[Cut, ...]
+
+    @cached_property
+    def norms(self) -> Array:
+        """The norms ``(r,)`` of the rows."""
+        return np.asarray(np.linalg.norm(self.G, axis=1))
 
     def take(self, keep: np.ndarray) -> Rows:
         """The rows where the mask (or the positions) ``keep`` says so."""
@@ -175,6 +181,7 @@ class RelaxedProgram:
     _last: RelaxedSolution | None = None
     _least: tuple[float, Array, Array, Array | None] | None = None
     _programs: dict[float, FiniteProgram] = field(default_factory=dict)
+    _plain: tuple[Rows, FiniteProgram] | None = None
 
     def __post_init__(self) -> None:
         self.counted = Asked.of(self.solver)
@@ -194,8 +201,8 @@ class RelaxedProgram:
     ) -> FiniteSolution:
         """Solve with all of these rows at once, each tightened by ``margin`` times its norm; ``guess`` is a solution
         with the same rows."""
-        norms = np.linalg.norm(rows.G, axis=1) if margin else 0.0
-        return self._solved(rows.G, rows.h - margin * norms, epsilon, guess)
+        h = rows.h - margin * rows.norms if margin else rows.h
+        return self._solved(rows.G, h, epsilon, guess)
 
     def lower_bound(self, rows: Rows, solution: FiniteSolution) -> Dual:
         """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these
@@ -204,7 +211,9 @@ class RelaxedProgram:
         Less an allowance for the rounding of the rows themselves; no multipliers at all are an offer too, and need
         none.
         """
-        plain = self.finite(rows.G, rows.h, 0.0)
+        if self._plain is None or self._plain[0] is not rows:  # the same again and again while the weight falls
+            self._plain = rows, self.finite(rows.G, rows.h, 0.0)
+        plain = self._plain[1]
         offers = [(solution.y, solution.mu, solution.z)]
         if np.isfinite(solution.x).all():
             linear = plain.tangent(solution.x)
