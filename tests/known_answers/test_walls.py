@@ -185,6 +185,20 @@ def test_a_limit_leaves_a_proven_control_whatever_the_method(
     assert np.isfinite(result.upper_bound)
 
 
+def test_a_limit_leaves_a_proven_control_between_walls_that_are_closer_than_is_spared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(run_module, "Deadline", Clock)
+    monkeypatch.setattr(Clock, "looks", 14)
+    given, width = ridden("moving", 16), 1e-4
+    problem = given["problem"]
+    problem.update(initial_state=[1.5 + width / 2], disturbance={"box": [1e-7]}, system={"A": [[0.0]], "B": [[1.0]]})
+    problem["path"].append({**problem["path"][0], "polytope": {"H": [[1.0]], "h": [width]}})
+    problem["control"]["box"]["lower"] = [-6.0]
+    result = sr.run(given, quiet=True, figures=False).result
+    assert result.status == "verified"
+
+
 @pytest.mark.parametrize(("feedback", "looks"), [(False, 36), (True, 8)])
 def test_a_relaxed_program_that_is_not_solved_leaves_the_control_that_is_proven(
     feedback: bool, looks: int, monkeypatch: pytest.MonkeyPatch

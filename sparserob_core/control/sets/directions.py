@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
-from itertools import product
 
 import numpy as np
 
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
-PER_EDGE = {1: 1, 2: 33, 3: 13, 4: 7}  # sampled directions along an edge of the cube, by dimension; 3 beyond
+# Sampled directions along an edge of the cube, by dimension; 3 beyond. What is most violated is climbed to from them:
+# with 13 and 7 in three and four dimensions a round takes four times as long and finds the same.
+PER_EDGE = {1: 1, 2: 33, 3: 9, 4: 5}
 
 
 @shaped
@@ -54,19 +55,14 @@ def on_surface(z: Float[Array, "*k b"]) -> Float[Array, "*k b"]:
     return np.asarray(z / np.where(size > 0, size, 1.0))
 
 
-@shaped
-def sampled(dimension: int) -> Float[Array, "k b"]:
-    """A lattice ``(k, b)`` on the surface of the cube."""
-    points = np.linspace(-1.0, 1.0, PER_EDGE.get(dimension, 3)) if dimension > 1 else np.zeros(0)
-    every = [
-        np.insert(rest, axis, sign)
-        for axis in range(dimension)
-        for sign in (-1.0, 1.0)
-        for rest in np.array(list(product(points, repeat=dimension - 1))).reshape(
-            len(points) ** (dimension - 1), dimension - 1
-        )
-    ]
-    return np.unique(np.array(every), axis=0)
+@cache
+def sampled(dimension: int) -> Array:
+    """A lattice ``(k, b)`` on the surface of the cube, which nobody may write to."""
+    points = np.linspace(-1.0, 1.0, PER_EDGE.get(dimension, 3)) if dimension > 1 else np.array([-1.0, 1.0])
+    every = np.stack(np.meshgrid(*[points] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
+    surface = every[np.abs(every).max(axis=1) == 1.0]
+    surface.flags.writeable = False
+    return surface
 
 
 @cache
