@@ -60,7 +60,7 @@ def sampled(dimension: int) -> Array:
     """A lattice ``(k, b)`` on the surface of the cube, which nobody may write to."""
     points = np.linspace(-1.0, 1.0, PER_EDGE.get(dimension, 3)) if dimension > 1 else np.array([-1.0, 1.0])
     every = np.stack(np.meshgrid(*[points] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
-    surface = every[np.abs(every).max(axis=1) == 1.0]
+    surface: Array = every[np.abs(every).max(axis=1) == 1.0]
     surface.flags.writeable = False
     return surface
 
