@@ -36,7 +36,7 @@ class Continuation(Options):
 
     The weight ``epsilon`` goes from ``start`` by ``factor`` (the paper's ``Regu``) down to ``stop`` at the latest, or
     until the cost ``J`` changes by no more than ``tolerance`` when it is reduced again (``SC1``). The method
-    ``exchange`` takes several steps at once, down to a sixteenth of a weight, as long as its gap is open.
+    ``exchange`` takes several steps at once, down to an eighth of a weight, as long as its gap is open.
     """
 
     start: float = Field(default=1.0, gt=0.0)
