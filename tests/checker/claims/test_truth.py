@@ -12,12 +12,16 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.claims import claims, constraints, replay, units
+from sparserob_core.checker.claims.duality import Duality, Row
 from sparserob_core.checker.outcome import Broken
+from sparserob_core.control.sets.sets import Box
 from tests.support.worst_cases import (
     BEFORE,
     CHANGES,
     CONTROL,
     DIRECTIONS,
+    ENDS,
+    HORIZON,
     KINDS,
     START,
     kind,
@@ -128,3 +132,68 @@ def test_a_unit_is_no_more_than_a_row_reaches_however_few_numbers_are_held(
     assert again.rows == pytest.approx(found.rows, rel=1e-12)
     assert again.sums == pytest.approx(sums, rel=1e-12)
     assert claims.precision_of(case) >= claims.PRECISION
+
+
+def test_slopes_on_pieces_may_be_moved_as_far_as_every_control_of_few_functions_is_alike() -> None:
+    """Of one function the coefficient is the control itself, so that nothing is given away."""
+    rng, K = np.random.default_rng(7), 4
+    problem = replace(kind("alone").case().problem, control=Box([-1.0, -0.5], [1.0, 0.5]))
+    for values in (np.ones((1, K)), np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, -1.0, -1.0]])):
+        duality = Duality(problem, sr.Dictionary(np.linspace(0.0, HORIZON, K + 1), values), None)
+        slope, moved = rng.normal(size=(K, 2)), rng.normal(size=(K, 2))
+        row = Row(arb(0.25), [[arb(v) for v in piece] for piece in slope])
+        constant, slopes = duality.summed([(2.0, row)], (-moved.T).tolist())
+        assert np.array([[float(x.mid()) for x in piece] for piece in slopes]) == pytest.approx(moved)
+        theta = rng.uniform(-1.0, 1.0, size=(300, 2, len(values))) / len(values) * np.array([1.0, 0.5])[:, None]
+        theta[:4] = np.sign(theta[:4]) * np.array([1.0, 0.5])[:, None] / len(values)
+        theta[:4, :, 0] *= np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * np.sign(theta[:4, :, 0])
+        u = theta @ values
+        truth = 2.0 * (0.25 + (u * slope.T).sum(axis=(1, 2)))
+        told = float(constant.mid()) + (u * moved.T).sum(axis=(1, 2))
+        assert (told <= truth + 1e-12).all()
+        if len(values) == 1:
+            assert (truth - told).min() == pytest.approx(0.0, abs=1e-12)
+        # what acts alike on every control costs nothing
+        null = np.array([1.0, -1.0, 1.0, -1.0])[:, None] * rng.normal(size=2)
+        same, _ = duality.summed([(2.0, row)], (-(2.0 * slope + null).T).tolist())
+        assert float(same.mid()) == pytest.approx(0.5, abs=1e-12)
+
+
+def test_a_bound_is_the_least_of_the_cost_and_of_what_rows_say_of_sizes() -> None:
+    """In a box, entry by entry: at an end, or at 0."""
+    rng = np.random.default_rng(8)
+    case = kind("alone").case(weights=[1.0, 0.25])
+    lengths = np.diff(case.control.breakpoints)[:, None]
+    low, high = CONTROL.lower, CONTROL.upper
+    for count in (1, 2, 3):
+        rows, constant, slope, sizes = [], 0.0, np.zeros((3, 2)), np.zeros((3, 2))
+        for _ in range(count):
+            y, c, g, s = rng.uniform(0.2, 1.0), rng.normal(), rng.normal(size=(3, 2)), rng.uniform(size=(3, 2))
+            rows.append((y, Row(arb(c), [[arb(v) for v in piece] for piece in g], s)))
+            constant, slope, sizes = constant + y * c, slope + y * g, sizes + y * s
+        for price, costs in ((case.price, lengths * np.array([1.0, 0.25])), (None, 0.0 * lengths)):
+            ends = [slope * u + (costs + sizes) * np.abs(u) for u in (low, high)]
+            least = constant + np.minimum(np.minimum(*ends), 0.0).sum()
+            found = case.duality.bound(rows, None, price)
+            assert float(found.mid()) == pytest.approx(least, abs=1e-12)
+            assert float(found.rad()) < 1e-20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["alone", "known"])
+def test_errors_of_execution_push_as_much_as_fine_pieces_of_either_sign(name: str) -> None:
+    made, shares = kind(name), np.array([0.1, 0.25])
+    wall, times, heights = walls(name, "fixed", made)
+    fine = replace(made.motion, breakpoints=np.linspace(0.0, HORIZON, 129), _steps={})
+    size = np.abs(made.u).T[np.searchsorted(ENDS, fine.breakpoints[:-1], side="right") - 1] * shares
+    heights = heights + [(np.abs(fine.weights(DIRECTIONS, float(t)).control) * size).sum(axis=(1, 2)) for t in times]
+    proof = {"proof": {"path": {"tolerance": 1e-9, "lower": [[times[0]]], "upper": [[times[-1]]]}}}
+    highest = heights.max(axis=0) + 5e-3
+    case = made.case(proof, path=[wall(highest)], execution=shares)
+    assert "margin" in constraints.bounded(case, case.windows[0])
+    for i in (0, 2):
+        near = highest.copy()
+        near[i] -= 6e-3
+        case = made.case(proof, path=[wall(near)], execution=shares)
+        with pytest.raises(Broken, match="exceeded"):
+            constraints.bounded(case, case.windows[0])
