@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 import sparserob_core as sr
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.measurable import Execution
+from sparserob_core.checker.reach.measurable import APART, Execution
 
 A = np.array([[0.0, 1.0], [-4.0, -0.3]])
 B = np.array([[0.2, 0.0], [1.0, -0.7]])
@@ -88,3 +88,28 @@ def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(execution: Ex
         off = (path - (1 - share) * path[0] - share * path[-1]).max()
         ratios.append(off / execution.bent(C, start, stop))
     assert 0.5 < max(ratios) <= 1.0
+
+
+def test_an_integral_allows_for_where_its_end_is_among_the_parts(execution: Execution) -> None:
+    low, high = execution.integrals(C, np.array([0.41]))
+    heights = np.array([abs(_height(0.41, j)) for j in range(2)])
+    assert (high[0] - low[0] >= APART * 3.0 * heights).all()
+
+
+def test_what_is_added_at_least_counts_only_what_is_sure(execution: Execution) -> None:
+    low, high = execution.integrals(C, np.maximum(1.7 - POINTS, 0.0))
+    assert (execution.least(C, 1.7) <= np.maximum(SHARES * (low[:-1] - high[1:]), 0.0)).all()
+
+
+def test_sums_and_jumps_are_off_by_what_is_rounded(execution: Execution) -> None:
+    which, change, off = execution.jumps
+    low, high = execution.integrals(C, np.maximum(2.9 - POINTS[which], 0.0))
+    up, down = np.maximum(change, 0.0), np.minimum(change, 0.0)
+    size, found = float((np.abs(change) * high).sum()), execution.added(C, 2.9)
+    assert found[0] <= (up * low + down * high).sum() - 1e-15 * size
+    assert found[1] >= (up * high + down * low).sum() + 1e-15 * size
+    assert (off >= 1e-16 * np.abs(change)).all()
+    assert (
+        off[np.abs(CONTROL.T[which]) > 0.0]
+        >= 2e-16 * (SHARES * np.abs(CONTROL.T[which]))[np.abs(CONTROL.T[which]) > 0.0]
+    ).all()

@@ -8,6 +8,8 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.enclosures.comparison import block_norms
+from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.measurable import Execution, ExecutionCellSupport
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 
@@ -138,3 +140,20 @@ def test_a_constraint_is_the_same_in_any_units(units: float) -> None:
     np.testing.assert_allclose(
         constraint(scaled).at(x * units, indices), constraint(model()).at(x, indices), atol=1e-12
     )
+
+
+def test_the_sum_over_jumps_allows_for_its_rounding(execution: Execution) -> None:
+    at = np.array([2.9]), np.array([[1.0, -0.4]])
+    low, high = execution.enclosed(CONTROL, *at)[0]
+    assert high - low >= 1e-14 * execution.added(CONTROL, *at)[0]
+
+
+def test_no_error_brings_a_state_further_than_is_said() -> None:
+    functionals, H = model().functionals, np.array([[1.0, -0.4], [0.3, 1.0]])
+    leg = functionals.legs(np.zeros(0), np.zeros(0))[0]
+    assert functionals.execution is not None and isinstance(leg, LiftedSystem)
+    full = np.ones_like(CONTROL)
+    support = ExecutionCellSupport(functionals.execution, full, H, leg)
+    ends = leg.grid.breakpoints[1:]
+    made = functionals.execution.added(full, np.repeat(ends, 2), np.tile(H, (ends.size, 1))).reshape(-1, 2)
+    assert (made <= support.reached @ block_norms(H @ leg.transform, leg.starts).T * (1 + 1e-12)).all()
