@@ -3,12 +3,15 @@ time."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.enclosures.comparison import block_norms
+from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.measurable import Execution, ExecutionCellSupport
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
@@ -157,3 +160,24 @@ def test_no_error_brings_a_state_further_than_is_said() -> None:
     ends = leg.grid.breakpoints[1:]
     made = functionals.execution.added(full, np.repeat(ends, 2), np.tile(H, (ends.size, 1))).reshape(-1, 2)
     assert (made <= support.reached @ block_norms(H @ leg.transform, leg.starts).T * (1 + 1e-12)).all()
+
+
+def test_ages_and_their_sum_are_rounded_outwards(execution: Execution) -> None:
+    class Exact:
+        """An integral that is its age, without an error."""
+
+        def __init__(self) -> None:
+            self.asked: list[np.ndarray] = []
+
+        def enclosed(self, ages: np.ndarray, rows: np.ndarray) -> np.ndarray:
+            self.asked.append(ages)
+            return np.stack([ages, ages], axis=1)
+
+    mine, exact = replace(execution), Exact()
+    mine.__dict__["_supports"] = [exact, None]
+    low, high = mine.enclosed(CONTROL, np.array([2.9]), np.array([[1.0, -0.4]]))[0]
+    below, above = exact.asked
+    assert (below[above > 1e-300] < above[above > 1e-300]).all()
+    which, change = mine.jumps(CONTROL)
+    size = float(np.abs(change[0]) @ (2.9 - mine.breakpoints[which]).clip(0.0))
+    assert high - low >= 2.0 * rounding(4 * which.size + 8) * size
