@@ -8,12 +8,8 @@ multipliers alone (`checker`).
 from __future__ import annotations
 
 import heapq
-import os
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +18,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import NO_BOUND, Branch, Dual, Leaf
 from sparserob_core.sip.finite import HIGHS, NOBODY, FiniteProgram
 from sparserob_core.sip.inner.duality import farkas_margin, proving
+from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.solve import elastic_program, unrelaxed
 from sparserob_core.sip.inner.vertex import Corner, simplex
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -255,7 +252,7 @@ def proposed(
         for part, low, high in plain
         if part.shape[0]
     ]
-    with _silent():
+    with silent():
         found = milp(
             np.concatenate([np.zeros(n), cost]),
             constraints=couplings,
@@ -264,24 +261,6 @@ def proposed(
             options={"time_limit": SECONDS if left is None else min(SECONDS, left), "mip_rel_gap": gap},
         )
     return None if found.x is None else np.asarray(found.x[:n])
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Nothing of what is written to the standard output meanwhile: HiGHS leaves remarks there, whatever it is told."""
-    try:
-        sys.stdout.flush()
-        kept = os.dup(1)
-    except (OSError, AttributeError, ValueError):  # there is none
-        yield
-        return
-    try:
-        with Path(os.devnull).open("wb") as nowhere:
-            os.dup2(nowhere.fileno(), 1)
-        yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
 
 
 def _off_or_on(S: Any, finite: FiniteProgram, prices: Array, together: np.ndarray) -> tuple[Array, list[Any]]:

@@ -25,6 +25,7 @@ from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows
 from sparserob_core.sip.inner.duality import Terms, without_norms
+from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.simplex.tangents import Tangents
 from sparserob_core.sip.solver import Asked, QuadraticProgram
 
@@ -370,7 +371,8 @@ class Growing:
         import highspy
 
         self.asked, self.by = asked, HIGHS
-        self.highs: Any = highspy.Highs()
+        with silent():
+            self.highs: Any = highspy.Highs()
         self.columns = self.count = 0
         self.refused = False
         self.work = 0.0  # of the last solution: entries times steps
