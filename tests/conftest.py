@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,14 @@ gc.set_threshold(50_000, 20, 20)
 def pytest_collection_finish() -> None:
     """What modules and thousands of collected tests hold need not be searched for cycles again and again."""
     gc.freeze()
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave out slow tests that have not begun at ``SPARSEROB_UNTIL``, in seconds since 1970: a run with a limit
+    ends by itself, and says how many tests are left. Without it all are run."""
+    until = os.environ.get("SPARSEROB_UNTIL")
+    if until is not None and item.get_closest_marker("slow") is not None and time.time() > float(until):
+        pytest.skip("the time of this run is over; make test-slow runs it")
 
 
 @pytest.fixture(scope="session")
