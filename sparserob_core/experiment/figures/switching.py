@@ -50,6 +50,9 @@ class Switching:
         program = self.program
         if not self.known or (program.A is not None and (mu is None or mu.size != len(np.atleast_2d(program.A)))):
             return None
+        names = {family.name for family in program.families}
+        if any(cut.family not in names for cut in cuts):  # a method may impose what is no constraint of the program
+            return None
         total = np.zeros(program.n)
         for cut in cuts:
             if program.family(cut.family).defines:  # it says what the price is
