@@ -141,7 +141,7 @@ def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, frame: Array, c
     them, and that part of the path."""
     during = (data.times >= limit.times[0]) & (data.times <= limit.times[-1])
     unit = f" {plain(data.names.time)}" if data.names.time else ""
-    said = f"{plain(limit.name)}, $t$ from {limit.times[0]:.4g} to {limit.times[-1]:.4g}{unit}"
+    said = f"{plain(limit.name)}, $t$ from {limit.times[0]:.6g} to {limit.times[-1]:.6g}{unit}"
     ax.plot(*path[during].T, color=colour, linewidth=4.0, alpha=0.6, zorder=2.5, solid_capstyle="butt", label=said)
     if not limit.moves:
         allowed = clipped(frame, limit.normals, limit.bounds[0])
@@ -181,7 +181,7 @@ def _marks(ax: Axes, data: FigureData, path: Array) -> None:
     for number, (time, place) in enumerate(zip(at, marked, strict=True)):
         crowded = (np.abs(marked[:number] - place).max(axis=1) < near).any()
         ax.annotate(
-            f"{time:.4g}{unit}",
+            f"{time:.6g}{unit}",
             place,
             xytext=(5, -13) if crowded else (5, 5),
             textcoords="offset points",
