@@ -30,7 +30,8 @@ def cheap(config: str) -> dict[str, object]:
     changes: dict[str, object] = {"limits.seconds": 20.0} if "limits" in plain else {}
     for name, dictionary in plain["dictionaries"].items():
         if dictionary and dictionary.get("pieces"):
-            changes[f"dictionaries.{name}.pieces"] = 16 if dictionary["name"] in ("haar", "walsh") else 20
+            most = 16 if dictionary["name"] in ("haar", "walsh") else 20
+            changes[f"dictionaries.{name}.pieces"] = min(dictionary["pieces"], most)
     if plain["method"]["name"] == "sparserob":
         changes |= {"method.indices": 4, "maximiser.budget": BUDGET, "continuation": {"start": 0.1, "stop": 0.01}}
     if plain["method"]["name"] == "scenario":

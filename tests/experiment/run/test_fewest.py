@@ -79,6 +79,6 @@ def test_an_interval_whose_search_ended_early_holds_as_far_as_it_came(
     whole = interval(tmp_path / "whole", monkeypatch)[0]["fewest_active"]
     early, handed = interval(tmp_path / "early", monkeypatch, cells={}, rounds=1)
     assert not handed["examined"]
-    assert 0.0 <= early["fewest_active"]["lower"] <= whole["lower"]
+    assert 0.0 <= early["fewest_active"]["lower"] <= whole["lower"] + 1e-12  # the last digits of two sums
     assert early["fewest_active"]["upper"] >= whole["upper"]
     assert sr.check(tmp_path / "early").status == "verified"
