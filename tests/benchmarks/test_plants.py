@@ -4,7 +4,6 @@ nodes. Skipped where the folder that SPARSEROB_PLANTS names is absent."""
 from __future__ import annotations
 
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -17,9 +16,9 @@ import pytest
 import yaml
 from scipy.linalg import expm
 from scipy.optimize import linprog
-from scipy.sparse import csr_array
 
-PLANTS = Path(os.environ.get("SPARSEROB_PLANTS", "plants"))
+from tests.support.places import matrices, needs_plants
+
 PER_PIECE = 50  # nodes of the naive program
 LARGEST: dict[str, tuple[float, float]] = {  # seconds of the processor and MB, of the command and of its check
     "building": (4.0, 300.0),
@@ -29,19 +28,8 @@ LARGEST: dict[str, tuple[float, float]] = {  # seconds of the processor and MB, 
 
 pytestmark = [
     pytest.mark.benchmark,
-    pytest.mark.skipif(not PLANTS.is_dir(), reason="SPARSEROB_PLANTS names no folder of plants"),
+    needs_plants,
 ]
-
-
-def matrices(plant: str) -> dict[str, np.ndarray]:
-    data = np.load(PLANTS / f"{plant}.npz")
-    parts = ("data", "indices", "indptr", "shape")
-    return {
-        key: csr_array(
-            (tuple(data[f"{key}_{part}"] for part in parts[:3])), shape=tuple(data[f"{key}_shape"])
-        ).toarray()
-        for key in "ABC"
-    }
 
 
 def stated(plant: str) -> dict[str, Any]:

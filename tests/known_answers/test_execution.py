@@ -70,18 +70,20 @@ def test_the_cost_is_that_of_an_independent_linear_program(finished: Path) -> No
     assert json.loads((finished / "result.json").read_text())["cost"] == pytest.approx(independent(), rel=2e-6)
 
 
+STRAIGHT: dict[str, Any] = {  # x' = u: what is delivered must be from 0.9 to 1.1, so that a share of 0.1 is the largest
+    "name": "linear",
+    "system": {"A": [[0]], "B": [[1]]},
+    "horizon": 2.0,
+    "initial_state": [-1],
+    "control": {"box": 1.0},
+    "terminal": [{"box": 0.1}],
+    "execution": 0.05,
+}
+
+
 def test_a_push_that_may_fall_short_is_stronger(tmp_path: Path) -> None:
     # x' = u, from -1 to at most 0.1 away from 0: the mean of u is at least 0.9 / (1 - 0.05)
-    problem = {
-        "name": "linear",
-        "system": {"A": [[0]], "B": [[1]]},
-        "horizon": 2.0,
-        "initial_state": [-1],
-        "control": {"box": 1.0},
-        "terminal": [{"box": 0.1}],
-        "execution": 0.05,
-    }
-    assert verified(tmp_path / "run", problem, pieces(4))["cost"] == pytest.approx(0.9 / 0.95, rel=1e-9)
+    assert verified(tmp_path / "run", STRAIGHT, pieces(4))["cost"] == pytest.approx(0.9 / 0.95, rel=1e-9)
 
 
 def test_the_worst_errors_reach_the_walls_and_no_others_pass_them(finished: Path) -> None:
@@ -198,17 +200,6 @@ def test_the_tube_of_a_result_holds_every_error_and_no_more() -> None:
     moved = np.stack([-np.diff(left**2 / 2, axis=1) @ size, -np.diff(left, axis=1) @ size])
     assert tube.upper - tube.nominal == pytest.approx(moved, abs=1e-12)
     assert tube.nominal - tube.lower == pytest.approx(moved, abs=1e-12)
-
-
-STRAIGHT: dict[str, Any] = {  # x' = u: what is delivered must be from 0.9 to 1.1, so that a share of 0.1 is the largest
-    "name": "linear",
-    "system": {"A": [[0]], "B": [[1]]},
-    "horizon": 2.0,
-    "initial_state": [-1],
-    "control": {"box": 1.0},
-    "terminal": [{"box": 0.1}],
-    "execution": 0.05,
-}
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -43,6 +43,20 @@ def finer(grid: TimeGrid, times: Array) -> TimeGrid:
     return grid.refined(times)
 
 
+class Motion(Protocol):
+    """What a system does on a piece, on which its inputs are constant, in coordinates of its own."""
+
+    def enter(self, states: Array) -> Array:
+        """The coordinates of ``states (n, d)``."""
+
+    def leave(self, state: Array) -> Array:
+        """The states ``(d, n)`` of coordinates."""
+
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array | None) -> Array:
+        """The coordinates at the end of a ``piece`` that begins in ``state``, under ``control (m, n or 1)`` and
+        ``disturbance (mw, n)``."""
+
+
 def walk(
     response: Response,
     control: Array | Callable[[int, Array], Array],
@@ -57,95 +71,108 @@ def walk(
     ``None``) on the pieces that the grid refers to,
     ``parameters (n, nu)``: the variation of constants over each piece, in which both inputs are constant.
     """
-    grid = response.grid
-    if grid.varying:
-        yield from _walk_varying(response, control, parameters.shape[0], disturbances, initial_states)
-        return
-    modes = [
-        [np.moveaxis(matrix, 0, -1) if parameters.shape[1] else matrix[0] for matrix in mode.matrices(points)]
-        for points in [parameters if parameters.shape[1] else parameters[:1]]
-        for mode in response.system.modes
-    ]
+    grid, motion = response.grid, _motion(response, parameters)
+    if initial_states is None:
+        initial_states = np.repeat(response.initial_state[None], parameters.shape[0], axis=0)
     signal = None if disturbances is None else np.ascontiguousarray(disturbances.transpose(2, 1, 0))
-    lengths, which = grid.distinct(grid.lengths)
-    if not parameters.shape[1] and grid.mode is None and lengths.size * 4 * response.system.states**2 > HELD:
-        yield from _walk_by_modes(response, control, parameters.shape[0], disturbances, initial_states)
-        return
-    state = np.repeat(response.initial_state[:, None], parameters.shape[0], axis=1)
-    if initial_states is not None:
-        state = np.ascontiguousarray(initial_states.T)
-    yield state
-    before, sigma, mode = (-1, -1, -1, -1), np.zeros(0), -1
-    driven = np.zeros(0)
-    for piece in range(grid.pieces):
-        acting = 0 if grid.mode is None else int(grid.mode[piece])
-        if acting != mode:
-            mode, (A, B, W) = acting, modes[acting]
-            flows, integrals = _transitions(A, lengths)
-        inputs = (int(which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]), mode)
-        if inputs != before:
-            if callable(control):
-                driven = control(inputs[1], state) if inputs[1] != before[1] else driven
-            else:
-                driven = control[:, inputs[1], None]
-            drive = _times(B, driven)
-            sigma, before = (
-                _times(integrals[inputs[0]], drive if signal is None else drive + _times(W, signal[inputs[2]])),
-                inputs,
-            )
-        state = _times(flows[inputs[0]], state) + sigma
-        yield state
-
-
-def _walk_by_modes(
-    response: Response,
-    control: Array | Callable[[int, Array], Array],
-    count: int,
-    disturbances: Array | None,
-    initial_states: Array | None,
-) -> Iterator[Array]:
-    """`walk` of a known system with many states on pieces of many lengths, in coordinates in which its modes are apart:
-    no matrix is held for a length."""
-    grid = response.grid
-    A, B, W = (part[0] for part in response.system.modes[0].matrices(np.zeros((1, 0))))
-    basis = decoupled(A)
-    flows, inverse = Flows(basis, basis.normal_form(basis.matrix(A)[0])), basis.inverse.astype(float)
-    B, W = inverse @ B, inverse @ W
-    begun = np.repeat(response.initial_state[None], count, axis=0) if initial_states is None else initial_states
-    yield begun.T.copy()
-    state = begun @ inverse.T
-    for piece, length in enumerate(grid.lengths.tolist()):
-        acting = int(grid.control_piece[piece])
-        driven = control(acting, basis.transform @ state.T) if callable(control) else control[:, acting, None]
-        drive = np.broadcast_to(_times(B, driven).T, state.shape)
-        if disturbances is not None:
-            drive = drive + disturbances[:, :, grid.disturbance_piece[piece]] @ W.T
-        state = flows.columns(state, drive, np.full(count, length))
-        yield basis.transform @ state.T
-
-
-def _walk_varying(
-    response: Response,
-    control: Array | Callable[[int, Array], Array],
-    count: int,
-    disturbances: Array | None,
-    initial_states: Array | None,
-) -> Iterator[Array]:
-    """`walk` of a system that changes with time, which is known."""
-    grid, steps = response.grid, response.steps(np.zeros((1, 0)))
-    state = np.repeat(response.initial_state[:, None], count, axis=1)
-    state = state if initial_states is None else np.ascontiguousarray(initial_states.T)
-    yield state
-    decided, before = np.zeros(0), -2
-    for piece, (B, E) in enumerate(zip(grid.of_modes(steps.B[0]), grid.of_modes(steps.E[0]), strict=True)):
-        acting = int(grid.control_piece[piece])
+    state = motion.enter(initial_states)
+    now = motion.leave(state)
+    yield now
+    decided, before = np.zeros(0), -1
+    for piece, (acting, pushing) in enumerate(
+        zip(grid.control_piece.tolist(), grid.disturbance_piece.tolist(), strict=True)
+    ):
         if acting != before:
-            decided, before = control(acting, state) if callable(control) else control[:, acting, None], acting
-        drive = B @ decided
-        if disturbances is not None:
-            drive = drive + E @ disturbances[:, :, grid.disturbance_piece[piece]].T
-        state = steps.Phi[0, piece] @ state + steps.Gamma[0, piece] @ drive
-        yield state
+            decided, before = control(acting, now) if callable(control) else control[:, acting, None], acting
+        state = motion.step(piece, state, decided, None if signal is None else signal[pushing])
+        now = motion.leave(state)
+        yield now
+
+
+def _motion(response: Response, parameters: Array) -> Motion:
+    """The way to follow a system that takes the least: ``parameters (n, nu)`` are those of the trajectories."""
+    grid, system = response.grid, response.system
+    if grid.varying:
+        return _InTime(response)
+    many = grid.distinct(grid.lengths)[0].size * 4 * system.states**2 > HELD
+    if many and not parameters.shape[1] and grid.mode is None:
+        return _Apart(response)
+    return _ByMatrices(response, parameters)
+
+
+class _ByMatrices:
+    """A system that is the same on each of its pieces: one transition for every length."""
+
+    def __init__(self, response: Response, parameters: Array) -> None:
+        self.grid = grid = response.grid
+        points = parameters if parameters.shape[1] else parameters[:1]
+        self.modes = [
+            [np.moveaxis(matrix, 0, -1) if parameters.shape[1] else matrix[0] for matrix in mode.matrices(points)]
+            for mode in response.system.modes
+        ]
+        self.lengths, self.which = grid.distinct(grid.lengths)
+        self.mode, self.inputs, self.driven = -1, (-1, -1, -1, -1), np.zeros(0)
+
+    def enter(self, states: Array) -> Array:
+        return np.ascontiguousarray(states.T)
+
+    def leave(self, state: Array) -> Array:
+        return state
+
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array | None) -> Array:
+        grid = self.grid
+        mode = 0 if grid.mode is None else int(grid.mode[piece])
+        A, B, W = self.modes[mode]
+        if mode != self.mode:
+            self.mode, (self.flows, self.integrals) = mode, _transitions(A, self.lengths)
+        inputs = (int(self.which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]), mode)
+        if inputs != self.inputs:  # the pieces that times inside cut one into are driven alike
+            drive = _times(B, control) if disturbance is None else _times(B, control) + _times(W, disturbance)
+            self.inputs, self.driven = inputs, _times(self.integrals[inputs[0]], drive)
+        return _times(self.flows[inputs[0]], state) + self.driven
+
+
+class _Apart:
+    """A known system with many states on pieces of many lengths, in coordinates in which its modes are apart: no matrix
+    is held for a length."""
+
+    def __init__(self, response: Response) -> None:
+        A, B, W = (part[0] for part in response.system.modes[0].matrices(np.zeros((1, 0))))
+        self.lengths, self.basis = response.grid.lengths, decoupled(A)
+        self.flows = Flows(self.basis, self.basis.normal_form(self.basis.matrix(A)[0]))
+        self.inverse = self.basis.inverse.astype(float)
+        self.B, self.W = self.inverse @ B, self.inverse @ W
+
+    def enter(self, states: Array) -> Array:
+        return np.asarray(states @ self.inverse.T)
+
+    def leave(self, state: Array) -> Array:
+        return np.asarray(self.basis.transform @ state.T)
+
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array | None) -> Array:
+        drive = self.B @ control if disturbance is None else self.B @ control + self.W @ disturbance
+        lengths = np.full(state.shape[0], self.lengths[piece])
+        return np.asarray(self.flows.columns(state, np.broadcast_to(drive.T, state.shape), lengths))
+
+
+class _InTime:
+    """A known system that changes with time: the transitions of the pieces."""
+
+    def __init__(self, response: Response) -> None:
+        self.steps, grid = response.steps(np.zeros((1, 0))), response.grid
+        self.B, self.E = list(grid.of_modes(self.steps.B[0])), list(grid.of_modes(self.steps.E[0]))
+
+    def enter(self, states: Array) -> Array:
+        return np.ascontiguousarray(states.T)
+
+    def leave(self, state: Array) -> Array:
+        return state
+
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array | None) -> Array:
+        drive = (
+            self.B[piece] @ control if disturbance is None else self.B[piece] @ control + self.E[piece] @ disturbance
+        )
+        return np.asarray(self.steps.Phi[0, piece] @ state + self.steps.Gamma[0, piece] @ drive)
 
 
 def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:

@@ -12,8 +12,8 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.bound.record import bound_rows_told
+from tests.support.places import matrices, needs_plants
 
-PLANTS = Path(__file__).parents[4] / "shared" / "plants"  # beside the repository, where they are at hand
 OSCILLATOR = {"A": [[0, 1], [-1, 0]], "B": [[0], [1]]}
 
 
@@ -290,36 +290,22 @@ def test_a_run_that_answers_what_it_measures_is_refused(tmp_path: Path) -> None:
         sr.bound(outcome)
 
 
-def plant(name: str) -> dict[str, np.ndarray]:
-    from scipy.sparse import csr_array
-
-    if not (PLANTS / f"{name}.npz").is_file():
-        pytest.skip("the plants are not here")
-    data = np.load(PLANTS / f"{name}.npz")
-    parts = ("data", "indices", "indptr", "shape")
-    return {
-        key: csr_array(
-            (tuple(data[f"{key}_{part}"] for part in parts[:3])), shape=tuple(data[f"{key}_shape"])
-        ).toarray()
-        for key in "ABC"
-    }
-
-
-def stated_plant(matrices: dict, centre: np.ndarray, radius: np.ndarray, inputs: sr.Box, row: np.ndarray, wall: float):
+def stated_plant(plant: dict, centre: np.ndarray, radius: np.ndarray, inputs: sr.Box, row: np.ndarray, wall: float):
     return sr.OptimalControlProblem(
-        system=sr.LinearSystem(matrices["A"], np.zeros((centre.size, 1)), E=matrices["B"]),
+        system=sr.LinearSystem(plant["A"], np.zeros((centre.size, 1)), E=plant["B"]),
         horizon=20.0, initial_state=centre, initial_set=sr.Box(-radius, radius), control=sr.Box([-1.0], [1.0]),
         disturbance=inputs, disturbance_class="measurable",
         path=[sr.PathConstraint(sr.Polytope(np.vstack([row, -row]), [wall, wall]))],
     )  # fmt: skip
 
 
+@needs_plants
 @pytest.mark.slow
 def test_the_building_of_48_states_is_bounded_and_checked(tmp_path: Path) -> None:
     """BLDF01: at t = 0.078 the worst x25 is 4.453677e-3, a little before it more."""
     centre, radius = np.zeros(48), np.zeros(48)
     centre[:10], radius[:10], radius[24] = 2.25e-4, 0.25e-4, 1e-4
-    problem = stated_plant(plant("building"), centre, radius, sr.Box([0.8], [1.0]), np.eye(48)[24], 5e-3)
+    problem = stated_plant(matrices("building"), centre, radius, sr.Box([0.8], [1.0]), np.eye(48)[24], 5e-3)
     found = sr.bound(problem, out=tmp_path / "out")
     top = found.rows[0]
     assert 4.4536e-3 <= top.lower <= top.upper <= 4.456e-3
@@ -327,12 +313,13 @@ def test_the_building_of_48_states_is_bounded_and_checked(tmp_path: Path) -> Non
     assert sr.check(tmp_path / "out").status == "verified"
 
 
+@needs_plants
 @pytest.mark.slow
 def test_the_space_station_of_270_states_is_bounded() -> None:
     """ISSF01: an independent program found 5.98783e-4 at t = 19.228 and -5.96004e-4 at t = 19.612."""
-    matrices = plant("iss")
+    station = matrices("iss")
     inputs = sr.Box([0.0, 0.8, 0.9], [0.1, 1.0, 1.0])
-    problem = stated_plant(matrices, np.zeros(270), np.full(270, 1e-4), inputs, matrices["C"][2], 7e-4)
+    problem = stated_plant(station, np.zeros(270), np.full(270, 1e-4), inputs, station["C"][2], 7e-4)
     found = sr.bound(problem)
     for row, value, time in zip(found.rows, (5.98783e-4, -5.96004e-4), (19.228, 19.612), strict=True):
         assert row.lower - 5e-9 <= value <= row.upper + 5e-9

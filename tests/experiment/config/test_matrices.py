@@ -6,7 +6,6 @@ from __future__ import annotations
 import base64
 import copy
 import io
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from sparserob_core.experiment.config.matrices import files
 from sparserob_core.experiment.config.matrices.packed import pack, unpack
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.sweep.plan import make_plan
+from tests.support.places import PLANTS, needs_plants
 
 A, B = np.array([[0.0, 1.0, 0.0], [-2.0, -0.5, 0.0], [0.0, 0.0, -1.0]]), np.array([[0.0], [1.0], [0.5]])
 WRITTEN: dict[str, Any] = {
@@ -37,7 +37,6 @@ WRITTEN: dict[str, Any] = {
     "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
     "observers": [],
 }
-PLANTS = Path(os.environ.get("SPARSEROB_PLANTS", "plants"))
 
 
 def sparse(name: str, matrix: np.ndarray) -> dict[str, np.ndarray]:
@@ -247,7 +246,7 @@ def test_a_config_in_python_takes_sparse_matrices() -> None:
     assert np.array_equal(problem_of(load_config(config)).system.A, A)
 
 
-@pytest.mark.skipif(not PLANTS.is_dir(), reason="SPARSEROB_PLANTS names no folder of plants")
+@needs_plants
 @pytest.mark.parametrize(
     ("plant", "states"), [("iss", 270), ("building", 48), ("heat", 200), ("pde", 84), ("beam", 348)]
 )
