@@ -67,14 +67,7 @@ def both(config: str, changes: dict[str, object], directory: Path, caplog: pytes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "config",
-    [
-        # a known fault: a recording of it that is shown again is not finished after minutes
-        pytest.param(name, marks=pytest.mark.skip(reason="takes minutes")) if name == "atv_feedback.yaml" else name
-        for name in NAMES
-    ],
-)
+@pytest.mark.parametrize("config", NAMES)
 def test_every_config_is_watched_and_shown_again(config: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     both(config, cheap(config), tmp_path, caplog)
 

@@ -219,6 +219,33 @@ def test_the_map_of_a_policy_goes_through_its_proven_bound_and_nowhere_above_its
         assert least - 1e-6 <= g.at(moved) <= most + 1e-6
 
 
+@pytest.mark.slow
+def test_a_value_of_a_policy_is_computed_in_the_programs_own_units_and_given_up_after_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from sparserob_core.experiment.config.load import load_config
+    from sparserob_core.sip.relaxed.policy_value import PolicyValue
+    from sparserob_rerun.recording.recorder import slots_of
+
+    config = CONFIGS / "atv_feedback.yaml"  # metres and 1e-5 m/s^2, of which a solver makes nothing
+    result = sr.run(config, {}, None, quiet=True, figures=False).result
+    view, programs = sr.Inspection(load_config(config)), []
+    began = PolicyValue.__init__
+    monkeypatch.setattr(
+        PolicyValue, "__init__", lambda value, program: (programs.append(program), began(value, program))[1]
+    )
+    slots = slots_of(list(result.dual.cuts), "literal", len(result.dual.cuts))
+    g = view.relaxed_value(len(slots), 0.0)
+    own = view.program.own_units
+    assert own is not None and programs == [own.program]
+    assert g.at(slots) == pytest.approx(result.lower_bound, rel=1e-7)
+    assert slots[g.deciding()[0], 0] == pytest.approx(6600.0)
+    monkeypatch.setattr("sparserob_core.sip.relaxed.policy_value.LASTING", 0.0)
+    everywhere = slots.copy()
+    everywhere[:, 1:] = np.nan  # at all deviations, for which a solver needs some hundred steps
+    assert np.isnan(g.at(everywhere))
+
+
 def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of_a_better_tuple() -> None:
     from sparserob_rerun.options import LandscapeOptions
     from sparserob_rerun.search.explorer import Aim, Explorer

@@ -217,7 +217,12 @@ class Inspection:
         from sparserob_core.sip.relaxed.policy_value import PolicyValue
 
         assert self.program.spread is not None
-        value, deviations = PolicyValue(self.program), self.program.spread.size
+        # as methods see it: in the program's own units (decision 16)
+        own = self.program.own_units
+        program = self.program if own is None else own.program
+        value, deviations = PolicyValue(program), self.program.spread.size
+        width, cost = 1 + deviations, 1.0 if own is None else own.cost
+        units = np.ones(width) if own is None else UsersUnits(own).tuple_units(width, width)
         times = [family.index_set for family in self.program.families if not family.defines]
         lower, upper = min(float(box.lower[0]) for box in times), max(float(box.upper[0]) for box in times)
         kinds: tuple[CoordinateKind, ...] = ("time", *_repeated("disturbance", deviations))
@@ -229,9 +234,9 @@ class Inspection:
             return np.where(weights[order] > 0.0, order, -1)
 
         return RelaxedValue(
-            value.at,
+            lambda slots: cost * value.at(slots / units),
             value.weights,
-            lambda: np.zeros((value.weights().size, 1 + deviations)),
+            lambda: np.zeros((value.weights().size, width)),
             deciding,
             Box(np.concatenate([[lower], -far]), np.concatenate([[upper], far])),
             ("t", *(f"w{k + 1}" for k in range(deviations))),

@@ -3,6 +3,7 @@ with all of them."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import TypeAlias, final
 
@@ -15,6 +16,10 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 
 Linear: TypeAlias = tuple[Array, Array, np.ndarray]
 """Rows ``G (r, n)``, right-hand sides ``h (r,)``, and which of them ``(r,)`` move with their index."""
+
+LASTING = 10.0
+"""Seconds that one value may take, after which it is not known. Ten times as many, and a recording waits minutes for a
+map that is worth seconds; a tenth, and policies of some hundred pieces have none."""
 
 
 @final
@@ -39,7 +44,7 @@ class PolicyValue:
         self._weights: Array = np.zeros(0)
 
     def at(self, slots: Array) -> float:
-        """The value; ``inf`` where nothing meets the rows, NaN where the solver failed."""
+        """The value; ``inf`` where nothing meets the rows, NaN where the solver failed or takes too long."""
         counterpart = Counterpart(self.program.finite, self.spread)
         plain = [self._at_deviation(slot) for slot in slots if not np.isnan(slot).any()]
         order = [*np.flatnonzero(~np.isnan(slots).any(axis=1)), *np.flatnonzero(np.isnan(slots).any(axis=1))]
@@ -53,9 +58,10 @@ class PolicyValue:
             for rows in blocks:
                 counterpart.add(rows)
             whose.append(self._flags(blocks))
-        answer = counterpart.solve()
+        until = time.monotonic() + LASTING
+        answer = counterpart.solve(seconds=LASTING)
         while answer.solved and counterpart.sharpen(answer.x):
-            answer = counterpart.solve()
+            answer = counterpart.solve(seconds=until - time.monotonic())
         if not answer.solved:
             self._weights = np.zeros(len(slots))
             return np.inf if "infeasible" in answer.said.lower() else np.nan
