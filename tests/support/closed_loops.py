@@ -33,6 +33,10 @@ class Loop:
     measurable: bool = False
     fine: int = 1
     """Into how many parts a piece of the grid is cut here for a measurable disturbance."""
+    C: np.ndarray | None = None
+    """What is seen of the state, with ``noise``, and made an innovation of by ``observer (K, d, p)``."""
+    noise: ConvexSet | None = None
+    observer: np.ndarray | None = None
 
     @property
     def system(self) -> System:
@@ -50,6 +54,7 @@ class Loop:
             disturbance=self.bound,
             disturbance_class="measurable" if self.measurable else "piecewise_constant",
             terminal=[Box(-99.0 * np.ones(d), 99.0 * np.ones(d))],
+            measurements=None if self.C is None else sr.Measurements(self.C, self.noise),
         )
 
     @property
@@ -72,6 +77,7 @@ class Loop:
     def sets(self) -> list[tuple[ConvexSet, np.ndarray]]:
         """The set and the middle of every block of deviations."""
         found = [] if self.bound is None else [(self.bound, self.bound.middle())] * (self.jumps.size - 1)
+        found += [] if self.noise is None else [(self.noise, self.noise.middle())] * (self.breakpoints.size - 1)
         return found if self.begun is None else [*found, (self.begun, self.begun.middle())]
 
     def _step(self, begin: float, lengths: np.ndarray, X: np.ndarray, drive: np.ndarray) -> np.ndarray:
@@ -91,14 +97,16 @@ class Loop:
         d, m = self.B.shape
         width = 0 if self.bound is None else self.E.shape[1]
         blocks = 0 if self.bound is None else self.jumps.size - 1
-        Q = blocks * width + (0 if self.begun is None else d)
+        noises = 0 if self.noise is None else (self.breakpoints.size - 1) * self.noise.dimension
+        Q = blocks * width + noises + (0 if self.begun is None else d)
         middle = np.zeros(self.E.shape[1]) if self.bound is None else self.bound.middle()
         X = np.zeros((d, 1 + Q))
         X[:, 0] = self.start + (0.0 if self.begun is None else self.begun.middle())
         if self.begun is not None:
-            X[:, 1 + blocks * width :] = np.eye(d)
+            X[:, 1 + blocks * width + noises :] = np.eye(d)
         still = self.E @ middle + (0.0 if self.c is None else np.asarray(self.c).ravel())
-        innovations = [np.hstack([np.zeros((d, 1)), X[:, 1:]])]
+        error = np.hstack([np.zeros((d, 1)), X[:, 1:]])
+        innovations = [self._innovation(0, error, 1 + blocks * width)]
         (found, rates), controls = np.zeros((2, times.size, d, 1 + Q)), []
         marks = np.unique(np.concatenate([self.grid, self.jumps]))
         for k, (begin, end) in enumerate(pairwise(self.breakpoints)):
@@ -122,8 +130,25 @@ class Loop:
                 X = after[-1]
             guess = self.B @ U
             guess[:, 0] += still
-            innovations.append(X - self._step(begin, np.array([end - begin]), before, guess)[0])
+            length = np.array([end - begin])
+            entered = X - self._step(begin, length, before, guess)[0]
+            if self.C is not None and self.observer is not None:
+                onward = self._step(begin, length, error, 0.0 * error)[0]
+                error = onward - self.observer[k] @ innovations[k] + entered
+            else:
+                error = entered
+            if end < marks[-1]:
+                innovations.append(self._innovation(k + 1, error, 1 + blocks * width))
         return found, rates, np.array(controls)
+
+    def _innovation(self, j: int, error: np.ndarray, noises: int) -> np.ndarray:
+        """What is seen at a breakpoint beyond what was predicted, ``(p, 1 + Q)``; entries of the noise begin at
+        ``noises``."""
+        seen = error.copy() if self.C is None else self.C @ error
+        if self.noise is not None:
+            place = noises + j * self.noise.dimension
+            seen[:, place : place + self.noise.dimension] += np.eye(self.noise.dimension)
+        return seen
 
     def height(self, along: np.ndarray) -> np.ndarray:
         """The largest ``a_0 + a'z`` over all deviations, for ``(..., 1 + Q)``."""
@@ -198,7 +223,7 @@ def gains(rng: np.random.Generator, loop: Loop, size: float = 0.4) -> tuple[np.n
     """A random nominal control ``(m, K)`` and gains ``(K, K, m, d)`` that know the past only."""
     d, m = loop.B.shape
     K = loop.breakpoints.size - 1
-    M = size * rng.normal(size=(K, K, m, d))
+    M = size * rng.normal(size=(K, K, m, d if loop.C is None else len(loop.C)))
     M[np.triu_indices(K, 1)] = 0.0
     return rng.uniform(-1, 1, size=(m, K)), M
 
@@ -221,6 +246,12 @@ LOOPS = {
     "fast": Loop(
         FAST, FORCE, GUST, np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 2.0]), np.array([1.0, 0.0]), TRIANGLE,
         Box(np.array([-0.1, -0.05]), np.array([0.05, 0.1])),
+    ),
+    "outputs": Loop(
+        SLOW, FORCE, GUST, np.array([0.0, 0.5, 1.25, 2.0]), np.array([0.0, 0.7, 2.0]), np.array([-1.0, 0.5]),
+        Box(np.array([-0.1, 0.0]), np.array([0.2, 0.1])), Box(np.array([-0.1, -0.05]), np.array([0.05, 0.1])),
+        C=np.array([[1.0, 0.5]]), noise=Box(np.array([-0.03]), np.array([0.05])),
+        observer=np.array([[[0.5], [-0.25]], [[0.75], [0.125]], [[0.25], [1.0]]]),
     ),
     "begun": Loop(
         np.array([[0.0, 1.0], [0.0, 0.0]]), FORCE, FORCE, np.linspace(0.0, 2.0, 4), np.linspace(0.0, 2.0, 4),

@@ -14,9 +14,10 @@ from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from tests.support.closed_loops import exponentials
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +43,7 @@ class Motion:
     breakpoints: Array
     changes: Array
     delay: float = 0.0
-    _steps: dict[tuple[int, float], Array] = field(default_factory=dict)
+    _steps: dict[tuple[float, float], Array] = field(default_factory=dict)
 
     @cached_property
     def acting(self) -> list[float]:
@@ -58,7 +59,7 @@ class Motion:
         cuts = {0.0, time, *(t for t in (*self.ends, *self.acting, *map(float, self.changes)) if 0.0 < t < time)}
         for begin, end in reversed(list(pairwise(sorted(cuts)))):
             leg = bisect_right(self.ends, begin)
-            given = v @ self._step(leg, end - begin)
+            given = v @ self._step(leg, begin, end - begin)
             v, inputs = given[:, :d], given[:, d:]
             k = bisect_right(self.acting, begin) - 1
             if k < 0:
@@ -70,9 +71,9 @@ class Motion:
             drift += inputs[:, -1]
         return Weights(v, control, before, drift, blocks)
 
-    def _step(self, leg: int, length: float) -> Array:
+    def _step(self, leg: int, begin: float, length: float) -> Array:
         """The transition and the integrals of the inputs, ``(d, d + m + mw + 1)``."""
-        key = leg, round(length, 12)
+        key = float(leg), round(length, 12)
         if key not in self._steps:
             A, B, E, c = self.legs[leg]
             M, d = np.hstack([B, E, c[:, None]]), len(A)
@@ -90,6 +91,27 @@ class Motion:
         if bound is not None:
             total = total + bound.support(w.blocks).sum(axis=1)
         return np.asarray(total if begun is None else total + begun.support(w.free))
+
+
+@dataclass(frozen=True, eq=False)
+class Varying(Motion):
+    """``x' = (1 + t) A x + (1 - t / 4) (B u + E w + c)``: the transition is the exponential of ``A`` times the integral
+    of its factor, what the inputs do is integrated by Gauss' rule."""
+
+    RATE, FACTOR = "(1 + t)", "(1 - t/4)"
+
+    def _step(self, leg: int, begin: float, length: float) -> Array:
+        key = round(begin, 12), round(length, 12)
+        if key not in self._steps:
+            A, B, E, c = self.legs[leg]
+            points, weights = np.polynomial.legendre.leggauss(16)
+            end, within = begin + length, begin + length * (1.0 + points) / 2.0
+            grown = (end - within) * (1.0 + (end + within) / 2.0)
+            onward = exponentials(A * np.append(grown, length * (1.0 + begin + length / 2.0))[:, None, None])
+            share = length / 2.0 * weights * (1.0 - within / 4.0)
+            forced = np.tensordot(share, onward[:-1], axes=1) @ np.hstack([B, E, c[:, None]])
+            self._steps[key] = np.hstack([onward[-1], forced])
+        return self._steps[key]
 
 
 HORIZON = 2.0
@@ -146,14 +168,22 @@ def kind(name: str) -> Kind:
     if name == "late":
         delay = 0.375
         system = replace(system, delay=delay)
+    if name == "varying":
+        delay = 0.375
+        parts = [
+            [[f"{x!r}*{factor}" for x in row] for row in np.atleast_2d(M).tolist()]
+            for M, factor in zip((A, B, E, C), (Varying.RATE, *[Varying.FACTOR] * 3), strict=True)
+        ]
+        system = VaryingSystem.of(parts[0], parts[1], HORIZON, parts[2], parts[3][0], delay=delay)
     if name == "alone":
         legs, system = [(A, B, E, 0.0 * C)], LinearSystem(A, B, E)
-    motion = Motion(legs, ends, START, ENDS, CHANGES if name != "alone" else np.zeros(0), delay)
+    moves = Varying if name == "varying" else Motion
+    motion = moves(legs, ends, START, ENDS, CHANGES if name != "alone" else np.zeros(0), delay)
     u = np.array([[0.5, -1.0, 1.5], [-2.0, 0.25, -0.5]])
     return Kind(motion, system, None if name == "alone" else BEGUN, None if name == "alone" else BOUND, u)
 
 
-KINDS = ("alone", "known", "turning", "late")
+KINDS = ("alone", "known", "turning", "late", "varying")
 
 
 def walls(name: str, which: str, made: Kind) -> tuple[Any, Array, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -192,13 +193,17 @@ class Case:
         )
         return [*every[(every < last) & ~np.isin(every, ends)].tolist(), last]
 
+    def piece_at(self, time: float) -> int:
+        """The piece of the `grid` that holds a time from 0 on; the last one holds the end too."""
+        return min(bisect_right(self.grid, time) - 1, len(self.grid) - 2)
+
     @cached_property
     def varying(self) -> VaryingFlow:
         """The flow of a system that changes with time; raises `Unchecked` for another one."""
         system = self.problem.system
         if not isinstance(system, VaryingSystem):
             raise Unchecked("the system does not change with time")
-        return VaryingFlow(system, max(self.grid[-1], self.problem.horizon))
+        return VaryingFlow(system, self.grid[-1])
 
     @property
     def changing(self) -> VaryingFlow | None:

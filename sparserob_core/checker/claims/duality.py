@@ -159,8 +159,9 @@ class Duality:
         if self.varying is not None:
             begins = sorted({0.0, *(s for s in jumps if s < time)})
             weights, row = self.varying.weights([*begins, time]), stacked([[_exact(c) for c in direction]])
-            late = [[_exact(0.0)] * self.problem.system.disturbances for s in jumps if s >= time]
-            return [(row * one).entries() for one in weights.disturbance] + late
+            given = {s: (row * one).entries() for s, one in zip(begins, weights.disturbance, strict=True)}
+            late = [_exact(0.0)] * self.problem.system.disturbances
+            return [given[s] if s < time else late for s in jumps]
         every = flows(self.problem.system, ())
         parts = every[0].parts
         first, mw = direction.size + parts["B"][0].ncols(), parts["E"][0].ncols()

@@ -404,7 +404,7 @@ class FeedbackClaims:
         flat = window.seen.facets
         if flat is None:
             raise Unchecked("the worst direction of a curved set is not told")
-        piece = min(max(bisect_right(case.grid, time) - 1, 0), len(case.grid) - 2)
+        piece = case.piece_at(time)
         seen = _Sides(loop, window, flat, np.ones(len(flat)))
         at = [int(np.searchsorted(loop.breakpoints, time, side=side)) - 1 for side in ("left", "right")]
         at = [min(max(k, 0), case.control.pieces - 1) for k in at]
@@ -441,7 +441,7 @@ class FeedbackClaims:
             return _dot(direction, [row[0] + _along(row[1:], z) for row in acting.tolist()]) - limit, TOLERANCE * unit
         if not window.start <= time <= window.stop:
             raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
-        piece = min(max(bisect_right(case.grid, time) - 1, 0), len(case.grid) - 2)
+        piece = case.piece_at(time)
         state, limit = loop.state(piece, time).tolist(), window.limit(direction, time)
         if window.is_mixed:
             said = data.get("piece")
@@ -459,13 +459,11 @@ class FeedbackClaims:
 
     def disturbed(self, direction: Array, time: float, limit: arb) -> arb:
         """By how much ``c'x(t)`` exceeds a limit without any control, for the worst disturbance and initial state."""
-        loop, grid = self.at_rest, self.case.grid
-        piece = min(max(bisect_right(grid, time) - 1, 0), len(grid) - 2)
-        return loop.highest(piece, time, direction[None])[0] - limit
+        return self.at_rest.highest(self.case.piece_at(time), time, direction[None])[0] - limit
 
     def farthest(self, c: Array, gain: Array, time: float, k: int | None) -> arb:
         """The largest ``c'x(t) + gain'u``, ``u`` the control on piece ``k``, over all deviations."""
-        piece = min(max(bisect_right(self.case.grid, time) - 1, 0), len(self.case.grid) - 2)
+        piece = self.case.piece_at(time)
         beside = None if k is None else stacked([balls(gain)]) * self.loop.inputs(k)
         return self.loop.highest(piece, time, c[None], beside)[0]
 

@@ -43,6 +43,8 @@ def made(name):
         case.changes[:-1].tolist(),
         case.bound,
         case.begun,
+        measured=case.problem.measurements,
+        observer=case.observer,
     )
     return case, loop, v, M
 

@@ -30,6 +30,8 @@ def made(name):
     rng = np.random.default_rng(1)
     x = np.zeros(model.program.n)
     x[: loop.nominal_size] = rng.uniform(-1, 1, size=loop.nominal_size)
+    if loop.observer is not None:
+        case = dataclasses.replace(case, observer=loop.observer.L)
     answers = loop.answers.variables
     x[loop.nominal_size : loop.nominal_size + answers] = 0.2 * rng.normal(size=answers)
     return case, loop, x
@@ -242,6 +244,17 @@ def test_the_signal_of_the_worst_deviation_takes_the_state_there(name):
             assert (begun == case.start).all()
         else:
             assert case.begun.contains((begun - case.start)[None], 1e-9)[0]
+        if case.C is not None:
+            z = np.concatenate(
+                [
+                    (values.T[np.searchsorted(ends, case.changes[:-1])] - case.bound.middle()).ravel(),
+                    loop.noises(deviation).ravel() - case.noise.middle(),
+                    begun - case.start - case.begun.middle(),
+                ]
+            )
+            states = case.states(loop.nominal(x), loop.gains(x), np.array([time - 1e-13]))[0][0]
+            assert c @ (states[:, 0] + states[:, 1:] @ z) == pytest.approx(case.height(c @ states), abs=1e-9)
+            continue
         driven = dataclasses.replace(case, changes=ends, start=begun, begun=None, measurable=False)
         # innovations are counted from the middle of the initial states
         gains, v = loop.gains(x), loop.nominal(x)
