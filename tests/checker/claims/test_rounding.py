@@ -11,8 +11,7 @@ import pytest
 from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.jets import Monomials
-from sparserob_core.checker.claims import activity
-from sparserob_core.checker.claims.cells import _tops
+from sparserob_core.checker.claims import activity, cells, window
 from sparserob_core.checker.claims.window import _plus
 from sparserob_core.checker.reach.tube import Polynomial
 from tests.support.worst_cases import kind, walls
@@ -49,22 +48,44 @@ def test_a_sum_of_polynomials_is_off_by_no_more_than_it_says() -> None:
         assert found.error <= (error + lost) * (1.0 + 1e-11) + 1e-15 * (np.abs(own).sum() + np.abs(more).sum())
 
 
+@pytest.mark.parametrize("lost", ["conversion", "products"])
+def test_each_allowance_beside_a_row_covers_its_own_loss_alone(lost: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of numbers that are converted and not multiplied, and of products and sums of exact ones."""
+    made, rng = kind("known"), np.random.default_rng(3)
+    case = made.case(path=[walls("known", "moving" if lost == "conversion" else "mixed", made)[0](np.full(4, 9.0))])
+    basis, gains = (np.eye(2), np.zeros((2, 0))) if lost == "conversion" else (np.zeros((2, 2)), np.eye(2))
+    beside = case.beside(case.windows[0], basis, gains)
+    assert beside is not None
+    monkeypatch.setattr(window, "HALF_ULP", 0.0)
+    monkeypatch.setattr(window, "OUTWARD", 1.0)
+    if lost == "conversion":
+        monkeypatch.setattr(window, "rounding", lambda count: 0.0)
+    for _ in range(60):
+        start = float(rng.uniform(0.3, 0.45))
+        z = np.array([[1.0, 0.0], [0.0, -1.0]]) if lost == "conversion" else rng.normal(size=(2, 2))
+        (offset, _), u = case.windows[0].moved(start, start), [arb(float(v)) for v in made.u[:, 0]]
+        beside_it = [-x for x in offset] if lost == "conversion" else u
+        for poly, row in zip(beside.added([polynomial([0.0])] * 2, start, start, z), z, strict=True):
+            truth = sum((arb(float(a)) * x for a, x in zip(row, beside_it, strict=True)), arb(0))
+            assert abs(truth - arb(float(poly.coefficients[0, 0]))) <= arb(poly.error)
+
+
 @pytest.mark.parametrize("which", ["moving", "mixed"])
 def test_what_stands_beside_a_row_is_off_by_no_more_than_it_says(which: str) -> None:
     """Rows that nearly cancel, at times that are no numbers of few bits."""
     made, rng = kind("known"), np.random.default_rng(2)
     wall, _, heights = walls("known", which, made)
     case = made.case(path=[wall(heights.max(axis=0) + 1.0)])
-    window = case.windows[0]
+    held = case.windows[0]
     basis = np.array([[1.0 / 3.0, 0.7], [1.0 / 3.0 + 1e-12, 0.7]])
     gains = np.array([[0.1, 0.3], [0.1, 0.3 + 1e-12]])
-    beside = case.beside(window, basis, gains)
+    beside = case.beside(held, basis, gains)
     assert beside is not None
     for _ in range(40):
         start = float(rng.uniform(0.3, 0.35))
         z = rng.normal(size=(3, 1)) * np.array([1.0, -1.0])
         for poly, row in zip(beside.added([polynomial([0.0])] * 3, start, start, z), z, strict=True):
-            (offset, _), u = window.moved(start, start), made.u[:, 0]
+            (offset, _), u = held.moved(start, start), made.u[:, 0]
             truth = -sum(
                 (
                     arb(a) * arb(c) * r
@@ -82,13 +103,23 @@ def test_what_stands_beside_a_row_is_off_by_no_more_than_it_says(which: str) -> 
             assert poly.error < 1e-14
 
 
-def test_what_is_taken_off_a_bound_rounds_upwards() -> None:
+def test_what_is_taken_off_a_bound_rounds_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the error that is handed on with it alone, whatever is added to that later."""
     tube: Any = SimpleNamespace(flow=SimpleNamespace(monomials=Monomials(0, 1)))
-    for level, allowed in ((2.0**-54, 1.0), (-(2.0**-54), 1.0), (1.0 / 3.0, 1.0 + 2.0**-52), (-0.1, -0.3)):
-        for error in (0.0, 2.0**-55):
-            (top,) = _tops(tube, [(polynomial([level], error), allowed)])
-            assert Fraction(float(top)) >= Fraction(level) - Fraction(allowed) + Fraction(error)
-            assert float(top) <= level - allowed + error + 1e-12
+    given = []
+
+    def highest(dense: np.ndarray, _: object, errors: np.ndarray, nothing: float) -> np.ndarray:
+        given.append((exact(dense)[0], exact(errors)[0]))
+        return errors
+
+    monkeypatch.setattr(cells, "highest", highest)
+    rng = np.random.default_rng(6)
+    for level, allowed in ((2.0**-54, 1.0), (-(2.0**-54), 1.0), *rng.uniform(0.0, 1.0, size=(20, 2))):
+        for error in (0.0, 1.0):
+            cells._tops(tube, [(polynomial([level], error), max(level, allowed))])
+            value, off = given[-1]
+            assert value + off >= Fraction(float(level)) - Fraction(float(max(level, allowed))) + Fraction(error)
+            assert off <= error * (1.0 + 1e-11) + 1e-15
 
 
 def test_a_bound_of_a_time_rounds_down(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ import pytest
 from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.claims import claims, constraints, replay, units
+from sparserob_core.checker.claims import cells, claims, constraints, replay, units
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Duality, Row
 from sparserob_core.checker.outcome import Broken
@@ -86,13 +86,26 @@ def test_a_replayed_state_is_that_of_its_disturbance(name: str) -> None:
 
 @pytest.mark.parametrize("which", ["fixed", "moving", "mixed"])
 @pytest.mark.parametrize("name", [*KINDS[:-1], pytest.param(KINDS[-1], marks=pytest.mark.slow)])
-def test_a_wall_may_be_where_the_worst_case_is_and_no_nearer(name: str, which: str) -> None:
-    made = kind(name)
+def test_a_wall_may_be_where_the_worst_case_is_and_no_nearer(
+    name: str, which: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, told = kind(name), []
+
+    def prove(*given: Any) -> cells.Proven:
+        told.append(cells.prove(*given))
+        return told[-1]
+
+    monkeypatch.setattr(constraints, "prove", prove)
     wall, times, heights = walls(name, which, made)
     highest, i = heights.max(axis=0), (KINDS.index(name) + len(which)) % len(DIRECTIONS)
     proof = {"proof": {"path": {"tolerance": 1e-9, "lower": [[times[0]]], "upper": [[times[-1]]]}}}
-    case = made.case(proof, path=[wall(highest + 5e-3)])
+    room = 5e-3 * np.roll([1.0, 2.0, 4.0, 3.0], i)
+    case = made.case(proof, path=[wall(highest + room)])
     assert "margin" in constraints.bounded(case, case.windows[0])
+    # no more room is told than there is
+    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in case.windows[0].seen.facets]
+    assert -room.min() - 1e-12 <= told[0].bound <= 0.0
+    assert (-room[order] / case.units(case.windows[0]).rows).max() - 1e-12 <= told[0].share <= 0.0
     near = highest + 5e-3
     near[i] = highest[i] - 1e-3
     case = made.case(proof, path=[wall(near)])
@@ -227,24 +240,26 @@ def test_a_unit_is_no_more_than_a_row_reaches_however_few_numbers_are_held(
 
 
 def test_slopes_on_pieces_may_be_moved_as_far_as_every_control_of_few_functions_is_alike() -> None:
-    """Of one function the coefficient is the control itself, so that nothing is given away."""
+    """Of one function the coefficient is the control itself, so that no more than its far end is given away."""
     rng, K = np.random.default_rng(7), 4
-    problem = replace(kind("alone").case().problem, control=Box([-1.0, -0.5], [1.0, 0.5]))
+    problem = replace(kind("alone").case().problem, control=Box([-1.0, -0.25], [0.5, 0.5]))
     for values in (np.ones((1, K)), np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, -1.0, -1.0]])):
         duality = Duality(problem, sr.Dictionary(np.linspace(0.0, HORIZON, K + 1), values), None)
         slope, moved = rng.normal(size=(K, 2)), rng.normal(size=(K, 2))
         row = Row(arb(0.25), [[arb(v) for v in piece] for piece in slope])
         constant, slopes = duality.summed([(2.0, row)], (-moved.T).tolist())
         assert np.array([[float(x.mid()) for x in piece] for piece in slopes]) == pytest.approx(moved)
-        theta = rng.uniform(-1.0, 1.0, size=(300, 2, len(values))) / len(values) * np.array([1.0, 0.5])[:, None]
-        theta[:4] = np.sign(theta[:4]) * np.array([1.0, 0.5])[:, None] / len(values)
-        theta[:4, :, 0] *= np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * np.sign(theta[:4, :, 0])
-        u = theta @ values
+        low, high = (end[:, None] for end in (problem.control.lower, problem.control.upper))
+        halves = rng.uniform(low, high, size=(300, 2, len(values)))
+        halves[:100] = np.where(halves[:100] > (low + high) / 2, high, low)
+        u = np.repeat(halves, K // len(values), axis=2)
         truth = 2.0 * (0.25 + (u * slope.T).sum(axis=(1, 2)))
         told = float(constant.mid()) + (u * moved.T).sum(axis=(1, 2))
         assert (told <= truth + 1e-12).all()
         if len(values) == 1:
-            assert (truth - told).min() == pytest.approx(0.0, abs=1e-12)
+            off, ends = (2.0 * slope - moved).sum(axis=0), np.hstack([low, high])
+            least = (np.abs(off) * np.abs(ends).max(axis=1) + (off[:, None] * ends).min(axis=1)).sum()
+            assert (truth - told).min() == pytest.approx(least, abs=1e-12)
         # what acts alike on every control costs nothing
         null = np.array([1.0, -1.0, 1.0, -1.0])[:, None] * rng.normal(size=2)
         same, _ = duality.summed([(2.0, row)], (-(2.0 * slope + null).T).tolist())
@@ -269,6 +284,36 @@ def test_a_bound_is_the_least_of_the_cost_and_of_what_rows_say_of_sizes() -> Non
             found = case.duality.bound(rows, None, price)
             assert float(found.mid()) == pytest.approx(least, abs=1e-12)
             assert float(found.rad()) < 1e-20
+
+
+def test_what_errors_of_execution_add_beside_a_row_is_near_its_chord() -> None:
+    made, shares = kind("alone"), np.array([0.1, 0.25])
+    fine = replace(made.motion, breakpoints=np.linspace(0.0, HORIZON, 129), _steps={})
+    size = np.abs(made.u).T[np.searchsorted(ENDS, fine.breakpoints[:-1], side="right") - 1] * shares
+    case = made.case(path=[walls("alone", "fixed", made)[0](np.full(4, 9.0))], execution=shares)
+    c = np.array([0.5, -1.25])
+    beside = case.beside(case.windows[0], c[None], np.zeros((1, 2)))
+    assert beside is not None and case.execution is not None
+    for a, b in ((0.125, 0.1875), (0.25, 0.5), (0.75, 1.0), (1.5, 2.0), (1.25, 1.25)):
+        terms, off = beside._erring(case.execution, c, a, b)
+        truth = []
+        for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+            at = fine.weights(c[None], a + share * (b - a)).control
+            truth.append(float((np.abs(at) * size).sum()))
+            told = float(np.polyval(terms[::-1], share))
+            assert -off - 1e-12 <= told - truth[-1] <= off + 3e-4
+        assert terms.size == 1 + (a < b)
+        assert np.polyval(terms[::-1], 0.0) == pytest.approx(truth[0], abs=3e-4)
+        assert np.polyval(terms[::-1], 1.0) == pytest.approx(truth[-1], abs=3e-4)
+        assert off <= 2.0 * (b - a) ** 2 + 1e-12
+        assert (
+            off
+            >= max(
+                abs(t - (truth[0] * (1 - s) + truth[-1] * s))
+                for s, t in zip((0.25, 0.5, 0.75), truth[1:4], strict=True)
+            )
+            - 3e-4
+        )
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.causal import causal_bound
+from sparserob_core.checker.claims.causal import _shared, causal_bound
 from sparserob_core.checker.claims.cells import Place, _cut
 from sparserob_core.checker.claims.cost import _integrated, _semidefinite
 from sparserob_core.checker.outcome import Broken, Clock, Finding, Unchecked
@@ -635,3 +635,19 @@ def test_the_largest_cost_is_that_of_the_far_end_of_every_channel():
     )  # fmt: skip
     # held at 2 or at -2, whichever costs more: int_0^2 (1 + 2 t)^2 dt = 62 / 3
     assert claims.largest_cost(bent) == pytest.approx(4.0 + 62.0 / 3.0)
+
+
+def test_the_price_of_a_peak_is_parted_and_no_more_of_it_is():
+    """Random slopes of groups of signals: what they are given together is at most the price, and nearly all of it."""
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        case = case_of(control=Box([-1.0], [0.5]))
+        groups = {bytes([g]): [arb(float(v))] for g, v in enumerate(rng.normal(size=rng.integers(1, 5)))}
+        price = float(rng.uniform(0.1, 2.0))
+        parts = [row[0] for row in _shared(case, [arb(price)], groups).values()]
+        assert all(part >= 0 for part in parts)
+        assert sum(parts, arb(0)) <= arb(price)
+        assert float(sum(parts, arb(0)).mid()) >= price * (1.0 - 1e-9)
+        # no group is given more than it can use, but for the first, which has what is left
+        most = [abs(float(slope[0].mid())) for slope in groups.values()]
+        assert all(float(part.mid()) <= one for part, one in list(zip(parts, most, strict=True))[1:])

@@ -3,13 +3,15 @@ where the series are cut short, and stay narrow over many pieces."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from decimal import Decimal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("flint")
-from flint import arb, arb_series, ctx
+from flint import arb, arb_poly, arb_series, ctx
 
 import sparserob_core.checker.reach.varying.flow as varying
 from sparserob_core.checker.arithmetic.jets import kepler_root, kepler_series
@@ -62,6 +64,21 @@ def test_balls_hold_the_closed_form_where_series_are_cut_short(
             assert all(one.overlaps(other) for one, other in zip(balls, exact(start, start + 0.375), strict=True))
             wide = max(wide, *(float(one.rad()) for one in balls))
         assert wide > 1e-12, "nothing was left out"
+
+
+def test_what_a_series_leaves_out_widens_every_entry_in_its_units() -> None:
+    """With tails that are told: 1 of the state, 2 of what is forced, and nothing beside them."""
+    with ctx.workprec(BITS):
+        flow = VaryingFlow(FADING, 3.0)
+        (segment, *_) = flow.segments
+        still = replace(segment, left=[[arb(0)] * len(row) for row in segment.left])
+        table = [[(entry(arb_poly([0, 1]))).coeffs() for entry in row] for row in still.law]
+        tails = SimpleNamespace(sizes=[arb(0)], of=lambda count, forced: arb(1 if forced is None else 2))
+        found = flow._left_out([[arb(0)] * len(table[0])], still, table, arb(1), tails, 3)
+        (u,) = flow.units
+        expected = [1.0, *[2.0 * u] * (len(table[0]) - 1)]
+        for ball, size in zip(found.entries(), expected, strict=True):
+            assert size <= float(ball.rad()) <= size * 1.001
 
 
 def test_nothing_is_said_beyond_what_was_expanded() -> None:
