@@ -29,6 +29,7 @@ BITS = 30  # to which the ends of durations that differ are rounded outwards
 AT_ONCE = 4_000_000  # numbers of the exponentials that are made at a time
 SMALL = 256  # numbers in the matrices of one kind, up to which it is not looked for durations that are alike
 FEW = 4  # times as many durations as matrices, from which every matrix is applied to all its durations at once
+APART = 1e-6  # what couples the blocks, added up over a duration, up to which its third power is below all rounding
 LONG = 256  # equal durations from which what adds up over them is summed in blocks
 
 
@@ -180,7 +181,12 @@ class ComparisonSystem:
     def _over(self, shortest: Array, longest: Array) -> tuple[Array, Array, Array, Array]:
         one = np.eye(self.metzler.shape[0])
         with np.errstate(over="ignore", invalid="ignore"):
-            flow, integral = flows_between(self.metzler, shortest, longest)
+            rates = np.diagonal(self.metzler)
+            coupling = self.metzler - np.diag(rates)
+            if rates.size * coupling.max() * longest.max(initial=0.0) <= APART:
+                flow, integral = flows_apart(rates, coupling, shortest, longest)
+            else:
+                flow, integral = flows_between(self.metzler, shortest, longest)
             peak = one + SAFE * product(self.rising, integral)
             departure = np.minimum(SAFE * product(self.sizes, integral), one + peak)
         return flow, integral, peak, departure
@@ -214,8 +220,6 @@ def _rounded(values: Array, to: np.ufunc) -> Array:
 def flows_between(metzler: Array, shortest: Array, longest: Array) -> tuple[Array, Array]:
     """Bounds ``(u, q, q)`` of ``e^{M r}`` for all ``r`` from ``shortest`` to ``longest (u,)``, and of its integral
     until the longest."""
-    if metzler.size == 1 and shortest is longest:
-        return _of_one_block(float(metzler[0, 0]), longest[:, None, None])
     differ = np.flatnonzero(shortest < longest)
     durations = np.concatenate([shortest, longest[differ] - shortest[differ]])
     flow, integral = np.empty((2, durations.size, *metzler.shape))
@@ -232,10 +236,42 @@ def flows_between(metzler: Array, shortest: Array, longest: Array) -> tuple[Arra
     return flow, integral
 
 
-def _of_one_block(rate: float, durations: Array) -> tuple[Array, Array]:
-    """`flows_between` of a single block, ``(u, 1, 1)``, by numbers."""
-    flow, grown = SAFE * np.exp(rate * durations), np.expm1(rate * durations)
-    return flow, SAFE * (grown / rate if rate != 0.0 else durations)
+def flows_apart(rates: Array, coupling: Array, shortest: Array, longest: Array) -> tuple[Array, Array]:
+    """`flows_between` of ``M = D + S``, ``D`` diagonal with ``rates (q,)``, ``S >= 0`` the ``coupling (q, q)``: by
+    numbers, and no matrix is made for a duration but the answer.
+
+    Duhamel's series ``e^{M r} = e^{D r} + int_0^r e^{D (r - s)} S e^{D s} ds + ...``, all of whose terms grow with
+    ``S``: that of first order is ``S_ij`` times the divided difference of ``e^{x r}`` at the rates ``i`` and ``j``,
+    ``e^{b r} (e^{(a - b) r} - 1) / (a - b)`` with the larger rate ``b``, whose last factor rises with ``r``; its
+    integral, over ``0 <= s <= t <= r``, is at most that over the square, and the triangle times the largest value. The
+    others are at most ``r^k S^k / k!`` times ``e^{r max(0, D)}``, and ``S^k`` is at most ``q^{k - 1} s^k`` with the
+    largest coupling ``s``.
+    """
+    q, early, late = rates.size, shortest[:, None], longest[:, None]
+    alone, added = np.exp(rates * np.where(rates < 0, early, late)), _grown(rates, late)
+    larger, difference = np.maximum.outer(rates, rates), -np.abs(np.subtract.outer(rates, rates))
+    early, late = early[..., None], late[..., None]
+    share = np.exp(larger * np.where(larger < 0, early, late)) * _grown(difference, late)
+    triangle = late**2 / 2 * np.exp(np.maximum(larger, 0.0) * late)
+    twice = np.minimum(added[:, :, None] * added[:, None, :], triangle)
+    third = (q * coupling.max() * late) ** 3 / (5 * q)  # e^x - 1 - x - x^2 / 2 <= x^3 / 5 where x <= 1/2
+    higher = _scaled(late**2 / 2 * product(coupling, coupling) + third, np.exp(max(0.0, float(rates.max())) * late))
+    flow, integral = _scaled(coupling, share) + higher, _scaled(coupling, twice) + late * higher
+    here = np.arange(q)
+    flow[:, here, here] += alone
+    integral[:, here, here] += added
+    return finite(SAFE * flow), finite(SAFE * integral)
+
+
+def _scaled(couplings: Array, growth: Array) -> Array:
+    """Couplings times what they grow by, where nothing stays nothing however large the growth is."""
+    return np.asarray(np.where(couplings > 0, couplings * growth, 0.0))
+
+
+def _grown(rates: Array, durations: Array | float) -> Array:
+    """The integrals ``(e^{a r} - 1) / a`` of what grows at ``rates`` ``a`` over ``durations`` ``r``."""
+    safe = np.where(rates == 0, 1.0, rates)
+    return np.asarray(np.where(rates == 0, durations, np.expm1(safe * durations) / safe))
 
 
 def rising(metzler: Array) -> Array:

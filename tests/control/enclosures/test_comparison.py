@@ -69,6 +69,54 @@ def slips_of(system, slack, lengths):
     return [part[:, :3, 3:] for part in transitions(both, lengths)]
 
 
+@pytest.mark.parametrize("rates", [[-1.0, -0.3, -50.0, 0.0], [0.4, -2.0, 0.4, 0.0], [0.0, 0.0, 0.0, 0.0]])
+def test_blocks_that_are_apart_are_bounded_by_numbers_closely(rates):
+    coupling = 1e-9 * np.array([[0, 3, 1, 2], [2, 0, 5, 1], [4, 1, 0, 1], [1, 1, 6, 0.0]])
+    M, rates, lengths = np.diag(rates) + coupling, np.array(rates), np.array([0.0, 1e-3, 0.1, 1.0, 7.0, 20.0])
+    exact = exact_between(M, lengths)
+    off = ~np.eye(4, dtype=bool)
+    for bound, truth, close in zip(
+        comparison.flows_apart(rates, coupling, lengths, lengths), exact, (1e-5, 9.0), strict=True
+    ):
+        room = 1e-13 * truth.max(axis=(1, 2), keepdims=True)  # what the orders from the second on may add too much
+        assert (bound >= truth).all()
+        assert (bound <= (1.0 + np.where(off, close, 1e-5)) * truth + room).all()
+    between, within = comparison.flows_apart(rates, coupling, lengths[:-1], lengths[1:])
+    for share in np.linspace(0.0, 1.0, 11):
+        flow, integral = exact_between(M, lengths[:-1] + share * np.diff(lengths))
+        assert (between >= (1.0 - 1e-12) * flow - 1e-24).all()
+        assert (within >= (1.0 - 1e-12) * integral - 1e-24).all()
+
+
+def test_what_comes_of_couplings_by_each_other_is_bounded_too(monkeypatch):
+    monkeypatch.setattr(comparison, "SAFE", 1.0)
+    rng, length = np.random.default_rng(3), np.array([0.8])
+    for size in (0.02, 0.1):  # `APART` allows far less: there the other orders hide behind `SAFE`
+        rates, equal = np.zeros(5), size * np.ones((5, 5))
+        for coupling in (equal, equal * rng.uniform(0.0, 1.0, (5, 5))):
+            exact = exact_between(np.diag(rates) + coupling, length)
+            for bound, truth in zip(comparison.flows_apart(rates, coupling, length, length), exact, strict=True):
+                assert (bound >= truth).all()
+
+
+def exact_between(M, lengths):
+    """The exponential and its integral by a series in long doubles, of short steps."""
+    A, found = M.astype(np.longdouble), []
+    for length in lengths:
+        steps = max(1, int(np.ceil(np.abs(M).sum() * length)))
+        term = flow = np.eye(len(M), dtype=np.longdouble)
+        driven, width = np.zeros_like(A), np.longdouble(length) / steps
+        for order in range(1, 30):
+            driven = driven + term * width / order
+            term = term @ A * width / order
+            flow = flow + term
+        whole, added = np.eye(len(M), dtype=np.longdouble), np.zeros_like(A)
+        for _ in range(steps):
+            whole, added = whole @ flow, added + whole @ driven
+        found.append((whole, added))
+    return np.array([flow for flow, _ in found]), np.array([driven for _, driven in found])
+
+
 @pytest.mark.parametrize("name", sorted(METZLER))
 def test_very_many_durations_share_bounds_in_steps_that_hold_for_each(name, monkeypatch):
     lengths = np.random.default_rng(0).uniform(1e-3, 1.0, 400)
