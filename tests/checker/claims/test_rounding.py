@@ -60,7 +60,7 @@ def test_each_allowance_beside_a_row_covers_its_own_loss_alone(lost: str, monkey
     monkeypatch.setattr(window, "OUTWARD", 1.0)
     if lost == "conversion":
         monkeypatch.setattr(window, "rounding", lambda count: 0.0)
-    for _ in range(60):
+    for _ in range(25):
         start = float(rng.uniform(0.3, 0.45))
         z = np.array([[1.0, 0.0], [0.0, -1.0]]) if lost == "conversion" else rng.normal(size=(2, 2))
         (offset, _), u = case.windows[0].moved(start, start), [arb(float(v)) for v in made.u[:, 0]]
@@ -81,7 +81,7 @@ def test_what_stands_beside_a_row_is_off_by_no_more_than_it_says(which: str) -> 
     gains = np.array([[0.1, 0.3], [0.1, 0.3 + 1e-12]])
     beside = case.beside(held, basis, gains)
     assert beside is not None
-    for _ in range(40):
+    for _ in range(15):
         start = float(rng.uniform(0.3, 0.35))
         z = rng.normal(size=(3, 1)) * np.array([1.0, -1.0])
         for poly, row in zip(beside.added([polynomial([0.0])] * 3, start, start, z), z, strict=True):
