@@ -651,3 +651,38 @@ def test_the_price_of_a_peak_is_parted_and_no_more_of_it_is():
         # no group is given more than it can use, but for the first, which has what is left
         most = [abs(float(slope[0].mid())) for slope in groups.values()]
         assert all(float(part.mid()) <= one for part, one in list(zip(parts, most, strict=True))[1:])
+
+
+@pytest.mark.parametrize("uncertain", [False, True])
+def test_cells_of_a_curved_wall_fill_every_face_for_all_times_and_parameters(uncertain):
+    """Each of the four faces of a square of directions, one cell each, and nothing may be missing of any."""
+    more = {"parameters": Box([-0.5], [0.25])} if uncertain else {}
+    matrix = (lambda p: np.array([[p[0], 0.0 * p[0]], [0.0 * p[0], p[0]]])) if uncertain else np.eye(2)
+    case = case_of(
+        wall=Ellipsoid([0.0, 0.0], [[4.0, 0.0], [0.0, 9.0]]),
+        system=LinearSystem(matrix, np.eye(2), **more),
+        initial_state=[0.0, 0.0],
+        control=Box([-1.0, -1.0], [1.0, 1.0]),
+        disturbance=None,
+        decision=((0.0, 0.0), (0.0, 0.0)),
+    )
+    window, early, late = case.windows[0], [0.0, *([-0.5] * uncertain)], [2.0, *([0.25] * uncertain)]
+    faces = [
+        ((-1.0 if i else s, s if i else -1.0), (1.0 if i else s, s if i else 1.0)) for i in (0, 1) for s in (-1.0, 1.0)
+    ]
+    lower = np.array([[*early, *low] for low, _ in faces])
+    upper = np.array([[*late, *high] for _, high in faces])
+    constraints.covered(case, window, lower, upper)
+    for face in range(4):
+        others = np.arange(4) != face
+        with pytest.raises(Broken):
+            constraints.covered(case, window, lower[others], upper[others])
+        for place in range(lower.shape[1]):
+            less = upper.copy()
+            less[face, place] -= 1e-9 if less[face, place] > lower[face, place] else 0.0
+            if (less != upper).any():
+                with pytest.raises(Broken):
+                    constraints.covered(case, window, lower, less)
+    for wrong in (lower[:, 1:], lower[:, :, None], lower[:1]):
+        with pytest.raises(Broken, match="corners"):
+            constraints.covered(case, window, wrong, upper[:, 1:] if wrong.shape[1] < lower.shape[1] else upper)
