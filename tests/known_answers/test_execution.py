@@ -32,11 +32,15 @@ PROBLEM: dict[str, Any] = {
 }
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run."""
+DRESSED = {key: [[f"{entry} + 0*t" for entry in row] for row in part] for key, part in (("A", A), ("B", B))}
+
+
+@pytest.fixture(scope="module", params=["constant", pytest.param("in t", marks=pytest.mark.slow)])
+def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run, of the plant as it is and as one that might change with time."""
     directory = tmp_path_factory.mktemp("execution") / "run"
-    verified(directory, PROBLEM, pieces(PIECES))
+    plant = PROBLEM["system"] if request.param == "constant" else DRESSED
+    verified(directory, {**PROBLEM, "system": plant}, pieces(PIECES))
     return directory
 
 
@@ -156,7 +160,6 @@ def test_a_control_that_is_refuted_shows_by_how_much(tmp_path: Path) -> None:
         ({"execution": [-0.1, 0.1]}, "numbers from 0 to 1"),
         ({"execution": [0.1, 0.1, 0.1]}, "2"),
         ({"terminal": [{"equals": [0, 0]}]}, "fixed final values"),
-        ({"system": {"A": [["-t", 1], [0, 0]], "B": B.tolist()}, "path": [], "terminal": []}, "a system in t"),
         ({"system": {"A": A.tolist(), "B": B.tolist(), "delay": 0.1}}, "a delay"),
         ({"disturbance": {"box": 0.01}, "disturbance_class": "measurable"}, "measurable"),
         ({"terminal": [{"norm": {"p": 2, "radius": 0.3}}]}, "curved sets of states"),

@@ -21,6 +21,7 @@ from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.integrals import integrating
 from sparserob_core.checker.reach.measurable import Execution
+from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
@@ -283,16 +284,19 @@ class Case:
         return Beside(window, basis, gains, self.scene, ends, self.pieces, self.execution)
 
     @cached_property
-    def execution(self) -> Execution | None:
+    def execution(self) -> Execution | VaryingExecution | None:
         """How exactly the control is delivered, ``None`` where that is as it is commanded; of no control where the
         certificate has none."""
         shares = self.problem.execution
         if shares is None:
             return None
         system = self.problem.system
-        if not isinstance(system, LinearSystem) or system.parameter_count or system.delay or self.policy is not None:
+        one = isinstance(system, LinearSystem | VaryingSystem)
+        if not one or system.parameter_count or system.delay or self.policy is not None:
             raise Unchecked("the checker knows errors of execution of one known system, undelayed and without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
+        if self.changing is not None:
+            return VaryingExecution(self.changing, np.asarray(shares, dtype=float), self.control.breakpoints, pieces)
         return Execution(self.problem, np.asarray(shares, dtype=float), self.control.breakpoints, pieces)
 
     def at(self, time: float) -> str:

@@ -14,6 +14,7 @@ from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.tube import Polynomial
+from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.shape import Shape
@@ -100,7 +101,7 @@ class Beside:
     scene: Scene
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
-    delivered: Execution | None = None
+    delivered: Execution | VaryingExecution | None = None
 
     def added(
         self, found: Sequence[Polynomial], start: float, stop: float, z: Array, piece: int | None = None
@@ -129,7 +130,9 @@ class Beside:
             for poly, c in zip(found, z @ self.basis, strict=True)
         ]
 
-    def _erring(self, delivered: Execution, c: Array, start: float, stop: float) -> tuple[Array, float]:
+    def _erring(
+        self, delivered: Execution | VaryingExecution, c: Array, start: float, stop: float
+    ) -> tuple[Array, float]:
         """What errors of execution add to ``c'x`` on ``[start, stop]``, ``c`` one of the basis or its opposite: the
         terms of a polynomial, and how far it may be off."""
         ends = [delivered.added(c, time) for time in ([start] if start == stop else [start, stop])]

@@ -413,7 +413,7 @@ class Execution:
             kernel, m = self.kernel, self.shares.size
             plain, off = kernel.along(Enclosed(c[None], np.zeros((1, c.size))))
             P, off = plain[0], off[0] + rounding(4 * ORDER + 32) * np.abs(plain[0]).sum(axis=1)  # as they are summed
-            value, more, less = swept(*_signed(P[..., :m], off[:, :m]), np.ones(len(P) * m))
+            value, more, less = swept(*signed(P[..., :m], off[:, :m]), np.ones(len(P) * m))
             low, high = (part.reshape(-1, m) * kernel.half for part in (value - less, value + more))
             lost = rounding(len(P) + 8) * np.cumsum(np.abs(high), axis=0)
             totals = [np.concatenate([np.zeros((1, m)), np.cumsum(part, axis=0)]) for part in (low, high)]
@@ -429,7 +429,7 @@ class Execution:
         part = np.minimum(place.astype(int), kernel.count - 1)
         ends = np.clip(2.0 * (place - part) - 1.0, -1.0, 1.0)
         P, off = known.P[part], known.off[part]
-        value, more, less = swept(*_signed(P, off), np.repeat(ends, m))
+        value, more, less = swept(*signed(P, off), np.repeat(ends, m))
         value, more, less = (one.reshape(-1, m) for one in (value, more, less))
         # of where an age is among the parts, and of the polynomial's own height there
         late = APART * kernel.count * np.abs(known.P).sum(axis=1).max(axis=0) + rounding(16) * np.abs(value)
@@ -479,7 +479,7 @@ class Execution:
         return float((stop - start) ** 2 / 8.0 * total * (1.0 + rounding(change.size + 16)))
 
 
-def _signed(P: Array, off: Array) -> tuple[Array, Array]:
+def signed(P: Array, off: Array) -> tuple[Array, Array]:
     """Polynomials ``(n, p + 1, m)`` with their opposites, one after another, ``(n m, p + 1, 2)``, and how far both are
     off."""
     each = np.moveaxis(P, 2, 1).reshape(-1, P.shape[1])

@@ -26,7 +26,6 @@ from sparserob_core.control.problem.problem import MixedConstraint
 from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.response.functional import LEGS_KEPT, Leg, WorstCase
 from sparserob_core.control.response.initial_support import Supports
-from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Direct, Moving, Reference
 from sparserob_core.control.response.response import LONG, Outputs, Response, distinct_times
@@ -380,7 +379,6 @@ class FlatConstraint(StateConstraint):
             known = self.samples.support_over(legs, low, high)
             if self.functionals.execution is not None:  # of a known system, which has one leg
                 (leg,) = legs
-                assert isinstance(leg, LiftedSystem)
                 errors = self.functionals.execution.over(control, H, leg)
                 known = [Supports((*(() if known[0] is None else known[0].parts), errors))]
             supports = iter(known)
@@ -430,7 +428,7 @@ class FlatConstraint(StateConstraint):
         """What errors of execution add to all rows at every sampled time, ``(r, times)``."""
         rows, copies = self.H[: self.samples.proven], self.h.size // max(1, self.samples.proven)
         k, r = self.times.size, rows.shape[0]
-        added = execution.added(self.functionals.control(x), np.repeat(self.times, r), np.tile(rows, (k, 1)))
+        added = execution.sampled(self.functionals.control(x), np.repeat(self.times, r), np.tile(rows, (k, 1)))
         return np.tile(added.reshape(k, r).T, (copies, 1))
 
     @shaped

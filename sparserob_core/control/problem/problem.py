@@ -295,7 +295,6 @@ class OptimalControlProblem:
         ]
         refused = {
             "fixed final values, which an error of execution misses: a terminal set such as box": ends,
-            "a system in t": isinstance(self.system, VaryingSystem),
             "pieces of the system": isinstance(self.system, SwitchedSystem),
             "uncertain parameters": bool(self.system.parameter_count),
             "a delay": self.system.delay > 0.0,

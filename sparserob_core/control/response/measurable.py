@@ -10,9 +10,9 @@ ds``, the integral over piece ``k`` up to ``t``: convex in the command, and 0 wh
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from math import comb
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -21,10 +21,14 @@ from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.flows import Leaps, products
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.initial_support import Support
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+
+if TYPE_CHECKING:
+    from sparserob_core.control.response.varying_motion import VaryingMotion
 
 LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
 # Gauss-Lobatto: the ends are nodes, so that no kink hides beside them
@@ -36,8 +40,6 @@ ORDER = 12  # of the expansion that encloses a row; what is left of it on a shor
 SHORT = 0.5  # time times speed that such an interval takes: twice as much leaves 1e-10, half as much doubles the work
 TINY = float(np.finfo(float).tiny)
 TABLES_KEPT = 4096  # directions and parameters whose integrals are remembered
-BEZIER = np.array([[comb(k, j) / comb(ORDER, j) for k in range(ORDER + 1)] for j in range(ORDER + 1)])
-"""From powers on ``[0, 1]`` to the coefficients of Bernstein's form, ``(ORDER + 1, ORDER + 1)``."""
 MOST_SHORT = 4096  # intervals that one is cut into before any is halved
 HALVINGS = 48  # of an interval across a kink of the integrand: what is left of it is below rounding
 # Of the horizon: ages that differ by less are one where nothing is proven. Ten times as much would be seen in a
@@ -239,12 +241,13 @@ class MeasurableSupport:
 
 def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) -> Array:
     """Lower and upper bounds ``(l, 2)`` of the integrals of the support function of ``bound`` over intervals of
-    ``lengths (l,)``, on which its argument is a polynomial with ``terms (l, ORDER + 1, w)`` in the share of the
+    ``lengths (l,)``, on which its argument is a polynomial with ``terms (l, p + 1, w)`` in the share of the
     interval that has passed; intervals across a kink are halved until their bounds are within ``accuracy (l,)``."""
     total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
-    points = np.einsum("kj,ljw->lkw", BEZIER.T, terms)
+    order = terms.shape[1] - 1
+    points = np.einsum("kj,ljw->lkw", bezier(order), terms)
     for turn in range(HALVINGS + 1):
-        best = bound.support_point(points[:, ORDER // 2])
+        best = bound.support_point(points[:, order // 2])
         low = (points @ best[:, :, None])[..., 0].mean(axis=1) * lengths
         high = bound.support(points).mean(axis=1) * lengths
         open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
@@ -254,6 +257,12 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
         if not owner.size:
             break
     return total
+
+
+@cache
+def bezier(order: int) -> Array:
+    """From powers on ``[0, 1]`` to the coefficients of Bernstein's form, ``(order + 1, order + 1)``."""
+    return np.array([[comb(k, j) / comb(order, j) for j in range(order + 1)] for k in range(order + 1)])
 
 
 def _halved(points: Array) -> Array:
@@ -355,7 +364,6 @@ class MeasurableCellSupport(KnownCellSupport):
         return np.asarray(self.support.bound.radius_bound * norms)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Execution:
     """The ``shares (m,)`` of the commanded control by which what is delivered may differ; ``breakpoints (K + 1,)`` are
@@ -365,9 +373,14 @@ class Execution:
     breakpoints: Array
     shares: Array
 
-    def over(self, control: Array, rows: Array, lifted: LiftedSystem) -> ExecutionCellSupport:
+    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion) -> Support:
         """What the worst errors of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time."""
-        return ExecutionCellSupport(self, control, rows, lifted)
+        assert isinstance(leg, LiftedSystem)
+        return ExecutionCellSupport(self, control, rows, leg)
+
+    def sampled(self, control: Array, times: Array, directions: Array) -> Array:
+        """`added` at times and directions that are asked for again and again."""
+        return self.added(control, times, directions)
 
     def none(self) -> Execution:
         """The same of a control that is delivered as it is commanded."""

@@ -30,6 +30,7 @@ KNOWN = TaylorSpace(0, 0)
 GROWN = 8  # terms of an exponential of bounds, whose tail is added; half of them, and third derivatives count twice
 OUTWARD = 1.0 + 1e-12  # for sums of some thousand numbers that are not negative
 AT_ONCE = 4_000_000  # numbers of weights that are made at once
+TINY = float(np.finfo(float).tiny)
 PATHS_KEPT = 4  # controls whose states are remembered
 
 
@@ -191,7 +192,7 @@ class VaryingMotion:
         ahead = (np.abs(steps) / units[:, None] * units).sum(axis=2).max(axis=1)
         rounded = rounding(self.states + self.inputs.shape[2])
         here = self.flow.error * (begun + pushed) + rounded * (ahead + self.flow.error) * (begun + pushed)
-        before = np.concatenate([[0.0], np.cumsum(here)[:-1]])
+        before = np.concatenate([[TINY], np.cumsum(here)[:-1]])  # not 0, which times no bound is no number
         carried = units * self._carries[:-1] * before[:, None]
         return np.asarray((self.grown(self.every, self.grid.lengths, carried) + units * here[:, None]) * OUTWARD)
 
@@ -225,16 +226,25 @@ class VaryingMotion:
         rest = np.where(pace < 0.8 * GROWN, rest, np.inf)
         return np.asarray((total + units * rest[:, None]) * OUTWARD)
 
+    def place(self, times: Array) -> np.ndarray:
+        """The mark at or before each time."""
+        return np.maximum(np.searchsorted(self.grid.breakpoints, times, side="right") - 1, 0)
+
     def bends(self, times: Array, pieces: np.ndarray) -> Array:
         """``[Q R]`` at times on pieces, ``(k, d, d + m + mw)``."""
-        d, segments = self.states, self._segments[pieces]
+        law, slope = self.law(times, pieces)
+        return np.asarray(slope + law[:, :, : self.states] @ law)
+
+    def law(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
+        """``[A F]`` and its derivative at times on pieces, ``(k, d, d + m + mw)`` each."""
+        segments = self._segments[pieces]
         begin, end = self.expansion.ends[segments], self.expansion.ends[segments + 1]
         every = self.expansion.coefficients[segments]
         radius, orders = (end - begin) / 2, np.arange(every.shape[1])
         powers = ((times - (begin + end) / 2) / radius)[:, None] ** orders
         law = np.einsum("kn,knij->kij", powers, every)
         slope = np.einsum("kn,knij->kij", powers[:, :-1] * orders[1:] / radius[:, None], every[:, 1:])
-        return np.asarray(slope + law[:, :, :d] @ law)
+        return law, slope
 
     @cached_property
     def every(self) -> np.ndarray:
@@ -355,7 +365,7 @@ class VaryingSupport:
     def deviation(self, start: Array, widths: Array) -> Array:
         """`Support.deviation`: as `VaryingMotion.deviation`, for every block."""
         motion, d = self.motion, self.motion.states
-        pieces = np.minimum(self._place(start), motion.origin.size - 1)
+        pieces = np.minimum(motion.place(start), motion.origin.size - 1)
         at = motion.bends(start, pieces)
         bent = self._weights(start, self.rows @ at[:, :, :d])
         third = motion.third[pieces]
@@ -404,14 +414,9 @@ class VaryingSupport:
         found = self.blocks(self._weights(times, rows))[:, :, None]
         return found if self.combination is None else self.combination.apply(found)
 
-    def _place(self, times: Array) -> np.ndarray:
-        """The mark at or before each time."""
-        marks = self.motion.grid.breakpoints
-        return np.maximum(np.searchsorted(marks, times, side="right") - 1, 0)
-
     def _weights(self, times: Array, rows: Array) -> Array:
         """What rows ``(k, r, d)`` at times ``(k,)`` give to every part, ``(k, r, P, w)``."""
-        motion, place = self.motion, self._place(times)
+        motion, place = self.motion, self.motion.place(times)
         parts = self.effect.shape[2:]
         flow = motion.expansion.flow(motion.grid.breakpoints[place], times)
         carried = rows @ flow.state

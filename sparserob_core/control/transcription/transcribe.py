@@ -164,8 +164,10 @@ def _functionals(
     execution = None
     if problem.execution is not None:
         from sparserob_core.control.response.measurable import Execution
+        from sparserob_core.control.response.varying.execution import VaryingExecution
 
-        execution = Execution(response, control.breakpoints, np.asarray(problem.execution))
+        made = VaryingExecution if varying else Execution
+        execution = made(response, control.breakpoints, np.asarray(problem.execution))
     functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)
 

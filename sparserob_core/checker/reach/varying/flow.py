@@ -4,7 +4,7 @@ their products by a tree, in which balls grow with the logarithm of the number o
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 ORDER = 24  # of the system in time on a segment; with a tenth of it segments are a million times shorter
 TERMS = (16, 24, 32, 48, 64)  # of the solution over a part of a segment: the fewest that are sharp, else the last
 SHARP = 2.0**-100  # of the system's numbers, what is left out on a segment; 2^-10 would show in what states miss
+ENOUGH = 2.0**-64  # the same of a kernel, which goes on as numbers of 53 bits; 2^-54 would show, 2^-74 takes more terms
 LONG = 2.0  # norm of the system times the length of a segment; ten times more takes more terms than there are
 FIRST = 8  # segments to begin with
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment holds a pole
@@ -67,6 +68,7 @@ class VaryingFlow:
     until: float
     _known: dict[tuple[float, float], tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict)
     _weights: dict[tuple[float, ...], Weights] = field(default_factory=dict)
+    _most: dict[float, tuple[Array, Array]] = field(default_factory=dict)
 
     @cached_property
     def segments(self) -> list[Segment]:
@@ -196,17 +198,83 @@ class VaryingFlow:
     def within(self, start: float, stop: float, order: int) -> tuple[list[arb_mat], arb_mat]:
         """What an interval within one segment makes of states and of inputs that stay the same, ``(d, d + m + mw)``:
         coefficients of powers of the share of the interval, up to ``order``, and balls that hold the rest."""
-        if not 0.0 <= start <= stop <= self.until:
-            raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
-        begins = [one.start for one in self.segments]
-        number = max(0, bisect_right(begins, start) - 1)
-        if stop > self.segments[number].stop:
-            raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
-        terms, rest = self._series(self.segments[number], start, stop)
+        terms, rest = self._series(self._segment_of(start, stop), start, stop)
         for term in terms[order + 1 :]:
             rest = rest + stacked([[_wider(zero, abs(x)) for zero, x in zip(*pair, strict=True)] for pair in
                                    zip((term * 0).tolist(), term.tolist(), strict=True)])  # fmt: skip
         return terms[: order + 1], rest
+
+    def kernel(self, start: float, stop: float) -> list[arb_mat]:
+        """What inputs at any time ``s`` on an interval within one segment make of the state at its end: ``h Phi(stop,
+        s) [B E](s)`` as coefficients ``(d, m + mw)`` of powers of the share ``r`` of the interval that is left at
+        ``s``; the first one holds what all of them leave out.
+
+        ``Psi(r) = Phi(stop, stop - r h)`` has ``Psi' = h Psi A``: its norms are at most the coefficients of the
+        solution of ``y' = a(r) y``, and those of the kernel at most those of ``y(r) b(r)``.
+        """
+        from flint import arb, arb_poly
+
+        segment = self._segment_of(start, stop)
+        d, h, u = self.system.states, arb(stop) - arb(start), [arb(one) for one in self.units]
+        shifted = arb_poly([arb(stop) - arb(segment.centre), -h])
+        table = [[(entry(shifted) * h).coeffs() for entry in row] for row in segment.law]
+        order = max(1, *(len(entry) for row in table for entry in row))
+        rows = [[[entry[k] if k < len(entry) else arb(0) for entry in row] for row in table] for k in range(order)]
+        A, F = ([stacked([row[part] for row in one]) for one in rows] for part in (slice(d), slice(d, None)))
+        tails, rest = _Tails(self._norms(table)), self._rest(segment, h)
+        columns = range(F[0].ncols())
+        forced = [[_largest([upper(abs(F[k][i, j])) / u[i] for i in range(d)]) for k in range(order)] for j in columns]
+        every = [_largest([one[k] for one in forced]) for k in range(order)] if forced else [arb(0)]
+        wanted = arb(ENOUGH) * max(arb(1e-300), *every)
+        beyond = tails.times(every)
+        count = next((one for one in (8, *TERMS) if beyond(one) <= wanted), TERMS[-1])
+        back, found = [stacked([[arb(int(i == j)) for j in range(d)] for i in range(d)])], []
+        for n in range(count):
+            kernel, nexts = back[n] * F[0], back[n] * A[0]
+            for k in range(1, min(n + 1, order)):
+                kernel, nexts = kernel + back[n - k] * F[k], nexts + back[n - k] * A[k]
+            found.append(kernel)
+            back.append(nexts / (n + 1))
+        r = _largest([sum((one * u[j] / u[i] for j, one in enumerate(row[:d])), arb(0)) for i, row in enumerate(rest)])
+        a = sum(tails.sizes, arb(0))
+        first = found[0].tolist()
+        for j in columns:
+            missing = _largest([row[d + j] / u[i] for i, row in enumerate(rest)])
+            spread = (a + r).exp() * (r * (sum(forced[j], arb(0)) + missing) + missing)
+            error = tails.times(forced[j])(count) + spread
+            for i in range(d):
+                first[i][j] = _wider(first[i][j], error * u[i])
+        return [stacked(first), *found[1:]]
+
+    def most(self, start: float, stop: float) -> tuple[Array, Array]:
+        """The largest absolute values of ``[A B E]`` and of its derivative on the segment that an interval is in,
+        ``(d, d + m + mw)`` each."""
+        segment = self._segment_of(start, stop)
+        if segment.start not in self._most:
+            far = upper(self._far(segment))
+            tables = []
+            for order in (0, 1):
+                rows = []
+                for row, left in zip(segment.law, segment.left, strict=True):
+                    entries = []
+                    for entry, rest in zip(row, left, strict=True):
+                        coefficients = [upper(abs(one)) for one in entry.coeffs()]
+                        coefficients += [far * 0] * (ORDER + 1 - len(coefficients)) + [upper(abs(rest))]
+                        powers = enumerate(coefficients[order:])
+                        entries.append(sum((one * (n + 1) ** order * far**n for n, one in powers), far * 0))
+                    rows.append(entries)
+                tables.append(np.array([[float(one.upper()) for one in row] for row in rows]))
+            self._most[segment.start] = tables[0], tables[1]
+        return self._most[segment.start]
+
+    def _segment_of(self, start: float, stop: float) -> Segment:
+        if not 0.0 <= start <= stop <= self.until:
+            raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
+        begins = [one.start for one in self.segments]
+        segment = self.segments[max(0, bisect_right(begins, start) - 1)]
+        if stop > segment.stop:
+            raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
+        return segment
 
     @cached_property
     def ends(self) -> list[float]:
@@ -296,9 +364,7 @@ class VaryingFlow:
         from flint import arb
 
         d, u = self.system.states, [arb(one) for one in self.units]
-        sizes = tails.sizes
-        far = upper(abs(arb(segment.stop) - arb(segment.centre)).max(abs(arb(segment.start) - arb(segment.centre))))
-        rest = [[upper(abs(one)) * far ** (ORDER + 1) * upper(abs(h)) for one in row] for row in segment.left]
+        sizes, rest = tails.sizes, self._rest(segment, h)
         r = _largest([sum((one * u[j] / u[i] for j, one in enumerate(row[:d])), arb(0)) for i, row in enumerate(rest)])
         a = sum(sizes, arb(0))
         spread = (a + r).exp() * a.exp()
@@ -315,12 +381,23 @@ class VaryingFlow:
             columns.append([_wider(total[i][j], error * u[i]) for i in range(d)])
         return stacked([list(row) for row in zip(*columns, strict=True)])
 
+    @staticmethod
+    def _far(segment: Segment) -> arb:
+        from flint import arb
+
+        return abs(arb(segment.stop) - arb(segment.centre)).max(abs(arb(segment.start) - arb(segment.centre)))
+
+    def _rest(self, segment: Segment, h: arb) -> list[list[arb]]:
+        """What stands before the next power of the time on a segment, times ``h``, at most."""
+        far = upper(self._far(segment))
+        return [[upper(abs(one)) * far ** (ORDER + 1) * upper(abs(h)) for one in row] for row in segment.left]
+
     def weights(self, grid: Sequence[float]) -> Weights:
         """What the state at the end of a grid, which begins at 0, is made of."""
         key = tuple(grid)
         if key not in self._weights:
             parts = [self.over(*ends) for ends in pairwise(grid)]
-            after = _products([part[0] for part in parts])
+            after = products([part[0] for part in parts])
             control = [Z * part[1] for Z, part in zip(after[1:], parts, strict=True)]
             disturbance = [Z * part[2] for Z, part in zip(after[1:], parts, strict=True)]
             self._weights[key] = Weights(after[0], control, disturbance)
@@ -353,8 +430,19 @@ class _Tails:
             found.append(upper(y * driven * R ** (-count) / (R - 1)))
         return min(found)
 
+    def times(self, forced: list[arb]) -> Callable[[int], arb]:
+        """What ``y(r) b(r)`` has from a power on, ``y' = a(r) y``, ``y(0) = 1``, ``forced`` the coefficients of
+        ``b``."""
+        found = []
+        for R, y in self._grown:
+            driven, power = y * 0, y * 0 + 1
+            for size in forced:
+                driven, power = driven + size * power, power * R
+            found.append((R, y * driven * R / (R - 1)))
+        return lambda count: min(upper(size * R ** (-count)) for R, size in found)
 
-def _products(steps: Sequence[arb_mat]) -> list[arb_mat]:
+
+def products(steps: Sequence[arb_mat]) -> list[arb_mat]:
     """``Z_k = Phi_N ... Phi_{k+1}`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``: from the products of pairs
     of them, each of which is made of at most twice as many products as there are levels."""
     from flint import arb_mat
@@ -365,7 +453,7 @@ def _products(steps: Sequence[arb_mat]) -> list[arb_mat]:
         return [steps[0], unit]
     odd = len(steps) % 2
     pairs = [second * first for first, second in zip(steps[:-1:2], steps[1::2], strict=False)]
-    coarse = _products([*pairs, *([steps[-1]] if odd else [])])
+    coarse = products([*pairs, *([steps[-1]] if odd else [])])
     found: list[arb_mat] = []
     for k in range(len(steps) + 1):
         place, inside = divmod(k, 2)
@@ -379,7 +467,7 @@ def _products(steps: Sequence[arb_mat]) -> list[arb_mat]:
 
 
 def prefixes(steps: Sequence[arb_mat]) -> list[arb_mat]:
-    """``Phi_k ... Phi_1`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``, as `_products`."""
+    """``Phi_k ... Phi_1`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``, as `products`."""
     from flint import arb_mat
 
     d = steps[0].nrows()

@@ -53,6 +53,19 @@ class Flow(NamedTuple):
     sizes: Array
 
 
+class Kernel(NamedTuple):
+    """What inputs at any time ``s`` on ``k`` intervals make of the state at the end: ``Phi(end, s) F(s)`` times the
+    length, as polynomials of the share of the interval that is left at ``s``, ``terms (k, p + 1, d, m + mw)``.
+
+    ``error (k,)``: bound of what its columns are off by, in the norm of largest entries in the coordinates of
+    `Expansion.units`, times ``sizes (k, m + mw)``.
+    """
+
+    terms: Array
+    error: Array
+    sizes: Array
+
+
 class Majorant(NamedTuple):
     """How far the series of a flow is summed, ``terms`` of it with ``degree`` of the system's; what it is off by then,
     ``error (k,)``; what drives inputs, ``sizes (k, m + mw)``; and the factor by which states grow, ``growth (k,)``."""
@@ -182,23 +195,63 @@ class Expansion:
         """About what ``A`` is between ``times (k + 1,)``: at the middles, for what asks how fast the system is."""
         return self.at((times[:-1] + times[1:]) / 2)[0]
 
+    def kernel(self, starts: Array, stops: Array) -> Kernel:
+        """The kernel of intervals ``(k,)`` within one segment each. With ``Psi(r) = Phi(end, end - r h)``, ``Psi' = h
+        Psi A``: a series majorised by that of ``y' = a y``, times that of ``F``."""
+        d, segments = self.units.size, self.segment_of((starts + stops) / 2)
+        length = stops - starts
+        law, bulk = self._recentred(segments, stops, -length, length)
+        A, F, scale = law[..., :d], law[..., d:], self.units / self.units[:, None]
+        sizes, full = ((np.abs(one[..., :d]) * scale).sum(axis=3).max(axis=2) for one in (law, bulk))
+        pushes, fuller = ((np.abs(one[..., d:]) / self.units[:, None]).max(axis=2) for one in (law, bulk))
+        inputs = pushes.sum(axis=1)
+        most = np.where(inputs > 0.0, inputs, np.inf)
+        shares = (pushes / most[:, None]).max(axis=2, initial=0.0)
+        rest = self.remainder[segments] * length[:, None, None]
+        r = (rest[..., :d] * scale).sum(axis=2).max(axis=1)
+        lost = ((rest[..., d:] / self.units[:, None]).max(axis=1) / most).max(axis=1, initial=0.0)
+        orders, terms, tail = np.arange(DEGREE + 1.0), TERMS, np.zeros(length.size)
+        for terms in (*(one for one in FEWER if one < TERMS), TERMS):
+            tail = np.full(length.size, np.inf)
+            for R in CIRCLES:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    y = np.exp((sizes * R ** (orders + 1.0) / (orders + 1.0)).sum(axis=1))
+                    tail = np.fmin(tail, y * (shares * R**orders).sum(axis=1) * R ** -float(terms) / (R - 1.0))
+            if (tail <= IDLE).all():
+                break
+        back, found = [np.tile(np.eye(d), (length.size, 1, 1))], []
+        for n in range(terms + 1):
+            last = min(n, DEGREE)
+            found.append(sum((back[n - k] @ F[:, k] for k in range(1, last + 1)), back[n] @ F[:, 0]))
+            back.append(sum((back[n - k] @ A[:, k] for k in range(1, last + 1)), back[n] @ A[:, 0]) / (n + 1))
+        a, a_full = sizes.sum(axis=1), full.sum(axis=1)
+        forced = (fuller.sum(axis=1) / most).max(axis=1, initial=0.0)
+        rounded = rounding((DEGREE + 1) * (d + 4)) * (2.0 + a_full) * np.exp(a_full) * forced
+        error = tail + (r + lost * (1.0 + r)) * np.exp(a + r) + rounded
+        return Kernel(np.stack(found, axis=1), error * (1.0 + 1e-9), inputs)
+
+    def _recentred(self, segments: np.ndarray, times: Array, steps: Array, length: Array) -> tuple[Array, Array]:
+        """The coefficients of ``[A F]`` times a ``length (k,)`` in powers of the share of ``steps (k,)`` that are made
+        from ``times (k,)``, ``(k, DEGREE + 1, d, d + m + mw)``; and what they are made of, before anything cancels."""
+        centre = (self.ends[segments] + self.ends[segments + 1]) / 2
+        radius = (self.ends[segments + 1] - self.ends[segments]) / 2
+        at, share = (times - centre) / radius, steps / radius
+        powers = at[:, None] ** np.arange(DEGREE + 1)
+        moved = np.zeros((times.size, DEGREE + 1, DEGREE + 1))
+        for n in range(DEGREE + 1):
+            for k in range(n, DEGREE + 1):
+                moved[:, n, k] = comb(k, n) * powers[:, k - n] * share**n
+        every = self.coefficients[segments].reshape(times.size, DEGREE + 1, -1)
+        shape, factor = (times.size, *self.coefficients.shape[1:]), length[:, None, None, None]
+        return (moved @ every).reshape(shape) * factor, (np.abs(moved) @ np.abs(every)).reshape(shape) * factor
+
     def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
         """`flow` of intervals within one segment each, with control and disturbance side by side, and by what factor
         states grow at most."""
         d = self.units.size
-        centre = (self.ends[segments] + self.ends[segments + 1]) / 2
-        radius = (self.ends[segments + 1] - self.ends[segments]) / 2
         length = stops - starts
-        at, share = (starts - centre) / radius, length / radius
-        powers = at[:, None] ** np.arange(DEGREE + 1)
-        moved = np.zeros((starts.size, DEGREE + 1, DEGREE + 1))
-        for n in range(DEGREE + 1):
-            for k in range(n, DEGREE + 1):
-                moved[:, n, k] = comb(k, n) * powers[:, k - n] * share**n
-        every = self.coefficients[segments].reshape(starts.size, DEGREE + 1, -1)
-        shape = (starts.size, DEGREE + 1, d, sum(self.channels) + d)
-        law = (moved @ every).reshape(shape) * length[:, None, None, None]
-        bulk = (np.abs(moved) @ np.abs(every)).reshape(shape) * length[:, None, None, None]
+        law, bulk = self._recentred(segments, starts, length, length)
+        shape = law.shape
         majorant = self._majorant(segments, law, bulk, length)
         A, driven = law[..., :d], law[..., d:]
         total, terms = np.zeros((starts.size, *shape[2:])), []

@@ -1,0 +1,191 @@
+"""Errors of execution of a known system that changes with time: what `Execution` is to the others.
+
+The worst of them is the sum of ``share_j |u_jk| int |c'Phi(t, s) B_j(s)| ds`` over the pieces of the command, each cut
+where a segment of the system ends. What the time after a piece makes of its end is a row; ``Phi(end, s) B(s)`` on the
+piece is a polynomial with balls as coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.measurable import signed, swept
+from sparserob_core.checker.reach.varying.flow import VaryingFlow, products
+from sparserob_core.checker.reach.varying.loop import ORDER
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb_mat
+
+KEPT = 16  # nodes, up to which the transitions from every earlier one are remembered; cells come one after another
+TIMES_KEPT = 4096  # times at which what errors make of the states is remembered
+
+
+@final
+@dataclass(eq=False)
+class VaryingExecution:
+    """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
+    none where only rows are asked for."""
+
+    law: VaryingFlow
+    shares: Array
+    breakpoints: Array
+    pieces: Sequence[arb_mat]
+    _kernels: dict[tuple[float, float], Enclosed] = field(default_factory=dict, repr=False)
+    _onward: dict[int, Enclosed] = field(default_factory=dict, repr=False)
+    _added: dict[tuple[float, bytes], tuple[Array, Array]] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def marks(self) -> list[float]:
+        """Where a piece of the command begins or ends, or a segment of the system."""
+        last = float(self.breakpoints[-1])
+        return sorted({*self.breakpoints.tolist(), *(end for end in self.law.ends if 0.0 < end < last)})
+
+    @cached_property
+    def owner(self) -> np.ndarray:
+        """The piece of the command that each piece between marks is in."""
+        return np.searchsorted(self.breakpoints, np.array(self.marks[:-1]), side="right") - 1
+
+    @cached_property
+    def sizes(self) -> Enclosed:
+        """How large errors may be on every piece of the command, ``(K, m)``."""
+        control = Enclosed.all(self.pieces, (len(self.pieces), self.shares.size))
+        size = self.shares * np.abs(control.mid)
+        return Enclosed(size, (self.shares * control.rad + rounding(2) * size) * OUTWARD)
+
+    def least(self, c: Array, time: float) -> Array:
+        """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
+        found = np.zeros((self.breakpoints.size - 1, self.shares.size))
+        low, _, which = self._integrals(c[None], time, np.arange(len(self.marks) - 1))
+        np.add.at(found, self.owner[which], np.maximum(low[:, 0], 0.0))
+        return found * self.shares * (1.0 - rounding(which.size))
+
+    def added(self, c: Array, time: float) -> tuple[float, float]:
+        """What the worst errors add to ``c'x(t)``, between two numbers."""
+        low, high = self._summed(c[None], time)
+        return float(low[0]), float(high[0])
+
+    def bent(self, c: Array, start: float, stop: float) -> float:
+        """How far `added` may be above its chord on ``[start, stop]``, which lies within one piece and one segment.
+
+        An integrand that began before is ``|c'Phi(t, start) y|``, above its chord by no more than ``c'Phi(t, start) y``
+        is from its own: its terms ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What begins within the
+        cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
+        """
+        d, m, width = c.size, self.shares.size, (stop - start) * (1.0 + rounding(2))
+        begun = self._summed(np.eye(d), start)[1]
+        terms, rest = self.law.within(start, stop, ORDER)
+        line, total = stacked([balls(c)]), 0.0
+        for n, term in enumerate([*terms[2:], rest], 2):
+            found = Enclosed.of(line * stacked([row[:d] for row in term.tolist()]))
+            factor = 2.0 if n == len(terms) else (n - 1) * n ** (-n / (n - 1))
+            total += factor * float((np.abs(found.mid) + found.rad)[0] @ begun)
+        place = min(max(0, int(np.searchsorted(self.breakpoints, start, side="right")) - 1), len(self.pieces) - 1)
+        size = self.sizes.mid[place] + self.sizes.rad[place]
+        if size.any():
+            (most, slope), units = self.law.most(start, stop), np.array(self.law.units)
+            A, B = most[:, :d], most[:, d : d + m]
+            pace = float((A * units / units[:, None]).sum(axis=1).max())
+            grown = np.exp(pace * width) * units * ((B @ size) / units).max()
+            second = (slope[:, d : d + m] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ grown
+            total += width**2 / 8.0 * float(np.abs(c) @ second)
+        return total * OUTWARD * (1.0 + rounding(8 * d * d))
+
+    def _summed(self, rows: Array, time: float) -> tuple[Array, Array]:
+        """What errors add along ``rows (n, d)`` at a time, at least and at most, ``(n,)``."""
+        key = time, rows.tobytes()
+        if key not in self._added:
+            used = np.flatnonzero((self.sizes.mid + self.sizes.rad).any(axis=1))
+            low, high, which = self._integrals(rows, time, np.flatnonzero(np.isin(self.owner, used)))
+            owner = self.owner[which]
+            mid, rad = self.sizes.mid[owner, None], self.sizes.rad[owner, None]
+            at_least = (np.maximum(low, 0.0) * np.maximum(mid - rad, 0.0)).sum(axis=(0, 2))
+            at_most = (high * (mid + rad)).sum(axis=(0, 2))
+            lost = rounding(2 * which.size * self.shares.size + 8) * at_most
+            if len(self._added) >= TIMES_KEPT:
+                self._added.clear()
+            self._added[key] = at_least - lost * OUTWARD, at_most + lost * OUTWARD
+        return self._added[key]
+
+    def _integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
+        """``int |c'Phi(t, s) B_j(s)| ds`` for ``rows (n, d)`` over those of the ``pieces`` between marks that begin
+        before the time: between ``(q, n, m)`` and ``(q, n, m)``; and which pieces these are, ``(q,)``."""
+        m, begins = self.shares.size, np.array(self.marks[:-1])
+        which = pieces[begins[pieces] < time]
+        if not which.size:
+            none = np.zeros((0, len(rows), m))
+            return none, none, which
+        last = int(np.searchsorted(begins, time, side="left")) - 1
+        kernels, lines = [], []
+        if (which < last).any():
+            begun = Enclosed.of(stacked([balls(row) for row in rows]) * self.law.over(self.marks[last], time)[0])
+            past, onward = which[which < last], self._onward_to(last)
+            found = _carried(begun, Enclosed(onward.mid[past], onward.rad[past]))
+            kernels += [self._kernel(self.marks[k], self.marks[k + 1]) for k in past]
+            lines.append(found)
+        if which[-1] == last:
+            kernels.append(self._kernel(self.marks[last], time))
+            lines.append(Enclosed(rows[None], np.zeros((1, *rows.shape))))
+        order = max(one.mid.shape[0] for one in kernels)
+        K = Enclosed(*(
+            np.array([np.pad(part, ((0, order - len(part)), (0, 0), (0, 0))) for part in parts])
+            for parts in zip(*((one.mid, one.rad) for one in kernels), strict=True)
+        ))  # fmt: skip
+        a, rad = (np.concatenate([getattr(one, name) for one in lines]) for name in ("mid", "rad"))
+        plain = np.einsum("qnd,qpdm->qnpm", a, K.mid)
+        sizes = np.abs(K.mid).sum(axis=1)
+        off = np.einsum("qnd,qdm->qnm", np.abs(a), rounding(a.shape[2] + 1) * sizes + K.rad.sum(axis=1))
+        off = (off + np.einsum("qnd,qdm->qnm", rad, sizes + K.rad.sum(axis=1))) * OUTWARD
+        off = off + rounding(4 * order + 32) * np.abs(plain).sum(axis=2)  # as they are summed
+        flat = signed(plain.reshape(-1, *plain.shape[2:]), off.reshape(-1, m))
+        value, more, less = (one.reshape(off.shape) / 2.0 for one in swept(*flat, np.ones(off.size)))
+        return (value - less) / OUTWARD, (value + more) * OUTWARD, which
+
+    def _kernel(self, start: float, stop: float) -> Enclosed:
+        """That of an interval, in powers of ``u`` from -1 to 1 across it, ``(p + 1, d, m)``."""
+        if (start, stop) not in self._kernels:
+            from flint import arb, arb_poly
+
+            m, terms = self.shares.size, self.law.kernel(start, stop)
+            half = arb_poly([arb(1) / 2, arb(1) / 2])
+            d = terms[0].nrows()
+            every = [[arb_poly([one[i, j] for one in terms])(half).coeffs() for j in range(m)] for i in range(d)]
+            none = arb(0)
+            found = [
+                stacked([[entry[k] if k < len(entry) else none for entry in row] for row in every])
+                for k in range(len(terms))
+            ]
+            if len(self._kernels) >= TIMES_KEPT:
+                self._kernels.clear()
+            self._kernels[start, stop] = Enclosed.all(found, (len(terms), d, m))
+        return self._kernels[start, stop]
+
+    def _onward_to(self, node: int) -> Enclosed:
+        """The transitions to a mark from the end of every piece before it, ``(node, d, d)``."""
+        if node not in self._onward:
+            found = products(self._steps[:node])[1:]
+            if len(self._onward) >= KEPT:
+                self._onward.clear()
+            self._onward[node] = Enclosed.all(found, (node, *2 * (self.law.system.states,)))
+        return self._onward[node]
+
+    @cached_property
+    def _steps(self) -> list[arb_mat]:
+        return [self.law.over(*ends)[0] for ends in pairwise(self.marks)]
+
+
+def _carried(rows: Enclosed, steps: Enclosed) -> Enclosed:
+    """``rows (n, d)`` times every one of ``steps (q, d, d)``: ``(q, n, d)``."""
+    size, there = np.abs(rows.mid), np.abs(steps.mid)
+    rad = np.einsum("nd,qde->qne", size, steps.rad + rounding(size.shape[1]) * there)
+    rad = (rad + np.einsum("nd,qde->qne", rows.rad, there + steps.rad)) * OUTWARD
+    return Enclosed(np.einsum("nd,qde->qne", rows.mid, steps.mid), rad)

@@ -1,0 +1,150 @@
+"""Guards checker/reach/varying/execution: errors of execution of systems that change with time: integrals of absolute
+values between closed forms, and their bends."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+pytest.importorskip("flint")
+from flint import arb, ctx
+
+import sparserob_core as sr
+import sparserob_core.checker.reach.varying.flow as varying
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.measurable import Execution
+from sparserob_core.checker.reach.varying.execution import VaryingExecution
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.sip.convex_set import Array
+
+SHARES = np.array([0.1, 0.03])
+CONTROL = np.array([[0.0, 0.8, -0.8, 0.0, 0.3, 0.0], [0.5, 0.0, 0.0, -0.2, 0.0, 1.0]])
+POINTS = np.linspace(0.0, 3.0, 7)
+A, B = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.2, 0.0], [1.0, -0.7]])
+ROCKET = VaryingSystem.of([[0, 1], [0, 0]], [[0, 0], ["1/(4 - t)", 0]], 3.0)
+FADING = VaryingSystem.of([["-1/(1 + t)"]], [["t", 1]], 3.0, [["exp(-t)"]])
+WILD = VaryingSystem.of([["-t", 2], [-1, "t"]], [["t^2", 0], ["cos(9*t)", 1]], 3.0)
+C = np.array([1.0, -0.4])
+
+
+def made(system: VaryingSystem, control: Array = CONTROL) -> VaryingExecution:
+    pieces = [stacked([[arb(float(v))] for v in u]) for u in control.T]
+    return VaryingExecution(VaryingFlow(system, 3.0), SHARES, POINTS, pieces)
+
+
+def test_a_constant_that_is_dressed_is_the_constant() -> None:
+    with ctx.workprec(128):
+        known = sr.OptimalControlProblem(
+            system=sr.LinearSystem(A, B), horizon=3.0, initial_state=[0, 0], control=sr.Box([-1.0, -1.0], [1.0, 1.0])
+        )
+        system = VaryingSystem.of(*([[f"{x} + 0*t" for x in row] for row in part] for part in (A, B)), 3.0)
+        found = made(system)
+        plain = Execution(known, SHARES, POINTS, found.pieces)
+        for time in (0.0, 0.3, 1.7, 3.0):
+            one, other = found.added(C, time), plain.added(C, time)
+            assert one[0] <= other[1] and other[0] <= one[1] <= one[0] + 1e-12
+            np.testing.assert_allclose(found.least(C, time), plain.least(C, time), atol=1e-12)
+
+
+def primitive(time: float, s: float) -> float:
+    """That of ``(time - s - 0.4) / (4 - s)``."""
+    return s + (4.4 - time) * float(np.log(4.0 - s))
+
+
+@pytest.mark.parametrize("time", [0.5, 1.7, 3.0])
+def test_a_falling_mass_is_between_the_bounds_of_the_closed_form(time: float) -> None:
+    with ctx.workprec(128):
+        found = made(ROCKET)
+        least, (low, high) = found.least(C, time), found.added(C, time)
+    truth = np.zeros(6)
+    for k, begin in enumerate(POINTS[:-1]):
+        a, b = min(begin, time), min(begin + 0.5, time)
+        turn = float(np.clip(time - 0.4, a, b))
+        ends = [primitive(time, float(one)) for one in (a, turn, b)]
+        truth[k] = abs(ends[1] - ends[0]) + abs(ends[2] - ends[1])
+    assert (least[:, 0] <= 0.1 * truth + 1e-15).all() and not least[:, 1].any()
+    np.testing.assert_allclose(least[:, 0], 0.1 * truth, atol=1e-12)
+    whole = float(0.1 * np.abs(CONTROL[0]) @ truth)
+    assert low <= whole + 1e-15 and whole - 1e-15 <= high <= low + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [(None, 0), ("TERMS", (4,)), ("TERMS", (6,)), ("ORDER", 2), ("ENOUGH", 1e-3)]
+)
+def test_balls_of_a_kernel_hold_the_closed_form(
+    name: str | None, value: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name is not None:
+        monkeypatch.setattr(varying, "SHARP", 1.0)
+        monkeypatch.setattr(varying, "ENOUGH", 1e-30)
+        monkeypatch.setattr(varying, name, value)
+    with ctx.workprec(128):
+        flow, widest = VaryingFlow(FADING, 3.0), 0.0
+        for part in flow.segments:
+            terms, h = flow.kernel(part.start, part.stop), arb(part.stop) - arb(part.start)
+            for left in (arb(0), arb(3) / 10, arb(1)):
+                s = arb(part.stop) - left * h
+                exact = [h * one * (1 + s) / (1 + arb(part.stop)) for one in (s, arb(1), (-s).exp())]
+                for j, truth in enumerate(exact):
+                    ball = sum((one[0, j] * left**n for n, one in enumerate(terms)), arb(0))
+                    assert ball.overlaps(truth)
+                    widest = max(widest, float(ball.rad()))
+    assert widest > 1e-9 if name else widest < 1e-17
+
+
+def test_what_the_system_is_at_most_and_how_fast_it_changes_is_not_exceeded() -> None:
+    with ctx.workprec(128):
+        flow = VaryingFlow(WILD, 3.0)
+        for part in flow.segments:
+            most, slope = flow.most(part.start, part.stop)
+            t = np.linspace(part.start, part.stop, 9)
+            for found, inside in ((most[:, :2], np.array([[t, 2 + 0 * t], [1 + 0 * t, t]])),
+                                  (most[:, 2:4], np.array([[t**2, 0 * t], [np.cos(9 * t), 1 + 0 * t]])),
+                                  (slope[:, :2], np.array([[1 + 0 * t, 0 * t], [0 * t, 1 + 0 * t]])),
+                                  (slope[:, 2:4], np.array([[2 * t, 0 * t], [9 * np.sin(9 * t), 0 * t]]))):  # fmt: skip
+                highest = np.abs(inside).max(axis=2)
+                assert (highest <= found * (1 + 1e-12)).all()
+                assert (found <= 3.0 * highest + 2.0).all()
+
+
+@pytest.mark.parametrize("system", [ROCKET, pytest.param(WILD, marks=pytest.mark.slow)], ids=["rocket", "wild"])
+def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(system: VaryingSystem) -> None:
+    ratios, share = [], np.linspace(0.0, 1.0, 5)
+    with ctx.workprec(128):
+        found = made(system)
+        for begin, end in list(pairwise(found.marks))[1::4]:
+            for start, stop in ((begin, end), (begin + 0.3 * (end - begin), begin + 0.4 * (end - begin))):
+                path = np.array([found.added(C, float(start + (stop - start) * s))[0] for s in share[:-1]])
+                path = np.append(path, found.added(C, stop)[0])
+                above = (path - (1 - share) * path[0] - share * path[-1]).max()
+                said = found.bent(C, start, stop)
+                assert above <= said * (1 + 1e-9) + 1e-13
+                ratios.append(above / max(said, 1e-12))
+    assert max(ratios) > (0.4 if system is ROCKET else 0.2)
+
+
+def test_what_begins_within_a_cell_bends_it_too() -> None:
+    share, control = np.linspace(0.0, 1.0, 7), np.zeros((2, 6))
+    control[0, 2] = 1.0
+    with ctx.workprec(128):
+        found = made(ROCKET, control)
+        stop = min(1.5, *(one for one in found.marks if one > 1.0))
+        path = np.array([found.added(C, float(t))[0] for t in 1.0 + share * (stop - 1.0)])
+        above = (path - (1 - share) * path[0] - share * path[-1]).max()
+        assert above <= found.bent(C, 1.0, stop) and above > 0.0
+
+
+def test_bounds_allow_for_what_is_rounded_and_for_the_size_of_the_control() -> None:
+    with ctx.workprec(128):
+        found = made(ROCKET)
+        low, high = found.added(C, 2.9)
+        assert high - low >= 1e-15 * high
+        ball = arb(0.5, 1e-3)
+        wide = VaryingExecution(found.law, SHARES, POINTS, [stacked([[ball], [arb(0)]])] * 6)
+        fixed = made(ROCKET, np.tile([[0.501], [0.0]], (1, 6)))
+        thin = made(ROCKET, np.tile([[0.499], [0.0]], (1, 6)))
+        assert wide.added(C, 2.9)[1] >= fixed.added(C, 2.9)[0]
+        assert wide.added(C, 2.9)[0] <= thin.added(C, 2.9)[1]
