@@ -163,8 +163,7 @@ def _functionals(
     response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
     execution = None
     if problem.execution is not None:
-        from sparserob_core.control.response.measurable import Execution
-        from sparserob_core.control.response.varying.execution import VaryingExecution
+        from sparserob_core.control.response.measurable import Execution, VaryingExecution
 
         made = VaryingExecution if varying else Execution
         execution = made(response, control.breakpoints, np.asarray(problem.execution))
