@@ -107,12 +107,18 @@ mutants: $(INSTALLED)
 	$(BIN)/python -m tests.mutants COUNT=$(COUNT) SEED=$(SEED) FOLDERS=$(FOLDERS) STAGE=$(STAGE) JOBS=$(JOBS)
 
 # One environment for each interpreter, set up once; one on which a dependency cannot be installed is named and left out.
+# Looked for on the path, among those of pyenv (whose names on the path answer for versions that are switched on only), and by uv.
 test-pythons:
 	@tried=; status=0; for python in $(PYTHONS); do \
-	  $$python -c 'import venv, ensurepip' 2>/dev/null || continue; \
+	  version=$${python#python}; found=; \
+	  for candidate in $$python $$(ls -r $${PYENV_ROOT:-$$HOME/.pyenv}/versions/$$version.*/bin/python 2>/dev/null) \
+	      $$(uv python find --no-python-downloads $$version 2>/dev/null); do \
+	    if $$candidate -c 'import venv, ensurepip' 2>/dev/null; then found=$$candidate; break; fi; \
+	  done; \
+	  if [ -z "$$found" ]; then echo "$$python: not found, left out" >&2; continue; fi; \
 	  place=$(VENV)/pythons/$$python; \
 	  if [ ! $$place/installed -nt pyproject.toml ]; then \
-	    $$python -m venv --clear $$place && $$place/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[all]' \
+	    $$found -m venv --clear $$place && $$place/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[all]' \
 	      || { echo "$$python: not every dependency can be installed there; left out" >&2; continue; }; \
 	    touch $$place/installed; \
 	  fi; \

@@ -38,7 +38,9 @@ autodoc_typehints = "none"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 
 html_theme = "furo"
-html_static_path: list[str] = []
+html_static_path = ["make_site/static"]
+html_css_files = ["site.css"]
+html_show_copyright = False  # LICENSE says whose it is
 html_theme_options = {
     "light_css_variables": {"color-brand-primary": "#0072b2", "color-brand-content": "#0072b2"},
     "dark_css_variables": {"color-brand-primary": "#56b4e9", "color-brand-content": "#56b4e9"},

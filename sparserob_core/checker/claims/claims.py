@@ -455,10 +455,10 @@ def _lower(case: Case) -> str:
         return f"no control of these acts for less than {written:.9g} {case.problem.names.time}".rstrip()
     written, derived = number(case.certificate, "lower_bound"), _multiplied(case, priced=True)
     if written <= 0.0:  # absolute values, lengths and positive semidefinite squares: no multiplier is needed for that
-        return f"no control costs less than {written:.12g}, for no term of the cost is negative"
+        return f"no control costs less than {written:.12g}{_effort(case)}, for no term of the cost is negative"
     if not derived >= written:
         raise Broken(f"{written!r} is written, the multipliers prove {float(derived.lower())!r}")
-    return f"no control costs less than {written:.12g}" + (
+    return f"no control costs less than {written:.12g}{_effort(case)}" + (
         f" (the multipliers prove {float(derived.lower()):.12g})"
         if not derived - written < FIGURES * max(1.0, abs(written))
         else ""
@@ -481,7 +481,7 @@ def _causal(case: Case) -> str:
     written, derived = number(data, "lower_bound"), causal_bound(case, data, priced=True)
     if not derived >= written:
         raise Broken(f"causal: {written!r} is written, the multipliers prove {float(derived.lower())!r}")
-    return f"no causal policy costs less than {written:.9g}, by {count} signals"
+    return f"no causal policy costs less than {written:.9g}{_effort(case)}, by {count} signals"
 
 
 def _tree(case: Case) -> float:

@@ -86,7 +86,9 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
     relative = (
         ["share of exact", *(f"to {share:.4g} %" for share in (100 * share for share in SHARES))] if known else []
     )
-    columns = ["run", "status", "lower bound", "cost", *relative, "worst violation", "evaluations", "seconds"]
+    unit = f" [{comparison.cost_unit}]" if comparison.cost_unit else ""
+    bounds = [f"lower bound{unit}", f"cost{unit}"]
+    columns = ["run", "status", *bounds, *relative, "worst violation", "evaluations", "seconds"]
     rows = []
     for curve, label in zip(comparison.curves, comparison.labels, strict=True):
         part = (
@@ -115,13 +117,14 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
 def comparison_remarks(comparison: Comparison) -> Iterator[str]:
     """What is to be said beside the table: where the exact value comes from, who has no curve, and bounds that
     contradict it."""
+    unit = f" {comparison.cost_unit}" if comparison.cost_unit else ""
     if comparison.certified is None:
         yield "no run is certified: the exact optimum is not known, and no line is drawn for it"
         above = np.inf
     else:
         best = comparison.curves[comparison.certified]
         yield (
-            f"exact optimum {comparison.exact:.9g}: certified by {comparison.labels[comparison.certified]} "
+            f"exact optimum {comparison.exact:.9g}{unit}: certified by {comparison.labels[comparison.certified]} "
             f"to a relative gap of {best.gap:.1e}"
         )
         above = best.upper_bound + SLACK * max(1.0, abs(best.upper_bound))
@@ -130,8 +133,8 @@ def comparison_remarks(comparison: Comparison) -> Iterator[str]:
             yield f"no curve of {label}: {_reason(curve)}"
         elif curve.bound[-1] > above:
             yield (
-                f"the lower bound of {label} exceeds the certified upper bound {best.upper_bound:.9g}: one of the two"
-                " is wrong"
+                f"the lower bound of {label} exceeds the certified upper bound {best.upper_bound:.9g}{unit}: one of"
+                " the two is wrong"
             )
     if comparison.undrawn:
         yield comparison.undrawn

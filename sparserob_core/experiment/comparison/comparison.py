@@ -33,6 +33,12 @@ class Comparison:
         titles = {curve.title for curve in self.curves}
         return titles.pop() if len(titles) == 1 else ""
 
+    @property
+    def cost_unit(self) -> str:
+        """The unit of the costs, where it is known and the same of all."""
+        units = {curve.cost_unit for curve in self.curves}
+        return units.pop() if len(units) == 1 else ""
+
     def share(self, bound: float) -> float:
         """The share of the exact value that a lower bound reaches: 1 less what it falls short, relative to the exact
         value's size."""

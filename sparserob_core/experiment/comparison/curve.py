@@ -32,7 +32,8 @@ class Curve:
 
     For a run that searches (``searched``) an evaluation is a value of g, and the entries are those at which the bound
     rose; for any other it is a relaxed program, and the entries are the rounds. Numbers that the run does not know are
-    nan. ``measured``: the unit of the worst ``violation``, where it is known.
+    nan. ``measured``: the unit of the worst ``violation``, ``cost_unit`` that of the cost and its bounds, where they
+    are known.
     """
 
     directory: Path
@@ -56,6 +57,7 @@ class Curve:
     """Coordinates of what is searched, or variables of a decision; 0: it is not known."""
     counts: bool = False
     """Whether its cost is the time that the control acts."""
+    cost_unit: str = ""
 
     def reached_after(self, target: float) -> float:
         """The seconds after which the bound was at least ``target``; infinite when it never was."""
@@ -75,7 +77,7 @@ def spent_until(target: float, best: Array, spent: Array) -> float:
 def read_curve(directory: Path) -> Curve:
     """Read a run directory; raises `InputError` when it is none, or a file of it cannot be understood."""
     summary, config = stored_run(directory).summary, _config(directory / "config.yaml")
-    counts, worst, units = _mapping(summary, "counts"), _mapping(summary, "worst"), summary.get("units")
+    counts, worst, units = (_mapping(summary, key) for key in ("counts", "worst", "units"))
     status, searched = str(summary["status"]), (directory / SEARCH[0]).is_file()
     spent, lower = _number(counts, "evaluations" if searched else "relaxed_programs"), _number(summary, "lower_bound")
     seconds, upper = _number(summary, "seconds"), _number(summary, "upper_bound")
@@ -97,7 +99,8 @@ def read_curve(directory: Path) -> Curve:
         gap=relative_gap(lower, upper, summary.get("cost_scale") or 0.0),
         cost=_number(summary, "cost"),
         violation=_number(worst, "violation"),
-        measured=str(units.get("worst") or "") if isinstance(units, Mapping) else "",
+        measured=str(units.get("worst") or ""),
+        cost_unit=str(units.get("cost") or ""),
         all_evaluations=spent,
         all_seconds=seconds,
         dimension=_dimension(directory, searched) if status not in WITHOUT_CURVE else 0,

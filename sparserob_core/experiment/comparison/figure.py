@@ -11,6 +11,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import plain
 from sparserob_core.experiment.figures.style import require_matplotlib, require_writable, style, write_figure
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
         pen = _pen(number, len(curves), curve.searched)
         _draw_curve(left, curve.evaluations, curve.bound, curve.all_evaluations, {**pen, "label": text})
         _draw_curve(right, curve.seconds, curve.bound, curve.all_seconds, pen)
-    _draw_axes(left, right, comparison.exact, curves)
+    _draw_axes(left, right, comparison.exact, curves, comparison.cost_unit)
     figure.suptitle(comparison.title, x=0.012, ha="left", fontsize=11.5)
     figure.legend(
         *left.get_legend_handles_labels(),
@@ -95,7 +96,7 @@ def _draw_curve(ax: Axes, places: Array, bound: Array, end: float, pen: dict[str
     ax.plot(x[x > 0], y[x > 0], drawstyle="steps-post", markersize=5, markevery=marked[x > 0].tolist(), zorder=3, **pen)
 
 
-def _draw_axes(left: Axes, right: Axes, exact: float, curves: list[Curve]) -> None:
+def _draw_axes(left: Axes, right: Axes, exact: float, curves: list[Curve], unit: str) -> None:
     for ax in (left, right):
         _scale(ax)
         ax.grid(axis="y", color=look.MIST, linewidth=0.6)
@@ -110,7 +111,7 @@ def _draw_axes(left: Axes, right: Axes, exact: float, curves: list[Curve]) -> No
                 label=f"exact optimum {exact:.9g}",
             )
     left.set_ylim(*_view(exact, curves))
-    left.set_ylabel("lower bound of the cost $J$")
+    left.set_ylabel("lower bound of the cost $J$" + (f" [{plain(unit)}]" if unit else ""))
     searched = {curve.searched for curve in curves}
     left.set_xlabel(
         " or ".join(

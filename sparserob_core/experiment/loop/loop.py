@@ -158,6 +158,8 @@ def _closed(
         shown=times[shown],
         paths=[(law, path) for law, path, _ in kept],
         controls=[(law, control) for law, _, control in kept],
+        cost_unit=str((finished.summary.get("units") or {}).get("cost") or ""),
+        paid_in=model.problem.cost_unit,
         units={
             **{one.name: joined(one.measured).strip() for one in model.constraints},
             CONTROL: joined(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",

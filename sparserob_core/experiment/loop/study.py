@@ -23,7 +23,9 @@ class ClosedLoops:
     and times inside every piece; the set of controls is ``control``. ``milliseconds (steps,)`` of every step.
     ``cost`` is that of the run, ``planned`` the first term of it for the plan's own control (under feedback the nominal
     one), ``costs (loops,)`` the same term for the control that was applied, law after law. ``paths`` and ``controls``
-    are the first loops of every law, for drawing. ``units``: of the violations, as the config names them.
+    are the first loops of every law, for drawing. ``units``: of the violations, as the config names them;
+    ``cost_unit``: of the cost of the run, ``paid_in``: of
+    that of a control, where they are known.
     """
 
     title: str
@@ -44,6 +46,8 @@ class ClosedLoops:
     paths: Sequence[tuple[str, Array]] = field(repr=False)
     controls: Sequence[tuple[str, Array]] = field(repr=False)
     units: Mapping[str, str] = field(default_factory=dict)
+    cost_unit: str = ""
+    paid_in: str = ""
     undrawn: str = ""
     """Why there is no figure, where one was asked for."""
     periods: int = 1
@@ -109,16 +113,20 @@ class ClosedLoops:
         """Columns and rows for people."""
         summary = self.summary()
         time, cost = summary["milliseconds"], summary["cost"]
+        unit, paid_in = (f" {one}" if one else "" for one in (self.cost_unit, self.paid_in))
         rows = [
             ("loops", f"{sum(self.laws.values())} ({', '.join(f'{n} {law}' for law, n in self.laws.items())})"),
             *([("periods of each", f"{self.periods}")] if self.periods > 1 else []),
             ("steps", f"{self.steps}" + (f", {self.resolved} of them solved anew and better" if self.resolve else "")),
             ("a step takes", f"{time['median']:.3g} ms (median), {time['99%']:.3g} ms (99 %)"),
-            ("cost of the run", f"{cost['run']:.7g}"),
-            ("cost of its control", f"{cost['plan']:.7g}" + " when nothing happens"),
-            ("cost of the loops", f"{cost['mean']:.7g} on average, {cost['least']:.7g} to {cost['largest']:.7g}"),
+            ("cost of the run", f"{cost['run']:.7g}{unit}"),
+            ("cost of its control", f"{cost['plan']:.7g}{paid_in} when nothing happens"),
+            (
+                "cost of the loops",
+                f"{cost['mean']:.7g}{paid_in} on average, {cost['least']:.7g} to {cost['largest']:.7g}{paid_in}",
+            ),
             *(
-                (f"cost under {law}", f"{one.mean():.7g} on average, {one.max():.7g} at most")
+                (f"cost under {law}", f"{one.mean():.7g}{paid_in} on average, {one.max():.7g}{paid_in} at most")
                 for law, one in self.paid.items()
             ),
             *(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import plain
 from sparserob_core.experiment.margin.search import FEASIBLE, Margin
 from sparserob_core.sip.convex_set import Array
 
@@ -77,7 +78,7 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
             label="nothing proven feasible",
         )
     _forbid(ax, found, np.array([point.factor for point in found.curve]))
-    ax.set_ylabel("least cost $J$")
+    ax.set_ylabel(least_cost(found))
     ax.set_xlabel(varied.label)
     if varied.relative:
         _unit_axis(ax, found)
@@ -86,6 +87,11 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
         *ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
     )
     return figure
+
+
+def least_cost(found: Margin) -> str:
+    """The label of an axis of costs, with their unit where it is known."""
+    return "least cost $J$" + (f" [{plain(found.cost_unit)}]" if found.cost_unit else "")
 
 
 def _band(factors: Array, lower: Array, upper: Array, rising: bool) -> tuple[Array, Array, Array]:
@@ -128,8 +134,8 @@ def _unit_axis(ax: Axes, found: Margin) -> None:
 
 
 def _mathematics(quantity: str) -> str:
-    for plain, drawn in (("|w_i|", "$|w_i|$"), ("|u_i|", "$|u_i|$"), ("|x_i(0)|", "$|x_i(0)|$")):
-        quantity = quantity.replace(plain, drawn)
+    for written, drawn in (("|w_i|", "$|w_i|$"), ("|u_i|", "$|u_i|$"), ("|x_i(0)|", "$|x_i(0)|$")):
+        quantity = quantity.replace(written, drawn)
     return quantity
 
 

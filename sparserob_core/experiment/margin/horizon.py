@@ -87,6 +87,7 @@ class HorizonSearch:
             remarks=(f"kept fixed: {kept}",),
             seconds=time.perf_counter() - started,
             covered=tuple(self.covered),
+            cost_unit=self.problem.cost_unit,
         )
 
     def _answer(self, best: Point | None, low: float, stuck: str) -> tuple[Answer, str]:

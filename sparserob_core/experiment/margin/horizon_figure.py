@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import plain
+from sparserob_core.experiment.margin.figure import least_cost
 from sparserob_core.experiment.margin.search import FEASIBLE, Margin
 
 if TYPE_CHECKING:
@@ -58,8 +60,8 @@ def draw_horizons(found: Margin) -> Figure:
             zorder=0,
             label=f"excluded up to {found.lower:.6g}",
         )
-    ax.set_ylabel("least cost $J$")
-    ax.set_xlabel("horizon $T$ [unit of time]")
+    ax.set_ylabel(least_cost(found))
+    ax.set_xlabel(plain(found.quantity).replace("horizon", "horizon $T$", 1))
     ax.set_title(found.title, pad=8)
     figure.legend(
         *ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6

@@ -119,13 +119,14 @@ def summary_of_margin(found: Margin) -> dict[str, Any]:
 def margin_rows(found: Margin) -> list[tuple[str, str]]:
     """What a user wants to know of a margin, as rows of a table."""
     rows = [("status", f"{found.status}: {found.message}")]
+    unit = f" {found.cost_unit}" if found.cost_unit else ""
     if found.of == HORIZON:
         rows += [
             (f"shortest {found.quantity}", _between(found.lower, found.upper)),
             ("excluded", f"(0, {found.lower:.9g}] on {len(found.covered)} cells" if found.covered else "nothing"),
         ]
         if found.feasible is not None:
-            cost = f"{found.feasible.upper_bound:.9g}"
+            cost = f"{found.feasible.upper_bound:.9g}{unit}"
             rows.append(("proven feasible", f"at {found.upper:.9g}: {found.feasible.status}, cost {cost}"))
         return [*rows, ("seconds", f"{found.seconds:.3f}")]
     rows += [
@@ -137,7 +138,7 @@ def margin_rows(found: Margin) -> list[tuple[str, str]]:
         rows.append(("no causal policy", f"from the factor {found.causal_upper:.9g} on{over}"))
     for name, point in (("proven feasible", found.feasible), ("proven infeasible", found.infeasible)):
         if point is not None:
-            cost = f", cost {point.upper_bound:.9g}" if np.isfinite(point.upper_bound) else ""
+            cost = f", cost {point.upper_bound:.9g}{unit}" if np.isfinite(point.upper_bound) else ""
             rows.append((name, f"at {point.factor:.9g}: {point.status}{cost}"))
     return [*rows, ("seconds", f"{found.seconds:.3f}")]
 

@@ -47,6 +47,8 @@ class Scaling:
     nested: bool = True
     """Whether a feasible factor makes every smaller (for the largest) or greater one (for the smallest) feasible
     too."""
+    cost_unit: str = ""
+    """Of the cost, where the problem names one."""
 
 
 def scaling(
@@ -90,7 +92,8 @@ def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
         "execution": "",
     }.get(chosen.of.split(".")[0], of_states if chosen.relative else joined([names.time])).strip()
     label = chosen.label.replace("[unit of time]", f"[{unit}]") if unit else chosen.label
-    return replace(chosen, label=label, quantity=f"{chosen.quantity} [{unit}]" if unit else chosen.quantity)
+    quantity = f"{chosen.quantity} [{unit}]" if unit else chosen.quantity
+    return replace(chosen, label=label, quantity=quantity, cost_unit=problem.cost_unit)
 
 
 def _choices(

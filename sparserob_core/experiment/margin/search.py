@@ -58,7 +58,8 @@ class Margin:
     ``curve``: runs at equally spaced horizons, feasible or not.
 
     Under a policy, of the ``disturbance``: at ``causal_upper`` and above no causal policy exists; ``causal_ended`` says
-    why no smaller factor was sought (as in ``result.json``), ``None`` where none was.
+    why no smaller factor was sought (as in ``result.json``), ``None`` where none was. ``cost_unit``: of the cost and
+    its bounds, where the problem names one.
     """
 
     title: str
@@ -79,6 +80,7 @@ class Margin:
     covered: tuple[tuple[float, float], ...] = ()
     causal_upper: float = np.nan
     causal_ended: Ended | None = None
+    cost_unit: str = ""
 
     __repr__ = brief
 
@@ -144,6 +146,7 @@ class MarginSearch:
             curve=curve,
             causal_upper=causal,
             causal_ended=ended,
+            cost_unit=self.scaling.cost_unit,
             seconds=time.perf_counter() - started,
         )
 

@@ -4,6 +4,8 @@ that is not known."""
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,8 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.comparison.compare import comparison_table
+from sparserob_core.experiment.margin.horizon_figure import draw_horizons
+from sparserob_core.experiment.margin.margin import margin_rows
 from sparserob_core.experiment.terminal.table import result_rows
 
 NAMES = {
@@ -54,6 +58,7 @@ def test_a_run_tells_units_row_by_row(outcome: sr.Outcome) -> None:
     assert where["cost"] == "N s" and all(rows[key].endswith(" N s") for key in ("cost", "lower bound", "upper bound"))
     said = {claim.name: claim.text for claim in sr.check(outcome).claims}
     assert said["cost"].endswith(" N s")
+    assert re.search(r"less than [\d.e-]+ N s\b", said["lower bound"])
 
 
 @pytest.mark.parametrize(
@@ -85,9 +90,13 @@ def test_horizons_and_comparisons_have_units(outcome: sr.Outcome) -> None:
     problem = PROBLEM | {"names": NAMES, "initial_state": [0.5, 0.0], "disturbance": None, "terminal": [{"box": 0.45}]}
     found = sr.margin({"problem": problem, "dictionaries": PIECES}, of="horizon", tolerance=0.05, write=False)
     assert found.quantity == "horizon [s]" and " s is feasible, proven on " in found.message
+    assert found.cost_unit == "N s" and dict(margin_rows(found))["proven feasible"].endswith(" N s")
+    axes = draw_horizons(replace(found, curve=(found.feasible,))).axes[0]
+    assert axes.get_ylabel().endswith("[N s]") and axes.get_xlabel().endswith("[s]")
     columns, rows = comparison_table(sr.compare([outcome.directory, outcome.directory]))
     worst = outcome.summary["units"]["worst"]
     assert all(dict(zip(columns, row, strict=True))["worst violation"].endswith(f" {worst}") for row in rows)
+    assert {"lower bound [N s]", "cost [N s]"} <= set(columns)
 
 
 def test_a_parameter_is_told_by_its_name(tmp_path: Path) -> None:
@@ -183,6 +192,7 @@ def test_tables_of_samples_and_loops_have_units(outcome: sr.Outcome) -> None:
     assert " m at t = " in path["largest violation seen"] and path["largest violation seen"].endswith(" s")
     assert path["worst case"].endswith(" m") and path["at"].endswith(" s")
     loops = dict(sr.loop(outcome, trajectories=1).table()[1])
+    assert all(" N s" in text for row, text in loops.items() if row.startswith("cost "))
     assert loops["largest violation of path"].endswith(" m")
     assert loops["largest violation of control"].endswith(" N")
 
