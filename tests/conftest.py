@@ -16,7 +16,7 @@ import sparserob_core.shapes
 del os.environ["SPARSEROB_SHAPES"]
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from tests.support.drafts import drafts
 from tests.support.places import ROOT
@@ -26,8 +26,8 @@ assert sparserob_core.shapes.CHECKED
 
 __all__ = ["command", "config", "drafts", "process"]
 
-# the same examples in every run; HYPOTHESIS_PROFILE=default searches for new ones
-settings.register_profile("repeatable", derandomize=True)
+# the same examples in every run, however slow the machine is; HYPOTHESIS_PROFILE=default searches for new ones
+settings.register_profile("repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 gc.set_threshold(50_000, 20, 20)
