@@ -3,7 +3,10 @@ witness that is neither more nor less than it is."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -106,3 +109,43 @@ def test_the_measurable_worst_is_that_of_ever_shorter_pieces() -> None:
 def test_a_system_that_is_too_fast_is_not_followed() -> None:
     with pytest.raises(Unchecked):
         Adjoint.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), np.ones(1), 1.0, Clock())
+
+
+def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
+    """Rows and integrals that are moved by as much as they may be off, to the corners that matter."""
+    plain, off = worst("constant"), 1e-3
+    deviation, signal = np.array([0.02, -0.05, 0.03]), np.array([[0.5, -0.2, 0.4, -0.1]])
+    times = np.array([0.3, 2.2, 4.0])
+
+    def moved(of_state: np.ndarray, of_input: np.ndarray, wide: float) -> Worst:
+        known = plain.adjoint
+
+        def at(t: np.ndarray) -> Enclosed:
+            rows = known.at(t)
+            return Enclosed(rows.mid + of_state, rows.rad + wide)
+
+        def between(t: np.ndarray, start: np.ndarray | float, stop: np.ndarray | float) -> Enclosed:
+            part = known.between(t, start, stop)
+            sign = np.ones((len(part.mid), 2))  # of what is driven and signalled on each piece, so that nothing cancels
+            if np.ndim(start):
+                sign[:, 1] = np.sign(signal[0])
+            else:
+                sign[:, 0] = np.sign(plain.drives.mid[0, np.searchsorted(GRID, start)])
+            return Enclosed(part.mid + of_input * sign, part.rad + wide)
+
+        stub = SimpleNamespace(at=at, between=between, step=known.step, count=known.count)
+        return replace(plain, adjoint=cast(Adjoint, stub))
+
+    sides = np.sign(plain.centre)
+    up, down = (moved(side * off * sides, side * off * np.ones(2), 0.0) for side in (1.0, -1.0))
+    blurred = moved(np.zeros(3), np.zeros(2), off)
+    for t in times.tolist():
+        low, high = blurred.along(t, deviation, GRID, signal)
+        assert low <= down.along(t, deviation, GRID, signal)[0] + 1e-12
+        assert high >= up.along(t, deviation, GRID, signal)[1] - 1e-12
+        assert high - low <= up.along(t, deviation, GRID, signal)[1] - down.along(t, deviation, GRID, signal)[0] + 1e-9
+    # with sets, whose support functions may be more than is met; and without
+    for some, slack in ((lambda one: one, 8e-3), (lambda one: replace(one, pushed=None, begun=None), 1e-9)):
+        tops, highest = some(blurred).most(times)[0], some(up).most(times)[0]
+        assert (highest <= tops + 1e-12).all()
+        assert (tops <= highest + slack).all()

@@ -204,6 +204,12 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
                 f = np.einsum("rdw,nd->nrw", K, a)
                 h = case.bound.support(f.reshape(-1, f.shape[2])).reshape(f.shape[:2]) - f @ middle
                 truth = h @ w
+                if share == 1.0:  # how far a piece pushes every state, either way
+                    tops = [case.bound.support(s * K.reshape(-1, K.shape[2])).reshape(K.shape[:2]) for s in (1.0, -1.0)]
+                    sides = np.array([w @ (top - s * K @ middle) for s, top in zip((1.0, -1.0), tops, strict=True)])
+                    far, own = sides.max(axis=0), loop.radii[loop.starts[piece] : loop.starts[piece] + 2]
+                    assert (own >= far - 2e-5).all()
+                    assert (own <= far + 2e-5).all()
                 assert (np.abs(found.mid - truth) <= found.rad + 2e-5).all()
                 assert (found.rad < 1e-11).all()
                 for offset in 1e-3 * rng.uniform(-1, 1, size=(3, *a.shape)):
