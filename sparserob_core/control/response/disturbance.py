@@ -9,6 +9,7 @@ exactly.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -84,8 +85,21 @@ class DisturbanceModel:
     @shaped
     def support(self, weights: Float[Array, "*k L mw"]) -> Float[Array, " *k"]:
         """``sigma (...,)``, the largest value of the functional over the admissible disturbances."""
-        answer: Array = self.set.support(self.blocks(weights)).sum(axis=-1)
-        return answer
+        return self.pushed(self.blocks(weights))
+
+    @shaped
+    def pushed(self, blocks: Float[Array, "*k nb q"]) -> Float[Array, " *k"]:
+        """`support` of a functional that is given on every block ``(..., nb, q)``."""
+        if self._radii is None:
+            answer: Array = self.set.support(blocks).sum(axis=-1)
+            return answer
+        return np.asarray(np.abs(blocks).reshape(*blocks.shape[:-2], -1) @ np.tile(self._radii, blocks.shape[-2]))
+
+    @cached_property
+    def _radii(self) -> Array | None:
+        """Half the widths ``(q,)`` of a set that is a box about 0: then one product sums up all blocks."""
+        about = isinstance(self.set, Box) and self.set.is_bounded and np.array_equal(self.set.lower, -self.set.upper)
+        return self.set.upper if isinstance(self.set, Box) and about else None
 
     @shaped
     def worst(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k mw L"]:

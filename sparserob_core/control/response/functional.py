@@ -34,6 +34,9 @@ WITHOUT_PROOF = "measurable disturbances are proven only for known systems and s
 LEGS_KEPT = 256  # cells of parameters whose lifted systems are kept
 Leg: TypeAlias = LiftedSystem | VaryingMotion
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
+# Numbers of a product over many directions that are made at once (2 MB), so that they stay near the processor. With
+# sixteen times as many a curved wall is sampled in up to twice the time; with a fourth part of them in no less.
+NEAR = 250_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,30 +247,27 @@ class WorstCase:
 
     def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
         """``max_w c'x(t)`` at a decision as a function of the direction alone, at ``times (k,)`` and ``parameters (k,
-        nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, ``(j,)``. Weights are linear in the
-        direction, so that those of the axes are computed once."""
-        d, control = self.response.initial_state.size, self.on_grid(theta)
-        axes = np.tile(np.eye(d), (times.size, 1))
-        every = [np.repeat(one, d, axis=0) for one in (times, parameters)]
-        parts = [self.response.weights(every[0][part], axes[part], every[1][part]) for part in self._chunks(every[1])]
-        free = np.concatenate([part.free for part in parts])
-        driven = np.concatenate([np.einsum("klm,ml->k", part.control, control) for part in parts])
-        states = (free @ self.response.initial_state + driven).reshape(-1, d)
-        disturbed = np.concatenate([part.disturbance for part in parts])
-        known = [one.reshape(times.size, d, *one.shape[1:]) for one in (free, disturbed)]
+        nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, as many at each, ``(j,)``. Weights are
+        linear in the direction, so that those of the axes are computed once."""
+        known, model = self._axes(times, parameters), self.disturbance
+        states = known.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", known.control, self.on_grid(theta))
+        by_block = model if model is not None and model.kind != "measurable" else None
+        blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(known.disturbance)
 
         def along(directions: Array, which: np.ndarray) -> Array:
-            found = (directions * states[which]).sum(axis=1)
-            size = max(1, CHUNK // max(1, known[1][:1].size))
-            for part in (slice(first, first + size) for first in range(0, which.size if self.disturbed else 0, size)):
-                at, c = which[part], directions[part]
-                weights = Weights(
-                    np.einsum("kd,kde->ke", c, known[0][at]),
-                    np.zeros((at.size, 0, 0)),
-                    np.einsum("kd,kdlq->klq", c, known[1][at]),
-                )
-                found[part] += self._support(weights, times[at], c, parameters[at])
-            return np.asarray(found)
+            places = which[np.flatnonzero(np.diff(which, prepend=-1))]
+            c = directions.reshape(places.size, -1, directions.shape[1])
+            found: Array = (c * states[places, None]).sum(axis=2)
+            for part in _parts(places.size, max(1, NEAR // max(1, c[:1, :, 0].size * blocks[:1, 0].size))):
+                at, turned = places[part], c[part]
+                free = turned @ known.free[at]
+                found[part] += self._begun(free.reshape(-1, free.shape[2])).reshape(free.shape[:2])
+                if by_block is not None:
+                    on_blocks = turned @ blocks[at].reshape(*blocks[at].shape[:2], -1)
+                    found[part] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
+            if model is not None and by_block is None:
+                found += self.measurable(times[which], directions, parameters[which]).reshape(found.shape)
+            return found.reshape(-1)
 
         return along
 
@@ -280,6 +280,8 @@ class WorstCase:
         model, (k, r) = self.disturbance, (times.size, directions.shape[0])
         changes = self.response.grid.mode is not None
         aged = model is None or (model.kind != "measurable" and self.response.uniform and model.by_piece)
+        if (changes or not aged) and r > directions.shape[1] and not (model and model.kind == "measurable"):
+            return self._profile_by_axes(times, directions, parameter)
         if changes or not aged:
             every = np.broadcast_to(parameter, (k * r, parameter.size))
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
@@ -292,10 +294,37 @@ class WorstCase:
             sigma = DisturbanceSupport(known, model, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
         if self.initial is not None:
             several = max(1, CHUNK // (r * directions.shape[1]))
-            for part in (slice(first, first + several) for first in range(0, k, several)):
+            for part in _parts(k, several):
                 rows = self.response.propagator.backwards(times[part], directions, parameter)
                 sigma[part] += self.initial.support(rows)
         return sigma
+
+    def _profile_by_axes(self, times: Array, directions: Array, parameter: Array) -> Array:
+        """`profile` of more directions than there are axes: what the axes give to the blocks of the disturbance does
+        for all directions, in which it is linear."""
+        (r, d), sigma, model = directions.shape, np.zeros((times.size, directions.shape[0])), self.disturbance
+        several = max(1, CHUNK // (d * self.response.numbers(parameter.size)))
+        for part in _parts(times.size if self.disturbed else 0, several):
+            known = self._axes(times[part], np.broadcast_to(parameter, (times[part].size, parameter.size)))
+            k = known.free.shape[0]
+            sigma[part] = self._begun((directions @ known.free).reshape(k * r, d)).reshape(k, r)
+            if model is None:
+                continue
+            blocks = model.blocks(known.disturbance)
+            for near in _parts(k, max(1, NEAR // (r * blocks[0, 0].size))):
+                begun = blocks[near][:, :, blocks[near].any(axis=(0, 1, 3))]
+                turned = directions @ begun.reshape(begun.shape[0], d, begun[0, 0].size)
+                sigma[part][near] += model.pushed(turned.reshape(begun.shape[0], r, *begun.shape[2:]))
+        return sigma
+
+    def _axes(self, times: Array, parameters: Array) -> Weights:
+        """The weights of the functionals along the axes at times ``(k,)``, with one dimension ``(k, d, ...)`` more."""
+        d = self.response.initial_state.size
+        axes = np.tile(np.eye(d), (times.size, 1))
+        every = [np.repeat(one, d, axis=0) for one in (times, parameters)]
+        parts = [self.response.weights(every[0][part], axes[part], every[1][part]) for part in self._chunks(every[1])]
+        known = [np.concatenate([getattr(part, name) for part in parts]) for name in ("free", "control", "disturbance")]
+        return Weights(*(one.reshape(times.size, d, *one.shape[1:]) for one in known))
 
     @shaped
     def support_over(self, lifted: Leg, H: Float[Array, "r d"], joined: Combination | None = None) -> Supports | None:
@@ -464,3 +493,8 @@ class WorstCase:
         if 0 < count <= size:
             return [slice(None)]
         return [slice(start, start + size) for start in range(0, count, size)]
+
+
+def _parts(count: int, several: int) -> list[slice]:
+    """``count`` numbers, ``several`` at a time."""
+    return [slice(first, first + several) for first in range(0, count, several)]

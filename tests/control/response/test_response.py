@@ -3,6 +3,7 @@ single trajectories."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.linalg import expm
 from sparserob_core.control.enclosures.matrix_exponential import exponential, transitions
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response import functional
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import lift
 from sparserob_core.control.response.response import FEW, Response, merge_grids
@@ -165,6 +167,23 @@ def test_the_profile_of_a_uniform_grid_equals_the_offsets(seed, pieces):
     fast = functionals.profile(times, directions, parameter)
     slow = functionals.offsets(np.repeat(times, 3), np.tile(directions, (7, 1)), np.tile(parameter, (21, 1)))
     assert np.allclose(fast.ravel(), slow, rtol=1e-10, atol=1e-11)
+
+
+@pytest.mark.parametrize("disturbance", ["uneven", "three walsh"])
+@pytest.mark.parametrize("bound", [Box([-0.1, -0.2], [0.3, 0.1]), Box([-0.3, -0.2], [0.3, 0.2])])
+@pytest.mark.parametrize("begun", [None, Box([-0.2, 0.0, -0.1], [0.1, 0.4, 0.1])])
+def test_the_profile_of_many_directions_equals_the_offsets(disturbance, bound, begun, monkeypatch):
+    """Few numbers at once, so that there are several parts of times and of those."""
+    monkeypatch.setattr(functional, "CHUNK", 200)
+    monkeypatch.setattr(functional, "NEAR", 200)
+    rng = np.random.default_rng(6)
+    functionals = worst_case(uncertain(rng), UNEVEN, DICTIONARIES[disturbance], bound)
+    functionals = replace(functionals, initial=begun)
+    times, directions = np.append(rng.uniform(0, HORIZON, 9), [0.0, 1.1, HORIZON]), rng.normal(size=(7, 3))
+    parameter = rng.uniform(-1, 1, 2)
+    fast = functionals.profile(times, directions, parameter)
+    slow = functionals.offsets(np.repeat(times, 7), np.tile(directions, (12, 1)), np.tile(parameter, (84, 1)))
+    np.testing.assert_allclose(fast.ravel(), slow, rtol=1e-12, atol=1e-13)
 
 
 def test_ages_are_powers_of_the_transition():
