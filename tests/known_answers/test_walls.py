@@ -11,8 +11,12 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.experiment.run import run as run_module
+from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.method import Deadline
-from sparserob_core.sip.methods import sparsest
+from sparserob_core.sip.methods import exchange, sparsest
+from sparserob_core.sip.proof.branch_and_bound import CELLS
+from sparserob_core.sip.working import securing
+from sparserob_core.sip.working.ledger import prover_of
 from sparserob_core.sip.working.plain import PlainRows
 from sparserob_core.sip.working.robust import RobustRows
 
@@ -292,3 +296,24 @@ def test_a_day_of_heating_is_certified_and_a_limit_leaves_a_proven_control() -> 
     limited = sr.run(heating(), {"limits.seconds": 10}, quiet=True, figures=False).result
     assert limited.status in ("certified", "verified")
     assert whole.lower_bound <= limited.upper_bound <= 1.05 * whole.lower_bound
+
+
+def test_where_nothing_is_as_far_away_as_large_cells_ask_for_smaller_ones_prove(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A proof whose large cells exclude nothing below the size of the wall, as in four dimensions."""
+    monkeypatch.setattr(run_module, "Deadline", Clock)
+    monkeypatch.setattr(Clock, "looks", 14)
+
+    def coarse(program: Any, tools: Any) -> Any:
+        proving = prover_of(program, tools)
+
+        def prover(x: Any, cells: int = CELLS) -> Any:
+            open_ = Proof("path", "undecided", 1e3, index=np.array([2.0]), row=0, cells=1, formulation="reduced")
+            return proving(x, cells) if cells > securing.GLANCE else [open_]
+
+        return prover
+
+    monkeypatch.setattr(exchange, "prover_of", coarse)
+    result = sr.run(ridden("moving", 16), quiet=True, figures=False).result
+    assert result.status == "verified"

@@ -18,7 +18,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import NO_BOUND, Branch, Dual, Leaf
 from sparserob_core.sip.finite import HIGHS, NOBODY, FiniteProgram
 from sparserob_core.sip.inner.duality import farkas_margin, proving
-from sparserob_core.sip.inner.simplex.silence import silent
+from sparserob_core.sip.inner.simplex.interruptible import with_integers
 from sparserob_core.sip.inner.solve import elastic_program, unrelaxed
 from sparserob_core.sip.inner.vertex import Corner, simplex
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -236,7 +236,7 @@ def proposed(
 ) -> Array | None:
     """What HiGHS takes for the decision ``(n,)`` of which the fewest entries count among those that meet the ``rows``,
     up to a relative ``gap``; ``None`` where it finds none in time. Nothing is believed of it."""
-    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.optimize import LinearConstraint
     from scipy.sparse import csr_array, eye_array, hstack
 
     finite, prices = relaxed.finite(rows.G, rows.h, 0.0), prices_of(program)
@@ -252,15 +252,10 @@ def proposed(
         for part, low, high in plain
         if part.shape[0]
     ]
-    with silent():
-        found = milp(
-            np.concatenate([np.zeros(n), cost]),
-            constraints=couplings,
-            integrality=np.concatenate([np.zeros(n), np.ones(count)]),
-            bounds=Bounds(np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])),
-            options={"time_limit": SECONDS if left is None else min(SECONDS, left), "mip_rel_gap": gap},
-        )
-    return None if found.x is None else np.asarray(found.x[:n])
+    bounds = np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])
+    seconds = SECONDS if left is None else min(SECONDS, left)
+    found = with_integers(np.concatenate([np.zeros(n), cost]), couplings, *bounds, n, seconds, gap)
+    return None if found is None else found[:n]
 
 
 def _off_or_on(S: Any, finite: FiniteProgram, prices: Array, together: np.ndarray) -> tuple[Array, list[Any]]:

@@ -25,6 +25,7 @@ from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows
 from sparserob_core.sip.inner.duality import Terms, without_norms
+from sparserob_core.sip.inner.simplex.interruptible import run
 from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.simplex.tangents import Tangents
 from sparserob_core.sip.solver import Asked, QuadraticProgram
@@ -488,7 +489,7 @@ class Growing:
 
     def _run(self) -> int:
         """Solve it; the steps that this took."""
-        self.highs.run()
+        run(self.highs)
         done = self.highs.getInfo()
         return int(1 + max(0, done.simplex_iteration_count) + INNER * max(0, done.ipm_iteration_count))
 

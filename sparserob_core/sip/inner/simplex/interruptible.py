@@ -1,0 +1,92 @@
+"""HiGHS, ended by an interrupt: Python hears of signals only where its own code goes on, and HiGHS may take minutes."""
+
+from __future__ import annotations
+
+import atexit
+import threading
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.inner.simplex.silence import silent
+
+if TYPE_CHECKING:
+    from scipy.optimize import LinearConstraint
+
+# Seconds that HiGHS has to end after it was asked to, for which it looks once an iteration. Without any it would go on
+# beside what is done with the answer; with ten times as many a presolve, which does not look, keeps a terminal waiting.
+GRACE = 0.5
+# Seconds after which a signal is heard that another thread has caught. With a tenth of them this thread takes a
+# noticeable share of the processor; ten times as many are a second.
+LOOK = 0.1
+
+
+def run(highs: Any) -> None:
+    """Solve what a `highspy.Highs` holds. In the main thread a `KeyboardInterrupt`, by a key, a signal or an alarm,
+    ends it; where it does not look for that in time, only the end of the process waits for it."""
+    if threading.current_thread() is not threading.main_thread():
+        highs.run()
+        return
+    stop, done = threading.Event(), threading.Event()
+
+    def asked(event: Any) -> None:
+        if stop.is_set():
+            event.interrupt()
+
+    def solve() -> None:
+        try:
+            highs.run()
+        finally:
+            done.set()
+
+    highs.cbSimplexInterrupt += asked
+    highs.cbIpmInterrupt += asked
+    highs.cbMipInterrupt += asked
+    try:
+        threading.Thread(target=solve, daemon=True).start()
+        while not done.wait(LOOK):  # a signal that another thread catches does not wake this one
+            pass
+    except KeyboardInterrupt:
+        stop.set()
+        if not done.wait(GRACE):
+            atexit.register(done.wait)  # a thread that asks for the interpreter after its end aborts the process
+        raise
+    highs.cbSimplexInterrupt -= asked
+    highs.cbIpmInterrupt -= asked
+    highs.cbMipInterrupt -= asked
+
+
+def with_integers(
+    cost: Array,
+    couplings: Sequence[LinearConstraint],
+    lower: Array,
+    upper: Array,
+    continuous: int,
+    seconds: float,
+    gap: float,
+) -> Array | None:
+    """A point ``(n,)`` of least ``cost (n,)`` up to a relative ``gap``, of which all entries but the first so many are
+    whole numbers; the best that is known after ``seconds``, ``None`` where none is."""
+    import highspy
+    from scipy.sparse import csr_array, vstack
+
+    table = csr_array(vstack([csr_array(one.A) for one in couplings]))
+    sides = [
+        np.concatenate([np.broadcast_to(side, one.A.shape[0]) for side, one in zip(each, couplings, strict=True)])
+        for each in ([one.lb for one in couplings], [one.ub for one in couplings])
+    ]
+    none, whole = np.zeros(0, dtype=np.int32), np.arange(continuous, cost.size, dtype=np.int32)
+    with silent():
+        highs: Any = highspy.Highs()
+        for name, value in (("output_flag", False), ("threads", 1), ("time_limit", seconds), ("mip_rel_gap", gap)):
+            highs.setOptionValue(name, value)
+        highs.addCols(cost.size, cost, lower, upper, 0, np.zeros(cost.size, dtype=np.int32), none, np.zeros(0))
+        starts, places = table.indptr[:-1].astype(np.int32), table.indices.astype(np.int32)
+        highs.addRows(table.shape[0], *sides, table.nnz, starts, places, table.data)
+        highs.changeColsIntegrality(whole.size, whole, np.full(whole.size, highspy.HighsVarType.kInteger))
+        run(highs)
+    if highs.getInfo().primal_solution_status != int(highspy.SolutionStatus.kSolutionStatusFeasible):
+        return None
+    return np.array(highs.getSolution().col_value)
