@@ -148,13 +148,14 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
     return known
 
 
-def plot(experiment: Experiment, result: Result, name: str) -> Figure:
-    """A figure of a result, for matplotlib; raises `InputError`, which names those that there are, for another one, and
-    without matplotlib."""
+def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
+    """A figure of a result, for matplotlib: the states, or what cannot hold together, where none is named; raises
+    `InputError`, which names those that there are, for another one, and without matplotlib."""
     from sparserob_core.experiment.figures.style import require_matplotlib, style
 
     require_matplotlib()
     known = pictures(experiment, result)
+    name = name or ("clash" if result.status == "infeasible" else "states")
     if name not in known:
         there = ", ".join(known) or f"none: the result is {result.status}, without a control"
         raise InputError(path="name", expected=f"a figure that there is ({there})", got=f"{name!r}")

@@ -124,11 +124,11 @@ class SolvedProblem(ControlResult):
         self.__dict__["directory"] = outcome.directory
         return outcome
 
-    def plot(self, name: str = "states") -> Figure:
+    def plot(self, name: str | None = None) -> Figure:
         """A figure of the run, for matplotlib: ``control``, ``states``, ``plane`` where the problem names one,
         ``convergence``, ``adversary``, under feedback ``gains``, ``effort`` and ``answers``, of a search ``climb`` and
-        ``landscape``, and ``clash`` of what is infeasible. Raises `InputError`, which names those that there are, for
-        another one."""
+        ``landscape``, and ``clash`` of what is infeasible; without a name the
+        states, or the clash. Raises `InputError`, which names those that there are, for another one."""
         from sparserob_core.experiment.run.drawing import plot
 
         return plot(self.experiment, self, name)
@@ -255,7 +255,7 @@ class Outcome:
         """The worst case of the constraint of that name: `ControlResult.adversary`."""
         return self._of_control().adversary(constraint)
 
-    def plot(self, name: str = "states") -> Figure:
+    def plot(self, name: str | None = None) -> Figure:
         """A figure of the run, for matplotlib: `SolvedProblem.plot`."""
         from sparserob_core.experiment.run.drawing import plot
 

@@ -123,6 +123,7 @@ def test_an_infeasible_result_is_saved_with_its_reason(tmp_path: Path) -> None:
     assert sr.check(result.save(tmp_path / "run")).status == "verified"
     assert (tmp_path / "run" / "figures" / "clash.png").is_file()
     assert "<img" in result._repr_html_()
+    assert len(result.plot().axes) == len(result.plot("clash").axes)
 
 
 def test_a_notebook_shows_a_figure_without_pyplot(solved: sr.SolvedProblem) -> None:
