@@ -240,6 +240,10 @@ def test_a_value_of_a_policy_is_computed_in_the_programs_own_units_and_given_up_
     assert own is not None and programs == [own.program]
     assert g.at(slots) == pytest.approx(result.lower_bound, rel=1e-7)
     assert slots[g.deciding()[0], 0] == pytest.approx(6600.0)
+    moved = slots.copy()
+    moved[0, 0], moved[[0, 2], 1:] = 7050.0, np.nan
+    # begun where the rows at a deviation are at their optimum, or from nothing
+    assert g.at(moved) == pytest.approx(view.relaxed_value(len(slots), 0.0).at(moved), rel=1e-7)
     monkeypatch.setattr("sparserob_core.sip.relaxed.policy_value.LASTING", 0.0)
     everywhere = slots.copy()
     everywhere[:, 1:] = np.nan  # at all deviations, for which a solver needs some hundred steps

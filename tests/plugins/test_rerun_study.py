@@ -279,6 +279,18 @@ def test_the_map_of_a_margin_says_between_which_values_the_critical_one_is(
         assert (signs[sense] * beyond >= -1e-9).all()
 
 
+def test_an_axis_of_costs_that_are_all_the_same_is_no_axis_of_their_rounding() -> None:
+    from sparserob_rerun.study.board import Board, about
+
+    told: dict[str, Any] = {"title": "", "directory": Path(), "axes": ["factor"], "logarithmic": [False]}
+    board = Board(sr.SweepStarted(points=[(0.0,), (1.0,)], arrangement="search", sense="largest", **told))
+    drawing = board.draw({0: {"status": "certified", "cost": 0.1757928, "lower_bound": 0.1757928 * (1 - 1e-9)}}, [])
+    beside = [text for place, text, _ in drawing.labels if 0.0 < place[0] < 150.0 and 0.0 < place[1] < 330.0]
+    assert len(beside) > 1 and len(set(beside)) == len(beside)
+    low, high = about(1.0, 2.0, 0.1)
+    assert (low, high) == (pytest.approx(0.9), pytest.approx(2.1)) and about(0.0, 0.0, 0.1) == (-0.5, 0.5)
+
+
 @pytest.mark.slow
 def test_a_margin_is_recorded_with_its_bracket(tmp_path: Path, command: Command) -> None:
     file = tmp_path / "margin.rrd"

@@ -30,6 +30,10 @@ LINES = 60  # of the table
 EMPTY: ink.Colour = (48, 52, 60, 255)
 FEASIBLE = ("certified", "verified")
 DECADES = 3.0  # between costs from which on their axis is logarithmic
+NARROW = 1e-3
+"""Of a cost, how far an axis of costs goes beyond it at least. With a thousandth of it all numbers beside the axis are
+the same, and a closed gap looks wide; with a hundred times as much, costs that differ by per cent look the same."""
+NAMED = 42.0  # pixels of the name of an axis below it, under its numbers
 
 
 @final
@@ -101,7 +105,7 @@ class Board:
         """The picture of what is known; ``boxes`` holds the cells, as centres and colours; they are filled by
         lines ``thick`` to each side about rectangles of ``half`` the size."""
         drawing, statuses = Drawing(), self.statuses(rows, now)
-        below = HEIGHT + 66.0
+        below = HEIGHT + 72.0
         if self.kind == "line":
             self._line(drawing, rows, statuses)
         elif self.kind == "cells":
@@ -141,7 +145,7 @@ class Board:
             drawing.text(x, bottom + 15, words, ink.GREY)
         also = f" (with {', '.join(self.event.axes[1:])})" if self.event.arrangement == "zip" else ""
         key = self.scales[0].key + also + (", logarithmic" if self.scales[0].log else "")
-        drawing.text((axes.left + right) / 2, bottom + 36, key, ink.GREY)
+        drawing.text((axes.left + right) / 2, bottom + NAMED, key, ink.GREY)
 
     def _upwards(self, drawing: Drawing, axes: Axes, scale: Scale) -> None:
         """Both axes, the second of them upwards."""
@@ -189,8 +193,7 @@ class Board:
         shown += [max(one, least if decades else least - span) for one in lower.values()]
         heights = [float(np.log10(max(one, least))) if decades else one for one in shown]
         low, high = min(heights, default=0.0), max(heights, default=1.0)
-        rim = 0.12 * (high - low) or 0.1 * abs(high) or 0.5
-        axes = self._axes((low - rim, high + rim))
+        axes = self._axes(about(low, high, 0.12))
         what = "cost J, down to its proven lower bound" if costs else "cost J: no point has one yet"
         what += self._critical(drawing, axes, rows)
         self._along(drawing, axes)
@@ -244,6 +247,12 @@ class Board:
         if np.isfinite(bad):
             return "; hatched: infeasible"
         return f"; feasible at {good:.7g}" if np.isfinite(good) else ""
+
+
+def about(low: float, high: float, rim: float) -> tuple[float, float]:
+    """The limits of an axis of costs from ``low`` to ``high``, with a ``rim``, a share of their distance."""
+    beyond = max(rim * (high - low), NARROW * max(abs(low), abs(high))) or 0.5
+    return low - beyond, high + beyond
 
 
 def shaded(status: str) -> ink.Colour:

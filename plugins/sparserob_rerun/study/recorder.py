@@ -181,16 +181,15 @@ class StudyRecorder:
         shown = [*running, *(place for place in self.newest if place not in self.running)][:SHOWN]
         known = [one for place in shown for one in self._range(place) if math.isfinite(one)]
         low, high = (min(known), max(known)) if known else (0.0, 1.0)
-        rim = 0.08 * (high - low) or 0.1 * abs(high) or 0.5
-        axes = Axes(LEFT, 0.0, WIDTH, SHOWN * ROW, (low - rim, high + rim), (0.0, 1.0))
+        axes = Axes(LEFT, 0.0, WIDTH, SHOWN * ROW, board.about(low, high, 0.08), (0.0, 1.0))
         bottom = axes.top + axes.height
         drawing.line("frame", np.array([[LEFT, bottom], [LEFT + WIDTH, bottom]]), ink.GREY, 1.0)
         if known:
-            for value in (low, high) if high > low else (low,):
+            for value in (low, high) if high - low > board.NARROW * max(abs(low), abs(high)) else (low,):
                 x = float(axes.at(value, 0.0)[0, 0])
                 drawing.line("frame", np.array([[x, bottom], [x, bottom + 5]]), ink.GREY, 1.0)
                 drawing.text(x, bottom + 15, f"{value:.6g}", ink.GREY)
-        drawing.text(LEFT + WIDTH / 2, bottom + 36, "bounds on the least cost J*", ink.GREY)
+        drawing.text(LEFT + WIDTH / 2, bottom + board.NAMED, "bounds on the least cost J*", ink.GREY)
         for line, place in enumerate(shown):
             self._one(drawing, axes, (line + 0.5) * ROW, place)
         drawing.text((LEFT + WIDTH) / 2, -20.0, self._heading(len(shown)))

@@ -50,7 +50,7 @@ def legend(drawing: Drawing, left: float, top: float, counts: Mapping[str, int])
     for place, status in enumerate(one for one in COLOURS if counts.get(one)):
         at = np.array([left + 1.4 * STEP * (place % 4), top + 20.0 * (place // 4)])
         mark(drawing, at, status)
-        drawing.text(at[0] + 12.0 + 4.0 * len(f"{counts[status]} {status}"), at[1], f"{counts[status]} {status}")
+        drawing.text(at[0] + 16.0 + 4.5 * len(f"{counts[status]} {status}"), at[1], f"{counts[status]} {status}")
 
 
 def said(value: Any) -> str:

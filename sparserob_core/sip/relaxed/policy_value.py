@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TypeAlias, final
+from typing import Any, TypeAlias, final
 
 import numpy as np
 
@@ -42,24 +42,26 @@ class PolicyValue:
         ]
         self._known: dict[bytes, Linear] = {}
         self._weights: Array = np.zeros(0)
+        self._base: tuple[bytes, Any] = b"", None  # the rows at a deviation of the last tuple, and where they began
 
     def at(self, slots: Array) -> float:
         """The value; ``inf`` where nothing meets the rows, NaN where the solver failed or takes too long."""
         counterpart = Counterpart(self.program.finite, self.spread)
         plain = [self._at_deviation(slot) for slot in slots if not np.isnan(slot).any()]
         order = [*np.flatnonzero(~np.isnan(slots).any(axis=1)), *np.flatnonzero(np.isnan(slots).any(axis=1))]
+        until = time.monotonic() + LASTING
         whose: list[np.ndarray] = []
         if plain:
             G, h, _ = (np.concatenate(part) for part in zip(*plain, strict=True))
             counterpart.add(_plain(G, h, self.spread.size))
             whose = [moves for _, _, moves in plain]
+            self._begun(counterpart, slots[order[: len(plain)]].tobytes())
         for slot in order[len(plain) :]:
             blocks = self._rows(slots[slot])
             for rows in blocks:
                 counterpart.add(rows)
             whose.append(self._flags(blocks))
-        until = time.monotonic() + LASTING
-        answer = counterpart.solve(seconds=LASTING)
+        answer = counterpart.solve(seconds=until - time.monotonic())
         while answer.solved and counterpart.sharpen(answer.x):
             answer = counterpart.solve(seconds=until - time.monotonic())
         if not answer.solved:
@@ -69,6 +71,15 @@ class PolicyValue:
         weights = np.bincount(owner, answer.y * np.concatenate(whose), len(slots))
         self._weights = np.asarray(weights, dtype=float)
         return self.program.cost(np.clip(answer.x, self.program.finite.lower, self.program.finite.upper))
+
+    def _begun(self, counterpart: Counterpart, which: bytes) -> None:
+        """Begin where rows at a deviation alone are at their optimum: on a map all others are added to the same ones,
+        and are few."""
+        if which != self._base[0]:
+            solved = counterpart.solve(seconds=LASTING).solved
+            self._base = which, counterpart.basis if solved else None
+        elif self._base[1] is not None:
+            counterpart.begin(self._base[1])
 
     def weights(self) -> Array:
         """The multipliers ``(D,)`` of the rows at every index that move with it, in the last evaluation."""

@@ -239,6 +239,15 @@ class Counterpart:
         return bool(limits)
 
     @property
+    def basis(self) -> Any:
+        """Where the last answer was, for `begin` of a program with the same rows and variables."""
+        return self._linear.highs.getBasis()
+
+    def begin(self, basis: Any) -> None:
+        """Solve from there the next time; what is added beforehand begins slack, or at 0."""
+        self._linear.highs.setBasis(basis)
+
+    @property
     def approximate(self) -> bool:
         """Whether an answer can be as accurate as is asked for: where the cost is replaced by tangents."""
         return self._tangents is not None
