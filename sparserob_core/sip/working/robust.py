@@ -319,9 +319,9 @@ class RobustRows(Working):
         relaxing = Counterpart(self.program.finite, self.counterpart.spread, elastic=True, asked=self.asked)
         for block in self.counterpart.blocks:
             relaxing.add(block)
-        elastic = relaxing.solve()
+        elastic = relaxing.solve(seconds=left(ledger.tools))
         while elastic.solved and relaxing.sharpen(elastic.x):
-            elastic = relaxing.solve()
+            elastic = relaxing.solve(seconds=left(ledger.tools))
         self.calls += relaxing.answered
         self._count(ledger)
         dual = self.refuted(elastic) if elastic.solved else None

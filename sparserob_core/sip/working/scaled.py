@@ -28,7 +28,7 @@ def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e
             assert family.uncertain is not None
             known.add((family.name, index.tobytes()))
             relaxing.add(family.uncertain(index))
-        answer = relaxing.solve()
+        answer = relaxing.solve(seconds=left(tools))
         if not answer.solved:
             return np.inf
         beyond = answer.slack + accuracy
