@@ -130,3 +130,26 @@ def test_a_bound_of_a_time_rounds_down(monkeypatch: pytest.MonkeyPatch) -> None:
     for found in (activity._whole(case, low), activity._leaf(case, True, {}, [])):
         assert arb(found) <= low
         assert found > 1.0 - 1e-12
+
+
+def test_a_chord_of_what_errors_of_execution_add_is_as_near_to_both_ends_as_it_says() -> None:
+    made, rng = kind("alone"), np.random.default_rng(8)
+    case = made.case(path=[walls("alone", "fixed", made)[0](np.full(4, 9.0))], execution=np.array([0.1, 0.25]))
+    beside = case.beside(case.windows[0], np.eye(2), np.zeros((2, 2)))
+    assert beside is not None
+    for _ in range(40):
+        low = rng.normal(size=2) * 10.0 ** rng.uniform(-3, 0, size=2)
+        high = low + rng.choice([0.0, 1e-16, 1.0], size=2) * rng.uniform(size=2)
+        start, stop = sorted((rng.choice(np.arange(513, 767), size=2, replace=False) / 1024.0).tolist())
+        told: Any = SimpleNamespace(
+            added=lambda c, time, a=start, low=low, high=high: (low[int(time > a)], high[int(time > a)]),
+            bent=lambda c, a, b: 0.0,
+        )
+        (level, slope), off = beside._erring(told, np.array([1.0, 0.0]), start, stop)
+        whole = case.scene.duration(case.scene.ticks(start, stop)).fmpq()  # rounded up to ticks: the end is before 1
+        end = (Fraction(stop) - Fraction(start)) / Fraction(int(whole.p), int(whole.q))
+        for share, a, b in ((Fraction(0), low[0], high[0]), (end, low[1], high[1])):
+            at = Fraction(float(level)) + share * Fraction(float(slope))
+            assert at - Fraction(float(off)) <= Fraction(float(a))
+            assert at + Fraction(float(off)) >= Fraction(float(b))
+        assert off <= max(high - low) + 1e-13
