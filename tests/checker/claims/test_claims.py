@@ -304,3 +304,71 @@ def test_the_share_of_time_that_a_control_acts_is_that_of_what_is_not_dust():
     assert activity.least(below, [], None) == 0.5
     scaled = activity.shared(case, rows, None)[0][0]
     assert scaled[0] == pytest.approx(0.5)
+
+
+def test_how_little_a_control_may_act_is_between_what_multipliers_prove_and_what_one_does():
+    """``x(2) = 1 + u_0 + u_1 <= 0.25`` with ``|u| <= 1`` asks for one piece of two at least."""
+    own = {"constraints": [entry(1.0)], "equalities": []}
+    end = {"terminal": [Box([-9.0], [0.25])]}
+
+    def fewest(status="verified", own_decision=((-0.75, 0.0),), **said):
+        data = {"lower": 0.5, "upper": 0.5, "multipliers": own, **said}
+        more = {"fewest_active": data, "status": status, "multipliers": own}
+        return claims._fewest(case_of(decision=own_decision, certificate=more, **end), status)
+
+    assert "at least 50.0% of the time, this one 50.0%" in fewest()
+    assert "at least 25.0%" in fewest(lower=0.25)
+    assert "at least 50.0%" in fewest("certified", multipliers=None)
+    assert "this one 100.0%" in fewest(own_decision=((-0.5, -0.25),), upper=1.0)
+    for status in ("refuted", "undecided"):
+        assert fewest(status, upper=None).endswith("of the time")
+    for status, wrong in (
+        ("verified", {"lower": 0.5 + 1e-6}),
+        ("verified", {"lower": -1e-6}),
+        ("verified", {"upper": 0.5 + 1e-6}),
+        ("verified", {"upper": 0.5 - 1e-6}),
+        ("verified", {"upper": None}),
+        ("certified", {"upper": None}),
+        ("refuted", {}),
+        ("undecided", {}),
+        ("refuted", {"upper": None, "lower": 0.75}),
+        ("verified", {"multipliers": {"constraints": [], "equalities": []}}),
+    ):
+        with pytest.raises(Broken):
+            fewest(status, **wrong)
+    # another control that acts less, which must be admissible too
+    end_of = {"terminal": {"tolerance": 1e-9, "lower": [[2.0]], "upper": [[2.0]]}}
+    idle = {"decision": [[-0.75, 0.0]], "proof": end_of}
+    assert "another one 50.0%" in fewest(own_decision=((-0.5, -0.25),), **idle)
+    for wrong in ([[-0.7, 0.0]], [[-1.1, 0.0]]):
+        with pytest.raises(Broken):
+            fewest(own_decision=((-0.5, -0.25),), **{**idle, "decision": wrong})
+    with pytest.raises(Broken, match="expected lower"):
+        claims._fewest(case_of(certificate={"fewest_active": 3}, **end), "verified")
+
+
+def test_every_claim_of_a_certificate_has_a_verdict():
+    end = {"terminal": {"tolerance": 1e-9, "lower": [[2.0]], "upper": [[2.0]]}}
+    honest = {
+        "format": 1, "status": "certified", "cost": 0.75, "lower_bound": 0.75, "gap_tolerance": 1e-6, "proof": end,
+        "multipliers": {"constraints": [entry(1.0)], "equalities": []},
+    }  # fmt: skip
+
+    def verdicts(gap=1e-6, **said):
+        case = case_of(decision=((-0.75, 0.0),), certificate={**honest, **said}, terminal=[Box([-9.0], [0.25])])
+        return {one.name: one.verdict for one in claims.check(case, gap)}
+
+    assert verdicts() == dict.fromkeys(["control", "cost", "lower bound", "terminal", "status"], "holds")
+    for wrong in ({"format": 2}, {"format": True}, {"format": "1"}, {"format": None}):
+        assert verdicts(**wrong) == {"certificate": "fails"}
+    for status in ("proven", None, 1):
+        assert verdicts(status=status) == {"status": "fails"}
+    assert verdicts(gap=1e-7)["status"] == "fails"
+    assert verdicts(cost=0.7)["cost"] == "fails"
+    assert verdicts(decision=[[-0.7, 0.0]], cost=0.7)["terminal"] == "fails"
+    assert verdicts(decision=[[-1.1, 0.0]], cost=1.1)["control"] == "fails"
+    assert verdicts(lower_bound=0.76)["lower bound"] == "fails"
+    assert verdicts(lower_bound=0.5)["status"] == "fails"
+    assert verdicts(status="infeasible") == {"infeasibility": "fails"}
+    assert verdicts(status="refuted")["violation"] == "not checked"
+    assert verdicts(repeat=True)["repeat"] == "fails"

@@ -13,7 +13,8 @@ import pytest
 from flint import ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.case import Case, written_policy
+from sparserob_core.checker.claims.claims import _policy
 from sparserob_core.checker.claims.feedback import FeedbackClaims, _Row
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.control.policies.affine import AffinePolicy
@@ -281,3 +282,28 @@ def test_multipliers_prove_no_more_than_every_policy_of_the_kind_pays(name: str)
         sums.append(sum(y * (c @ (x[:, 0] + x[:, 1:] @ off) - limit) for y, c, off, limit in offs))
     assert min(sums) >= told - 1e-9
     assert min(sums) <= told + 3.0
+
+
+def test_what_is_written_of_a_policy_is_what_the_problem_asks_for() -> None:
+    loop, _, _ = driven("outputs")
+    rows = [[[0, 0]], [[0, 1]], [[0, 0], [2, 2]]]
+
+    def judged(answers: Any, cost: Any = "peak", own: str = "peak") -> str:
+        return _policy(claims("outputs", own, {"policy": {"answers": answers, "cost": cost}}).case)
+
+    every = [[[0, k]] for k in range(3)]
+    assert judged(every)
+    assert judged([[[0, 0]], [[0, 0], [1, 1]], [[0, 1], [1, 2]]])
+    for answers, cost, own in ((rows, "peak", "peak"), (every, "worst", "peak"), (every, "peak", "nominal")):
+        with pytest.raises(Broken):
+            judged(answers, cost, own)
+    written = written_policy({"policy": {"answers": rows, "cost": "worst"}}, 3)
+    assert written.mask.tolist() == [[True, False, False], [True, True, False], [True, False, True]]
+    assert written.charge.cost == "worst"
+    assert written_policy({"policy": {"answers": [[], [], []], "cost": "nominal"}}, 3).mask.sum() == 0
+    for wrong in ([0, 1], [-1, 0], [1, 0], [0], [0, 0, 0], [0.0, 0], [True, True], 0, None, "0"):
+        with pytest.raises(Broken):
+            written_policy({"policy": {"answers": [[wrong], [], []], "cost": "nominal"}}, 3)
+    for wrong in ({"answers": rows[:2], "cost": "peak"}, {"answers": rows, "cost": "least"}, {"cost": "peak"}, 3, None):
+        with pytest.raises(Broken):
+            written_policy({"policy": wrong}, loop.breakpoints.size - 1)
