@@ -395,9 +395,10 @@ def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
     judged = claims()
     delayed = replace(judged.case.problem.system, delay=0.5)
     problem = replace(judged.case.problem, system=delayed)
-    free = replace(judged.case, problem=replace(problem, disturbance_class="measurable"), policy=None)
-    with pytest.raises(Unchecked, match="undelayed"):
-        FeedbackClaims(free).loop  # noqa: B018
+    for policy in (None, judged.case.policy):
+        free = replace(judged.case, problem=replace(problem, disturbance_class="measurable"), policy=policy)
+        with pytest.raises(Unchecked, match="undelayed"):
+            FeedbackClaims(free).loop  # noqa: B018
     one = LinearSystem(lambda p: p[0] * np.ones((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)), parameters=box(0.1))
     for policy, kind in ((judged.case.policy, "piecewise_constant"), (None, "measurable")):
         problem = replace(judged.case.problem, system=one, disturbance_class=kind)
