@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, final, get_args
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.claims.cost import Price
 from sparserob_core.checker.claims.duality import Duality, Row, before
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Beside, Window
+from sparserob_core.checker.cost.price import Price
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
@@ -79,6 +79,17 @@ class Case:
     def unloaded(self) -> bool:
         """Whether the policy is what the certificate says of it, since its component is not at hand."""
         return isinstance(self.policy, WrittenPolicy)
+
+    @property
+    def answering(self) -> bool:
+        """Whether the control answers what it measures."""
+        return self.policy is not None
+
+    @property
+    def looped(self) -> bool:
+        """Whether the state is followed block by block of what deviates: where the control answers, and under
+        measurable disturbances."""
+        return self.answering or self.measurable
 
     @property
     def charge(self) -> Cost:
@@ -188,7 +199,7 @@ class Case:
         self.clock.check()
         ends = float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1])
         last = max(*ends, self.problem.horizon)
-        measured = [] if self.policy is None else self.control.breakpoints.tolist()
+        measured = self.control.breakpoints.tolist() if self.answering else []
         every = np.unique(
             [*self.acting, *measured, *self.disturbance.breakpoints.tolist(), *self.problem.system.switches]
         )
@@ -292,7 +303,7 @@ class Case:
             return None
         system = self.problem.system
         one = isinstance(system, LinearSystem | VaryingSystem)
-        if not one or system.parameter_count or system.delay or self.policy is not None:
+        if not one or system.parameter_count or system.delay or self.answering:
             raise Unchecked("the checker knows errors of execution of one known system, undelayed and without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
         if self.changing is not None:
@@ -329,7 +340,7 @@ class Case:
     @property
     def _acting(self) -> Array | None:
         """How far each channel of the decision goes, ``(m,)``; not told of a policy, or where there is no decision."""
-        if self.policy is not None or self.certificate.get("decision") is None:
+        if self.answering or self.certificate.get("decision") is None:
             return None
         return np.asarray(np.abs(self.control.control(self.theta)).max(axis=1))
 

@@ -8,23 +8,30 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls, below
+from sparserob_core.checker.arithmetic.balls import below
 from sparserob_core.checker.claims import activity
+from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case, listed, number, numbers, written_policy
-from sparserob_core.checker.claims.constraints import bounded, equalities, is_followed
-from sparserob_core.checker.claims.duality import Row, before, steps
-from sparserob_core.checker.claims.replay import reached
+from sparserob_core.checker.claims.cells import Work, prove
+from sparserob_core.checker.claims.constraints import bounded, equalities
+from sparserob_core.checker.claims.duality import Row, steps
+from sparserob_core.checker.claims.multipliers import multiplied, weighted
+from sparserob_core.checker.claims.replay import witnessed
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
+from sparserob_core.checker.reach.closed_loop import exactly
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.loop_tube import Still
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.parameters import Parameters
+from sparserob_core.checker.sets.shape import Shape
+from sparserob_core.checker.sets.sides import Curved, Sides
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import ConvexSet
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
-
-    from sparserob_core.checker.claims.feedback import FeedbackClaims
 
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
@@ -36,7 +43,6 @@ SMALL_COST = 1e-6  # of what is added up to a cost: a gap is relative to at leas
 # larger, and a cost may be written lower than it is by as much as a gap that counts as closed.
 CANCELLED = 1e-3
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
-MOST_MULTIPLIERS = 100_000
 ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
 
 
@@ -62,10 +68,10 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
         if status == "refuted":
             return [*claims, judged("violation", lambda: _witness(case))]
         if case.problem.control_step is not None:
-            claims.append(judged("control_step", lambda: _changed(case)))
+            claims.append(judged("control_step", lambda: _steps(case)))
         if case.equalities:
-            claims.append(judged("equalities", lambda: _equalities(case)))
-        claims += [judged(window.name, lambda window=window: _kept(case, window)) for window in case.windows]  # type: ignore[misc]
+            claims.append(judged("equalities", lambda: equalities(case)))
+        claims += [judged(window.name, lambda window=window: bounded(case, window)) for window in case.windows]  # type: ignore[misc]
         if case.problem.repeat or "repeat" in case.certificate:
             claims.append(judged("repeat", lambda: _repeats(case, {one.name: one.verdict for one in claims})))
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
@@ -77,7 +83,7 @@ def derived_bound(case: Case) -> float:
     from flint import ctx
 
     with ctx.workprec(precision_of(case)):
-        return below(_multiplied(case, priced=True))
+        return below(multiplied(case, priced=True))
 
 
 def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> float:
@@ -124,18 +130,6 @@ def judged(name: str, derive: Callable[[], str]) -> Finding:
         return Finding(name, "not checked", "a ball around a divisor holds 0")
 
 
-def _feedback(case: Case) -> FeedbackClaims:
-    """What is derived of a control that answers its measurements."""
-    from sparserob_core.checker.claims.feedback import feedback_of
-
-    return feedback_of(case)
-
-
-def _looped(case: Case) -> bool:
-    """Whether the state is followed block by block of what deviates: under feedback, and measurable disturbances."""
-    return case.policy is not None or case.measurable
-
-
 def _policy(case: Case) -> str:
     """What is written of the policy, which bounds and gains are about, must be what the problem's policy says."""
     written = written_policy(case.certificate, case.control.pieces)
@@ -152,30 +146,63 @@ def _policy(case: Case) -> str:
     return f"it {told}" + (", as is written; its own component is not loaded" if case.unloaded else "")
 
 
-def _kept(case: Case, window: Window) -> str:
-    along_rows = is_followed(case, window)
-    return bounded(case, window) if along_rows or not _looped(case) else _feedback(case).bounded(window)
-
-
-def _equalities(case: Case) -> str:
-    return _feedback(case).equalities() if _looped(case) else equalities(case)
-
-
 def _control(case: Case) -> str:
     """Every piece of the control in its set."""
-    if case.policy is not None:
-        return _feedback(case).control()
-    worst, seen = 0.0, set[int]()
-    for start, piece in zip(case.control.breakpoints[:-1], case.pieces, strict=True):
+    commands, places = answers_of(case).commands, dict[int, int]()
+    for k, command in enumerate(commands):
+        places.setdefault(id(command), k)
+    shown = _in_set(case, case.problem.control, [*places.values()], lambda k: [commands[k]], "{}")
+    return f"{len(commands)} pieces in their set{shown}"
+
+
+def _in_set(
+    case: Case, bound: ConvexSet, places: Sequence[int], parts: Callable[[int], list[arb_mat]], name: str
+) -> str:
+    """Show that the control on every one of these pieces, or its change to it, is in its set, whatever it answers: it
+    is a sum of ``parts (m, 1 + Q)`` that deviate apart. Figures in words."""
+    shape, answers, worst, wide = known(bound), answers_of(case), 0.0, list[int]()
+    for k in places:
         case.clock.check()
-        if id(piece) in seen:
-            continue
-        seen.add(id(piece))
-        over, where = known(case.problem.control).excess(piece.entries())
+        every = parts(k)
+        beyond, point = None, [sum(entries[1:], entries[0]) for entries in zip(*map(_nominal, every), strict=True)]
+        if any(not x.is_zero() for part in every for row in part.tolist() for x in row[1:]):
+            if shape.facets is None:
+                wide.append(k)
+                continue
+            responses = [_without_nominal(part) for part in every]
+            beyond = lambda c, responses=responses: answers.heights(responses, exactly(c[None]))[0]  # noqa: E731
+        over, where = shape.excess(point, beyond)
         if over > TOLERANCE:
-            raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from {case.at(float(start))} on")
+            where = name.format("the control" if where == "it" else where)
+            at = case.at(float(case.control.breakpoints[k]))
+            raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from {at} on")
         worst = max(worst, over)
-    return f"{case.control.pieces} pieces in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
+    if wide:
+        worst = max(worst, _turned(case, shape, wide, lambda k, rows: answers.heights(parts(k), rows)))
+    return f", to {worst:.1e} of its own units" if worst > 0 else ""
+
+
+def _turned(case: Case, shape: Shape, places: Sequence[int], heights: Callable[[int, arb_mat], list[arb]]) -> float:
+    """Show that what answers is in a curved set on these pieces, in every direction; by how much it leaves it at
+    most."""
+    m, times = shape.dimension, case.control.breakpoints.tolist()
+    curved = Curved(shape, np.diag(1.0 / np.array(shape.radius)), np.zeros(m))
+    work = list[Work]()
+    for axis in range(m):
+        for sign in (-1.0, 1.0):
+            low, high = -np.ones(m), np.ones(m)
+            low[axis] = high[axis] = sign
+            work.append((((), ()), Sides.cell(curved, low, high), [(k, times[k], times[k]) for k in places]))
+    still = Still(heights, curved.normals)
+    return max(0.0, prove(lambda _: still, Parameters(None), work, case.clock).share)
+
+
+def _nominal(part: arb_mat) -> list[arb]:
+    return [row[0] for row in part.tolist()]
+
+
+def _without_nominal(part: arb_mat) -> arb_mat:
+    return stacked([[row[0] * 0, *row[1:]] for row in part.tolist()])
 
 
 def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
@@ -224,32 +251,17 @@ def _strictly(case: Case, window: Window) -> None:
             )
 
 
-def _changed(case: Case) -> str:
-    return _steps(case) if case.policy is None else _feedback(case).steps()
-
-
 def _steps(case: Case) -> str:
     """Every change of the control from piece to piece in its set."""
-    bound, worst = case.problem.control_step, 0.0
+    bound, found = case.problem.control_step, steps(case.problem, case.control)
     assert bound is not None
-    found = steps(case.problem, case.control)
-    for k in found:
-        case.clock.check()
-        last = balls(before(case.problem)) if k == 0 else case.pieces[k - 1].entries()
-        next_ = case.pieces[k % case.control.pieces].entries()  # after the last piece comes the first one
-        over, where = known(bound).excess([u - v for u, v in zip(next_, last, strict=True)])
-        if over > TOLERANCE:
-            where = "the change of the control" if where == "it" else f"the change of {where}"
-            at = case.at(float(case.control.breakpoints[k]))
-            raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, at {at}")
-        worst = max(worst, over)
-    return f"{len(found)} steps in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
+    return f"{len(found)} steps in their set{_in_set(case, bound, found, answers_of(case).changes, 'the change of {}')}"
 
 
 def _cost(case: Case) -> str:
     if case.counts:
         return _counted(case)
-    derived = case.price.of(case.pieces) if case.policy is None else _feedback(case).cost()
+    derived = answers_of(case).cost()
     _agrees("cost", number(case.certificate, "cost"), derived, CANCELLED * added_up(case))
     return f"J = {float(derived.mid()):.12g}{_effort(case)}"
 
@@ -281,53 +293,6 @@ def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
         raise Broken(f"{name}: {written!r} is written, {float(derived.mid())!r} is derived")
 
 
-def _multiplied(case: Case, priced: bool) -> arb:
-    """The bound that the certificate's multipliers give."""
-    data = case.certificate.get("multipliers")
-    if case.policy is not None:
-        return _feedback(case).multiplied(_entries(data), priced, _touched(case, data) if priced else None)
-    rows, pieces = _weighted(case, data)
-    if not priced:
-        return case.duality.bound(rows, pieces, None)
-    return case.duality.bound(rows, pieces, case.price, _touched(case, data))
-
-
-def _entries(data: object) -> Sequence[Any]:
-    """The constraints that a certificate gives multipliers of."""
-    if data is None:
-        raise Unchecked("the certificate holds no multipliers, which this method does not offer")
-    if not isinstance(data, Mapping):
-        raise Broken("multipliers: expected those of constraints, equalities and pieces")
-    entries = listed(data, "constraints")
-    if len(entries) > MOST_MULTIPLIERS:
-        raise Broken(f"{len(entries)} multipliers are too many to be checked")
-    return entries
-
-
-def _weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
-    """Multipliers with their constraints, and those of the control's pieces."""
-    from flint import arb
-
-    rows = [_row(case, entry) for entry in _entries(data)]
-    assert isinstance(data, Mapping)
-    nu = numbers(listed(data, "equalities"), "equalities")
-    if nu.shape != (len(case.equalities),):
-        raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
-    bound = case.problem.system.parameters
-    middle = [] if bound is None else bound.interior_point().tolist()
-    for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=True):
-        row = case.duality.row(
-            np.eye(case.problem.system.states)[state], case.problem.horizon, middle, arb(value), disturbed=False
-        )
-        rows.append((multiplier, row))
-    if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
-        return rows, None
-    pieces, expected = numbers(data.get("pieces"), "pieces"), (case.problem.system.controls, case.control.pieces)
-    if pieces.shape != expected:
-        raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
-    return rows, pieces
-
-
 def _fewest(case: Case, status: str) -> str:
     """Between what the least share of time lies that an admissible control must act."""
     data = case.certificate["fewest_active"]
@@ -348,9 +313,9 @@ def _fewest(case: Case, status: str) -> str:
             raise Broken(f"lower is {written!r}, the leaves prove {derived!r}")
         return _at_least(case, written)
     if own is None and case.problem.cost.blocks and not case.problem.cost.is_quadratic:
-        derived = activity.least_of_cost(case, _multiplied(case, priced=True))
+        derived = activity.least_of_cost(case, multiplied(case, priced=True))
     else:
-        rows, pieces = _weighted(case, case.certificate.get("multipliers") if own is None else own)
+        rows, pieces = weighted(case, case.certificate.get("multipliers") if own is None else own)
         rows, pieces = activity.shared(case, rows, pieces) if own is None else (rows, pieces)
         derived = activity.least(case, rows, pieces)
     if not 0.0 <= written <= derived + FIGURES or (proven and written > acted + FIGURES):
@@ -373,78 +338,10 @@ def _other(case: Case, data: Mapping[str, Any]) -> Case:
     other = replace(case, certificate={**case.certificate, **said})
     _control(other)
     if case.equalities:
-        _equalities(other)
+        equalities(other)
     for window in other.windows:
-        _kept(other, window)
+        bounded(other, window)
     return other
-
-
-def _touched(case: Case, data: object) -> Sequence[arb_mat] | None:
-    """The control at which the certificate replaces the cost by its tangent, on every piece."""
-    if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
-        return None
-    said = data.get("tangent") if isinstance(data, Mapping) else None
-    at, expected = numbers(said, "tangent"), (case.problem.system.controls, case.control.functions)
-    if at.shape != expected:
-        raise Broken(f"the tangent's control has shape {at.shape}, expected {expected}")
-    case.price.convex()
-    return case.on_pieces(at)
-
-
-def _row(case: Case, entry: object) -> tuple[float, Row]:
-    """A multiplier and its constraint, which must be one of the problem's."""
-    case.clock.check()
-    if not isinstance(entry, Mapping):
-        raise Broken("multipliers: expected a constraint, a time, a parameter, a direction and a number each")
-    name = str(entry.get("constraint"))
-    direction, time, y = (
-        numbers(entry.get("direction"), f"{name}: direction"),
-        number(entry, "time"),
-        number(entry, "multiplier"),
-    )
-    if not y > 0:
-        raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
-    if name == case.of_control and not any(window.name == name for window in case.windows):
-        _sized(direction, case.problem.system.controls, name)
-        return y, case.duality.control_row(direction, time)
-    if name == "control_step" and not any(window.name == name for window in case.windows):
-        _sized(direction, case.problem.system.controls, name)
-        return y, case.duality.step_row(direction, time)
-    window, parameter = case.window(name), numbers(entry.get("parameter"), f"{name}: parameter")
-    _sized(direction, window.shape.dimension, name)
-    if not window.start <= time <= window.stop:
-        raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
-    _sized(parameter, case.problem.system.parameter_count, name)
-    if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
-        raise Broken(f"{name}: the parameter {parameter.tolist()} is not shown to be in its set")
-    key = name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
-    if key in case.rows:
-        return y, case.rows[key]
-    c, gain = window.split(direction)
-    limit = window.limit(direction, time)
-    row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.measurable)
-    if case.measurable:
-        row = replace(row, constant=_feedback(case).disturbed(c, time, limit))
-    row = replace(row, sizes=None if case.execution is None else case.execution.least(c, time))
-    if window.is_mixed:
-        piece = _piece(case, window, entry, time)
-        row.slope[piece] = [a + balls([g])[0] for a, g in zip(row.slope[piece], gain, strict=True)]
-    case.rows[key] = row
-    return y, row
-
-
-def _piece(case: Case, window: Window, entry: Mapping[str, Any], time: float) -> int:
-    """The piece of the control that a mixed constraint speaks of."""
-    piece = entry.get("piece")
-    if not isinstance(piece, int) or isinstance(piece, bool):
-        raise Broken(f"{window.name}: piece is {piece!r}, expected the number of a piece of the control")
-    window.meets(case.control.breakpoints.tolist(), piece, time)
-    return piece
-
-
-def _sized(vector: Array, size: int, name: str) -> None:
-    if vector.shape != (size,):
-        raise Broken(f"{name}: {vector.size} numbers where {size} are expected")
 
 
 def _lower(case: Case) -> str:
@@ -453,7 +350,7 @@ def _lower(case: Case) -> str:
         if not written <= least + FIGURES * max(1.0, abs(least)):
             raise Broken(f"{written!r} is written, the leaves prove {least!r}")
         return f"no control of these acts for less than {written:.9g} {case.problem.names.time}".rstrip()
-    written, derived = number(case.certificate, "lower_bound"), _multiplied(case, priced=True)
+    written, derived = number(case.certificate, "lower_bound"), multiplied(case, priced=True)
     if written <= 0.0:  # absolute values, lengths and positive semidefinite squares: no multiplier is needed for that
         return f"no control costs less than {written:.12g}{_effort(case)}, for no term of the cost is negative"
     if not derived >= written:
@@ -493,16 +390,16 @@ def _tree(case: Case) -> float:
         raise Unchecked("the control has fewer functions than pieces, which is not followed")
     known = listed(data, "constraints")
 
-    def weighted(leaf: Mapping[str, Any]) -> list[tuple[float, Row]]:
+    def of_leaf(leaf: Mapping[str, Any]) -> list[tuple[float, Row]]:
         constraints = []
         for pair in listed(leaf, "multipliers"):
             if not (isinstance(pair, list) and len(pair) == 2 and type(pair[0]) is int and 0 <= pair[0] < len(known)):
                 raise Broken("tree: expected the number of a constraint and its multiplier")
             said = known[pair[0]]
             constraints.append({**said, "multiplier": pair[1]} if isinstance(said, Mapping) else said)
-        return _weighted(case, {"constraints": constraints, "equalities": leaf.get("equalities")})[0]
+        return weighted(case, {"constraints": constraints, "equalities": leaf.get("equalities")})[0]
 
-    return activity.proven(case, listed(data, "nodes"), weighted)
+    return activity.proven(case, listed(data, "nodes"), of_leaf)
 
 
 def _infeasible(case: Case) -> str:
@@ -510,7 +407,7 @@ def _infeasible(case: Case) -> str:
         if not case.counts or _tree(case) < np.inf:
             raise Broken("the leaves of the tree leave some control")
         return "every part of the controls is excluded by multipliers of its own"
-    amount = _multiplied(case, priced=False)
+    amount = multiplied(case, priced=False)
     if not amount > 0:
         raise Broken(f"the multipliers prove {float(amount.lower()):.3g}, expected a positive number")
     entries = case.certificate["multipliers"]["constraints"]
@@ -569,29 +466,7 @@ def _witness(case: Case) -> str:
     data = case.certificate.get("witness")
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no witness")
-    if case.policy is not None:
-        return _exceeded(case, *_feedback(case).driven(data), data)
-    window, time = case.window(str(data.get("constraint"))), number(data, "time")
-    direction, parameter = (numbers(data.get(key), key) for key in ("direction", "parameter"))
-    _sized(direction, window.shape.dimension, window.name)
-    _sized(parameter, case.problem.system.parameter_count, window.name)
-    if not window.start <= time <= window.stop:
-        raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
-    if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
-        raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
-    height = window.limit(direction, time)
-    if case.measurable:  # the worst is no signal on pieces: how far all of them reach is enclosed instead
-        k = _piece(case, window, data, time) if window.is_mixed else None
-        over = _feedback(case).farthest(*window.split(direction), time, k) - height
-        return _exceeded(case, over, case.units(window).slack(direction, height), data)
-    state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
-    if window.is_mixed:
-        state = state + case.pieces[_piece(case, window, data, time)].entries()
-    over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), -height)
-    if case.execution is not None:
-        low, high = case.execution.added(window.split(direction)[0], time)
-        over = over + balls([low])[0].union(balls([high])[0])
-    return _exceeded(case, over, case.units(window).slack(direction, height), data)
+    return _exceeded(case, *witnessed(case, data), data)
 
 
 def _exceeded(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> str:

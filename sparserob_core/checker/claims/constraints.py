@@ -14,13 +14,16 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, balls, below
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.arithmetic.subdivision import fill
+from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case, number, numbers
-from sparserob_core.checker.claims.cells import Interval, Work, prove
+from sparserob_core.checker.claims.cells import Interval, Proven, Reached, Work, prove
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Worst
+from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
+from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.tube import MANY, Tube
 from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.checker.sets.known import known
@@ -65,15 +68,18 @@ def bounded(case: Case, window: Window) -> str:
     normals = normals_of(window, entry.get("normals"))
     covered(case, window, lower, upper)
     if is_followed(case, window):
-        return _along_rows(case, window)
-    basis, gains, work = _work(case, window, normals, lower, upper)
-    found = prove(
-        tubes(case, basis, lower, upper),
-        parameters_of(case),
-        work,
-        case.clock,
-        case.beside(window, basis, gains),
-    )
+        found = _along_rows(case, window)
+    else:
+        if case.measurable and window.seen.facets is None:
+            raise Unchecked("the checker knows measurable disturbances with flat sets of states only")
+        basis, gains, work = _work(case, window, normals, lower, upper)
+        found = prove(
+            tubes(case, basis, gains, lower, upper),
+            parameters_of(case),
+            work,
+            case.clock,
+            case.beside(window, basis, gains),
+        )
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     if found.bound < 0:
         return f"kept, with a margin of at least {-found.bound:.1e}{_unit(case, window)} ({size})"
@@ -85,11 +91,11 @@ def is_followed(case: Case, window: Window) -> bool:
     system, flat = case.problem.system, window.seen.facets is not None
     if not isinstance(system, LinearSystem) or system.parameter_count or system.states < FOLLOWED:
         return False
-    return flat and case.policy is None and case.execution is None and len(case.grid) <= MANY
+    return flat and not case.answering and case.execution is None and len(case.grid) <= MANY
 
 
-def _along_rows(case: Case, window: Window) -> str:
-    """Show that no row of a flat set is exceeded by more than what counts as none; a sentence with the figures."""
+def _along_rows(case: Case, window: Window) -> Proven:
+    """Show that no row of a flat set is exceeded by more than what counts as none, along their adjoints."""
     flat, units = window.seen.facets, case.units(window).rows.tolist()
     assert flat is not None
     count, bound, share = 0, -np.inf, -np.inf
@@ -99,9 +105,7 @@ def _along_rows(case: Case, window: Window) -> str:
         cells, top = along(case, window, c, followed(case, window.split(c)[0]), row.allowed)
         over = float(np.nextafter(top - row.limit, np.inf))
         count, bound, share = count + cells, max(bound, over), max(share, over / unit)
-    if bound < 0:
-        return f"kept, with a margin of at least {-bound:.1e}{_unit(case, window)} ({count} cells)"
-    return f"kept to {bound:.1e}{_unit(case, window)}, {share:.1e} of its own unit ({count} cells)"
+    return Proven(bound, share, count, 1)
 
 
 def followed(case: Case, c: Array) -> Worst:
@@ -313,8 +317,11 @@ def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
     return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), parts, strict=True)]
 
 
-def tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Corners], Tube | VaryingTube]:
+def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
     """What makes the tube of a box of parameters; the cells ``[lower, upper]`` say how far these go."""
+    if case.looped:
+        loop_tube = LoopTube(answers_of(case).loop, basis, gains)
+        return lambda _: loop_tube
     if case.changing is not None:
         known_tube = VaryingTube(case.changing, case.scene, basis)
         return lambda _: known_tube
@@ -341,26 +348,43 @@ def tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Cor
 
 
 def equalities(case: Case) -> str:
-    """Show that the fixed states are met at every parameter and disturbance; a sentence with the figures."""
-    middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
+    """Show that the fixed states are met at every parameter, disturbance and initial state; a sentence with the
+    figures."""
+    worst = 0.0
+    for (state, value), (off, added) in zip(case.equalities, missed(case), strict=True):
+        most = EQUALITY * max(added, abs(value))
+        if not off <= most:
+            name = case.problem.names.state(state)
+            raise Broken(f"{name} is missed by up to {float(off.upper()):.3g}, rounding is at most {most:.1e}")
+        worst = max(worst, float(off.upper()))
+    return f"kept to {worst:.1e}{of_fixed(case)}"
+
+
+def missed(case: Case) -> list[tuple[arb, float]]:
+    """By how much every fixed state is missed at most, and the size of the numbers that are added up to it: of what
+    initial state and control do, and where deviations are answered also of these, with and without the control."""
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
-    if case.changing is not None:
-        last = VaryingTube(case.changing, scene, np.eye(d)).nodes[-1]
-    else:
-        last = Tube(flows(case.problem.system, middle), scene, np.eye(d)).nodes[-1].parts[0]
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = RowUnits(case.problem, scene, everything, horizon, horizon, varying=case.changing).sums
-    worst = 0.0
+    answers, found = answers_of(case), []
+    last = answers.loop.nodes[-1].tolist() if case.looped else _unreached(case, scene)
     for state, value in case.equalities:
+        off, responses = last[state][0] - balls([value])[0], last[state][1:]
+        high, low = off + answers.support(responses), answers.support([-x for x in responses]) - off
+        found.append((high.max(low), float(sums[state]) + (answers.added(state) if case.looped else 0.0)))
+    return found
+
+
+def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
+    """The final state ``(d, 1)`` where no uncertainty reaches what is fixed of it, whatever the control."""
+    for state, _ in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
-        missed = abs(last[state, 0] - balls([value])[0])
-        most = EQUALITY * max(float(sums[state]), abs(value))
-        if not missed <= most:
-            name = case.problem.names.state(state)
-            raise Broken(f"{name} is missed by up to {float(missed.upper()):.3g}, rounding is at most {most:.1e}")
-        worst = max(worst, float(missed.upper()))
-    return f"kept to {worst:.1e}{of_fixed(case)}"
+    middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
+    basis = np.eye(case.problem.system.states)
+    if case.changing is not None:
+        return list(VaryingTube(case.changing, scene, basis).nodes[-1].tolist())
+    return list(Tube(flows(case.problem.system, middle), scene, basis).nodes[-1].parts[0].tolist())
 
 
 def of_fixed(case: Case) -> str:

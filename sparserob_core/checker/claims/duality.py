@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import difference
-from sparserob_core.checker.claims.cost import Price, Tangent
+from sparserob_core.checker.cost.price import Price, Tangent
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
@@ -32,18 +32,26 @@ if TYPE_CHECKING:
 
 
 LEAPS = 64  # times in a row that a lag is carried on from the one before
+EFFORT = "effort"
 STEPS_KEPT = 64  # lengths whose exponentials are remembered from row to row: of 300 states each takes 10 MB
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Row:
-    """``constant + sum_k slope_k u_k + sizes_k |u_k| <= 0`` for every feasible control; ``slope`` is a list of ``m``
-    balls per piece of the control, ``sizes (K, m)`` are numbers that are not negative, or there are none."""
+    """``constant + sum_k slope_k u_k + sizes_k |u_k| <= charged`` for every feasible control; ``slope`` is a list of
+    ``m`` balls per piece of the control, ``sizes (K, m)`` are numbers that are not negative, or there are none.
+
+    A control that answers is ``u_k = v_k + sum_j M_kj innovations_j`` at the deviations that a certificate names, with
+    ``innovations (K, p)``; of one that answers nothing there are none, and the row is that of the worst deviations.
+    ``charged`` is 0, or with ``(k, i)`` the peak of that piece and channel, or with `EFFORT` the effort.
+    """
 
     constant: arb
     slope: list[list[arb]]
     sizes: Array | None = None
+    innovations: Sequence[Sequence[arb]] = ()
+    charged: tuple[int, int] | str | None = None
 
 
 @final
@@ -63,14 +71,17 @@ class Duality:
         """0."""
         return _exact(0.0)
 
+    def control_piece(self, time: float) -> int:
+        """The piece of the control that is commanded at a time."""
+        place = int(np.searchsorted(self.control.breakpoints, time, side="right")) - 1
+        return min(max(place, 0), self.control.pieces - 1)
+
     def control_row(self, direction: Array, time: float) -> Row:
-        """``c'u(t) <= h(c)`` for a curved set of controls."""
-        piece = int(
-            np.clip(np.searchsorted(self.control.breakpoints, time, side="right") - 1, 0, self.control.pieces - 1)
-        )
+        """``c'u(t) <= h(c)`` for the set of controls."""
+        piece = self.control_piece(time)
         slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
         slope[piece] = [_exact(c) for c in direction]
-        return Row(-known(self.problem.control).support(slope[piece]), slope)
+        return Row(-known(self.problem.control).limit(direction), slope)
 
     def step_row(self, direction: Array, time: float) -> Row:
         """``c'(u_k - u_{k-1}) <= h(c)`` for the step at a breakpoint, ``u_{-1}`` the control before time 0."""

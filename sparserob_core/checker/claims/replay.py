@@ -1,22 +1,30 @@
-"""One trajectory, for one disturbance and one parameter that must be admissible."""
+"""One time of a run: the state under a disturbance and a parameter that must be admissible, the constraint that a
+witness exceeds there, and by how much the worst one does."""
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.claims.case import Case, number, numbers
-from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.flow import flows, held, stacked
-from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.claims.answers import Named, answers_of, commanded
+from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
+from sparserob_core.checker.claims.cells import Reached
+from sparserob_core.checker.claims.constraints import missed
+from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
+from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
+from sparserob_core.checker.reach.closed_loop import exactly
+from sparserob_core.checker.reach.flow import flows, stacked
+from sparserob_core.checker.reach.flow import held as held_for
+from sparserob_core.checker.reach.loop_tube import LoopTube
+from sparserob_core.checker.reach.tube import Polynomial, Tube
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import along
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -42,7 +50,7 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
         if start >= time:
             break
         leg = case.scene.leg(k)
-        Phi, Gamma = held(every[leg]["A"][0], both[leg], arb(min(case.grid[k + 1], time)) - arb(start))
+        Phi, Gamma = held_for(every[leg]["A"][0], both[leg], arb(min(case.grid[k + 1], time)) - arb(start))
         pushed = [arb(0)] * every[leg]["E"][0].ncols() if w is None else balls(w[:, k])
         x = Phi * x + Gamma * arb_mat([[v] for v in case.scene.control[k].entries() + pushed])
     state: list[arb] = x.entries()
@@ -70,44 +78,106 @@ def _start(case: Case, deviation: object) -> arb_mat:
     return stacked([[v] for v in begin])
 
 
+def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
+    """By how much a witness exceeds the constraint that it names, under the disturbance and from the initial state that
+    it names, and how much of that counts as none."""
+    name, time, direction = (
+        str(data.get("constraint")),
+        number(data, "time"),
+        numbers(data.get("direction"), "direction"),
+    )
+    answers, named, held = answers_of(case), None, commanded(case, name)
+    if case.answering:
+        if case.measurable or (case.problem.disturbance is not None and data.get("disturbance") is None):
+            raise Unchecked("the certificate holds no disturbance of the witness")
+        named = answers.named(data, name)
+    if held is not None:
+        sized(direction, case.problem.system.controls, name)
+        parts = answers.parts_at(name, time)
+        if len(parts) > 1 and case.answering:
+            raise Unchecked("a witness across the seam is not followed")
+        value, limit = sum(_along(direction, named, part.tolist()) for part in parts), known(held).limit(direction)
+        slack = TOLERANCE * (1.0 if known(held).facets is None else max(known(held).units, default=1.0))
+    elif name == EQUALS and named is not None:
+        sized(direction, case.problem.system.states, name)
+        value, limit = _along(direction, named, answers.loop.nodes[-1].tolist()), fixed_limit(case, direction, time)
+        slack = EQUALITY * max(added for _, added in missed(case))
+    else:
+        window, parameter = case.window(name), numbers(data.get("parameter", []), "parameter")
+        sized(direction, window.shape.dimension, name)
+        admissible(case, window, time, parameter)
+        piece = piece_of(case, window, data, time) if window.is_mixed else None
+        limit = window.limit(direction, time)
+        slack = case.units(window).slack(direction, limit)
+        if named is not None:
+            rows = answers.loop.state(case.piece_at(time), time).tolist()
+            value = _along(direction, named, rows if piece is None else rows + answers.commands[piece].tolist())
+        elif case.measurable:  # the worst is no signal on pieces: how far all of them reach is enclosed instead
+            value = answers.farthest(*window.split(direction), time, piece)
+        else:
+            state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
+            state += [] if piece is None else case.pieces[piece].entries()
+            value = _along(direction, None, [[x] for x in state])
+        if case.execution is not None:
+            low, high = case.execution.added(window.split(direction)[0], time)
+            value = value + balls([low])[0].union(balls([high])[0])
+    return value - limit, slack
+
+
+def _along(direction: Array, named: Named | None, rows: Sequence[list[arb]]) -> arb:
+    """The value of ``c'x`` of what is nominal and has responses, ``(1 + Q,)`` each, under deviations that are named."""
+    return along(direction, [row[0] for row in rows] if named is None else named.of(rows))
+
+
 def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None) -> tuple[list[float], float]:
     """By how much the worst disturbance exceeds each row of a constraint at one time and parameter, and how closely
     that is known; from the worst initial state, or from ``begun (d,)``. `said` holds the names ``constraint``,
     ``time``, ``parameter`` and ``violation``. Raises `Broken` where these are none, `Unchecked` for a curved set."""
-    name = str(said.get("constraint"))
-    of_control = {case.of_control: case.problem.control, "control_step": case.problem.control_step}.get(name)
-    if of_control is not None and known(of_control).facets is None:
-        raise Unchecked("the worst direction of a curved set is not told")
-    window, time = case.window(name), number(said, "time")
-    parameter = numbers(said.get("parameter"), "parameter")
+    name, time, held = str(said.get("constraint")), number(said, "time"), commanded(case, str(said.get("constraint")))
     number(said, "violation")
-    if parameter.shape != (case.problem.system.parameter_count,):
-        raise Broken(f"parameter: {parameter.size} numbers where {case.problem.system.parameter_count} are expected")
-    if not window.start <= time <= window.stop:
-        raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
+    if held is not None:
+        flat, answers = known(held).facets, answers_of(case)
+        if flat is None:
+            raise Unchecked("the worst direction of a curved set is not told")
+        heights = answers.heights(answers.parts_at(name, time), exactly(np.array([c for c, _ in flat])))
+        slack = TOLERANCE * max(known(held).units, default=1.0)
+        return [float((height - b).mid()) for height, (_, b) in zip(heights, flat, strict=True)], slack
+    if name == EQUALS and case.equalities:
+        every = missed(case)
+        return [float(off.mid()) for off, _ in every], TOLERANCE * max(added for _, added in every)
+    window, parameter = case.window(name), numbers(said.get("parameter", []), "parameter")
+    asked(case, window, time, parameter)  # of one at the edge of its set, rounded, the worst is compared
     flat, found = window.seen.facets, window.seen.basis
     if flat is None or found is None:
         raise Unchecked("the worst direction of a curved set is not told")
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
-    scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
-    tube = (
-        Tube(flows(case.problem.system, parameter.tolist()), scene, basis)
-        if case.changing is None
-        else VaryingTube(case.changing, scene, basis)
-    )
-    piece = min(bisect_right(case.grid, time) - 1, len(case.grid) - 2 if time < case.grid[-1] else len(case.grid) - 1)
-    polynomials, beside = tube.cells(piece, time, time, z), case.beside(window, basis, gains)
-    breaks: list[int | None] = [None]
-    if window.is_mixed:  # where the control jumps, either of its values
-        ends = case.control.breakpoints
-        pieces = [int(np.searchsorted(ends, time, side=side)) - 1 for side in ("left", "right")]
-        breaks = [*{max(0, min(piece, case.control.pieces - 1)) for piece in pieces}]
-    if beside is not None:
-        polynomials = [p for k in breaks for p in beside.added(polynomials, time, time, z, k)]
-    limits = [float(b.mid()) for _, b in flat] * len(breaks)
+    tube, beside = _tube(case, parameter, begun, basis, gains), case.beside(window, basis, gains)
+    polynomials = list[Polynomial]()
+    for piece, k in _pieces(case, time, jumps=window.is_mixed):
+        cells = tube.cells(piece, time, time, z)
+        polynomials += cells if beside is None else beside.added(cells, time, time, z, k)
+    limits = [float(b.mid()) for _, b in flat] * (len(polynomials) // max(1, len(flat)))
     over = [float(poly.coefficients[0, 0]) - b for poly, b in zip(polynomials, limits, strict=True)]
     slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(case.units(window).rows.max(initial=0.0))
     return over, slack
+
+
+def _pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
+    """The pieces of the grid and of the control that a time is in; where the control ``jumps``, on either side."""
+    sides: tuple[Literal["left", "right"], ...] = ("left", "right") if jumps else ("right",)
+    ends = np.array(case.grid), case.control.breakpoints
+    places = ([int(np.clip(np.searchsorted(e, time, side=side) - 1, 0, e.size - 2)) for e in ends] for side in sides)
+    return sorted({(piece, k) for piece, k in places})
+
+
+def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains: Array) -> Reached:
+    """The states that are reached at a parameter, from the initial state ``begun (d,)`` alone where one is given."""
+    if case.looped:
+        return LoopTube(answers_of(case).loop, basis, gains)
+    scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
+    if case.changing is not None:
+        return VaryingTube(case.changing, scene, basis)
+    return Tube(flows(case.problem.system, parameter.tolist()), scene, basis)
 
 
 def _begun(case: Case, data: object) -> Array:

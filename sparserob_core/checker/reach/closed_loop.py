@@ -346,6 +346,12 @@ class ClosedLoop:
         given = (self.before, [none] * len(self.before)) if k < 0 else (self.nominal[:, k], self.effects[k])
         return stacked([[arb(float(v)), *row] for v, row in zip(*given, strict=True)])
 
+    def answers(self, k: int) -> arb_mat:
+        """The answers on a piece of the control without what is nominal, ``(m, 1 + Q)``, the first column 0."""
+        from flint import arb
+
+        return stacked([[arb(0), *row] for row in self.effects[k]])
+
     def on(self, piece: int) -> int:
         """The piece of the control that is commanded on a piece of the grid: the one that acts, where there is no
         delay."""
@@ -358,7 +364,7 @@ class ClosedLoop:
         along = (product if beside is None else product + beside).tolist()
         return [row[0] + self.support(row[1:]) for row in along]
 
-    def highest(self, piece: int, time: float, rows: Array, beside: arb_mat | None = None) -> list[arb]:
+    def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         """`heights` at a time in a piece of the grid."""
         return self.heights(self.state(piece, time), rows, beside)
 

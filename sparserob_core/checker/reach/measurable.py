@@ -351,9 +351,10 @@ class MeasurableLoop(ClosedLoop):
         along = (product if beside is None else product + beside).tolist()
         return [row[0] + more for row, more in zip(along, self.supports([row[1:] for row in along]), strict=True)]
 
-    def highest(self, piece: int, time: float, rows: Array, beside: arb_mat | None = None) -> list[arb]:
+    def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         from flint import arb
 
+        assert isinstance(rows, np.ndarray)  # curved sets, whose directions are balls, are not followed
         found = super().highest(piece, time, rows, beside)
         if time == self.grid[piece]:
             return found

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import difference
+from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.arithmetic.series import Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
 from sparserob_core.checker.reach.flow import Flow, Remainder, beyond, held, in_time, middles, stacked, up_to
@@ -31,9 +32,9 @@ MANY = 1000  # pieces of the grid, from which none has a ball of a duration that
 @dataclass(frozen=True, eq=False)
 class Polynomial:
     """``coefficients (J + 1, M)`` in powers of the time within the cell (from 0 to 1) and monomials of the parameters;
-    the truth exceeds it by at most ``error``, of which ``expansion`` is due to the size of the box of parameters; both
-    together exceed the truth by at most twice the ``error`` and ``kinks``, which is due to disturbances about to
-    switch, about ``turning`` of it because the box of parameters is so large.
+    the truth exceeds it by at most ``error``, of which ``expansion`` is due to the size of the box of parameters, or of
+    the cell of time where it is a chord; both together exceed the truth by at most twice the ``error`` and ``kinks``,
+    which is due to disturbances about to switch, about ``turning`` of it because the box of parameters is so large.
     """
 
     coefficients: Array
@@ -41,6 +42,15 @@ class Polynomial:
     expansion: float
     kinks: float
     turning: float = 0.0
+
+
+class Known(NamedTuple):
+    """There are no parameters that anything depends on: those of `Flow`."""
+
+    monomials: Monomials = Monomials(0, 0)
+    centre: tuple[float, ...] = ()
+    radius: tuple[float, ...] = ()
+    sizes: Array = np.zeros(1)
 
 
 @final

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias
@@ -172,10 +172,12 @@ class Shape(ABC):
         axes = np.eye(self.dimension)
         return [above(self.support(balls(axis)).max(self.support(balls(-axis)))) for axis in axes]
 
-    def excess(self, point: Sequence[arb]) -> tuple[float, str]:
+    def excess(self, point: Sequence[arb], beyond: Callable[[Array], arb] | None = None) -> tuple[float, str]:
         """An upper bound of how far a point may lie outside, and where: relative to the own unit of each facet (at
-        least what double precision resolves), or along the gauge of a curved set; 0 when proven inside."""
+        least what double precision resolves), or along the gauge of a curved set; 0 when proven inside. Of a flat set
+        with what may lie ``beyond`` the point along a normal."""
         if self.facets is None:
+            assert beyond is None
             gauge = self.gauge([x - m for x, m in zip(point, balls(self.centre), strict=True)])
             if not gauge.is_finite():
                 raise Unchecked("the size of a point cannot be bounded")
@@ -183,8 +185,9 @@ class Shape(ABC):
         worst, where = 0.0, ""
         for number, ((c, b), unit) in enumerate(zip(self.facets, self.units, strict=True)):
             terms = [a * x for a, x in zip(balls(c), point, strict=True) if not a.is_zero()]
-            unit = max(unit, RESOLVED * float((abs(b) + total(abs(t) for t in terms)).mid())) or 1.0
-            over = float((total(terms) - b).upper()) / unit
+            more = total([] if beyond is None else [beyond(c)])
+            unit = max(unit, RESOLVED * float((abs(b) + abs(more) + total(abs(t) for t in terms)).mid())) or 1.0
+            over = float((total(terms) + more - b).upper()) / unit
             if over > worst:
                 worst, where = over, _named(c, number)
         return worst, where

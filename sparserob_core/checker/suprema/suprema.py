@@ -238,6 +238,6 @@ def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
     times = cut(np.array(case.grid), np.array(cuts), window.start, window.stop)
     work: Sequence[Work] = [((tuple(ends[0]), tuple(ends[1])), Sides([bounded]), times)]
     shown = prove(
-        tubes(case, basis, lower, upper), parameters_of(case), work, case.clock, case.beside(alone, basis, gains)
+        tubes(case, basis, gains, lower, upper), parameters_of(case), work, case.clock, case.beside(alone, basis, gains)
     )
     return shown.cells

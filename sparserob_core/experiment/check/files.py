@@ -305,15 +305,10 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     from sparserob_core.checker.claims.case import numbers
     from sparserob_core.checker.claims.replay import exceeded
 
-    if case.policy is not None or case.measurable:
-        from sparserob_core.checker.claims.feedback import feedback_of
-
-        if case.policy is None and case.problem.initial_set is not None:
-            raise Unchecked("the worst initial state is followed with disturbances that change at breakpoints only")
-        found = [("", *feedback_of(case).exceeded(said))]
-    else:
-        found = [("", *exceeded(case, said))]
-    if case.problem.initial_set is not None and case.policy is None:
+    if case.measurable and not case.answering and case.problem.initial_set is not None:
+        raise Unchecked("the worst initial state is followed with disturbances that change at breakpoints only")
+    found = [("", *exceeded(case, said))]
+    if case.problem.initial_set is not None and not case.answering:
         begun = numbers(said.get("initial_state"), "initial_state")
         centre = np.asarray(case.problem.initial_state)
         if begun.shape != centre.shape or known(case.problem.initial_set).excess(balls(begun - centre))[0] > CLOSE:

@@ -10,7 +10,8 @@ import pytest
 from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.claims import activity, claims
+from sparserob_core.checker.claims import activity, claims, constraints
+from sparserob_core.checker.claims import multipliers as bounds
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.control.problem.system import LinearSystem
@@ -58,16 +59,16 @@ def test_the_control_and_its_steps_are_as_large_as_they_are():
         for size, kept in ((1.0 / (1 + NOTHING), True), (1.0 / (1 + TOO_MUCH), False)):
             case = case_of(control_step=box(size), initial_control=before)
             if kept:
-                assert f"{1 if before is None else 2} steps" in claims._changed(case)
+                assert f"{1 if before is None else 2} steps" in claims._steps(case)
             else:
                 with pytest.raises(Broken, match="t = 1"):
-                    claims._changed(case)
+                    claims._steps(case)
     # the first step is one where it is known what was before
-    assert "1 steps" in claims._changed(case_of(control_step=Box([-0.5], [1.0])))
+    assert "1 steps" in claims._steps(case_of(control_step=Box([-0.5], [1.0])))
     with pytest.raises(Broken, match="t = 0"):
-        claims._changed(case_of(control_step=Box([-0.5], [1.0]), initial_control=[0.0]))
+        claims._steps(case_of(control_step=Box([-0.5], [1.0]), initial_control=[0.0]))
     with pytest.raises(Broken, match="the change of the control leaves"):
-        claims._changed(case_of(control_step=NormBall(2.0, 0.9, dimension=2), decision=((-0.75, 0.25), (0.0, 0.0)),
+        claims._steps(case_of(control_step=NormBall(2.0, 0.9, dimension=2), decision=((-0.75, 0.25), (0.0, 0.0)),
                                 control=Box([-1.0] * 2, [1.0] * 2)))  # fmt: skip
 
 
@@ -158,29 +159,29 @@ def test_multipliers_of_fixed_states_of_steps_and_of_the_control_are_rows_too():
             claims._lower(case_of(certificate={"lower_bound": 0.1, **multipliers(equalities=wrong)}, **fixed))
     # |u| <= 0.2 a piece does not reach it: the sum of rows is above 0 whatever the control
     weak = case_of(0.2, certificate=multipliers(equalities=[1.0]), **fixed)
-    assert float(claims._multiplied(weak, priced=False).mid()) == pytest.approx(0.5 - 0.4)
+    assert float(bounds.multiplied(weak, priced=False).mid()) == pytest.approx(0.5 - 0.4)
     step = entry(0.5, constraint="control_step", time=1.0)
     case = case_of(certificate=multipliers(step, equalities=[1.0]), control_step=box(0.1), **fixed)
     # slopes 1 - 1/2 and 1 + 1/2 against the weight 1 with |u| <= 1
-    assert float(claims._multiplied(case, priced=True).mid()) == pytest.approx(0.5 - 0.05 - 0.5)
+    assert float(bounds.multiplied(case, priced=True).mid()) == pytest.approx(0.5 - 0.05 - 0.5)
     own = entry(0.5, constraint="control", time=0.0, direction=[-1.0])
     case = case_of(0.2, certificate=multipliers(own, equalities=[1.0]), **fixed)
     # the row of the control adds -u_0 - 0.2 <= 0, half of it
-    assert float(claims._multiplied(case, priced=False).mid()) == pytest.approx(0.5 - 0.1 - 0.1 - 0.2)
+    assert float(bounds.multiplied(case, priced=False).mid()) == pytest.approx(0.5 - 0.1 - 0.1 - 0.2)
     for wrong in (step, own):
         with pytest.raises(Broken):
             bad = multipliers({**wrong, "direction": [1.0, 0.0]}, equalities=[1.0])
-            claims._multiplied(case_of(certificate=bad, control_step=box(0.1), **fixed), priced=True)
+            bounds.multiplied(case_of(certificate=bad, control_step=box(0.1), **fixed), priced=True)
 
 
 def test_a_final_state_is_met_to_rounding():
     for goal, met in ((0.5, True), (0.5 + 1e-8, False), (0.5 - 1e-8, False)):
         case = case_of(terminal=[Equality([goal])])
         if met:
-            assert "kept to" in claims._equalities(case)
+            assert "kept to" in constraints.equalities(case)
         else:
             with pytest.raises(Broken, match="x1 is missed"):
-                claims._equalities(case)
+                constraints.equalities(case)
     for begun in ({"initial_set": box(1e-3)}, {"disturbance": box(1e-3)}):
         E = (
             {"system": LinearSystem(np.zeros((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)))}
@@ -188,7 +189,7 @@ def test_a_final_state_is_met_to_rounding():
             else {}
         )
         with pytest.raises(Unchecked, match="may reach x1"):
-            claims._equalities(case_of(terminal=[Equality([0.5])], **begun, **E))
+            constraints.equalities(case_of(terminal=[Equality([0.5])], **begun, **E))
 
 
 def tree(*nodes, constraints=()):
@@ -288,7 +289,7 @@ def test_the_share_of_time_that_a_control_acts_is_that_of_what_is_not_dust():
     assert activity.acted(case_of(**two)) == 0.25
     assert activity.acted(case_of(**two, weights=[3.0, 1.0])) == 0.375
     case = case_of(Box([-1.0], [2.0]), terminal=[Box([-9.0], [0.2])])
-    rows = [claims._row(case, entry())]
+    rows = bounds.rows_of(case, entry())
     assert activity.least(case, rows, None) == 0.5  # 0.8, rounded up to one piece of two
     assert activity.least(case, [(0.5, rows[0][1])], None) == 0.5
     assert activity.least(case, [], None) == 0.0

@@ -1,5 +1,5 @@
-"""Guards checker/claims/feedback: what is claimed of policies with random gains, against loops that are stepped from
-breakpoint to breakpoint and measure what they answer."""
+"""Guards checker/claims of controls that answer: what is claimed of policies with random gains, against loops that are
+stepped from breakpoint to breakpoint and measure what they answer."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import pytest
 from flint import ctx
 
 import sparserob_core as sr
+from sparserob_core.checker.claims import claims, constraints, replay
+from sparserob_core.checker.claims import multipliers as bounds
+from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case, written_policy
-from sparserob_core.checker.claims.claims import _policy
-from sparserob_core.checker.claims.feedback import FeedbackClaims, _Row
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.sets.sets import Box
@@ -46,11 +47,11 @@ def driven(name: str) -> tuple[Loop, np.ndarray, np.ndarray]:
     return loop, v, M
 
 
-def claims(name: str, cost: str = "nominal", certificate: dict[str, Any] | None = None, **more: Any) -> FeedbackClaims:
+def case_of(name: str, cost: str = "nominal", certificate: dict[str, Any] | None = None, **more: Any) -> Case:
     loop, v, M = driven(name)
     said = {"decision": v.tolist(), "gains": M.tolist(), "status": "verified", **(certificate or {})}
     said |= {} if loop.observer is None else {"observer": loop.observer.tolist()}
-    return FeedbackClaims(Case(replace(loop.problem, **more), *loop.grids, said, policy=AffinePolicy(cost=cost)))
+    return Case(replace(loop.problem, **more), *loop.grids, said, policy=AffinePolicy(cost=cost))
 
 
 @cache
@@ -105,24 +106,24 @@ def test_a_wall_may_be_where_the_worst_deviation_takes_the_loop_and_no_nearer(na
     sides = [loop.height(beside(name, which, side)) for side in ("left", "right")]
     highest = np.maximum(*sides).max(axis=0)
     proof = {"proof": {"path": {"tolerance": 1e-9, "lower": [[START]], "upper": [[STOP]]}}}
-    judged = claims(name, certificate=proof, path=[wall(which, highest + 5e-3)])
-    assert "margin" in judged.bounded(judged.case.windows[0])
+    judged = case_of(name, certificate=proof, path=[wall(which, highest + 5e-3)])
+    assert "margin" in constraints.bounded(judged, judged.windows[0])
     i = (NAMES.index(name) + len(which)) % len(DIRECTIONS)
-    near = claims(name, certificate=proof, path=[wall(which, highest + np.where(np.arange(3) == i, -1e-3, 5e-3))])
+    near = case_of(name, certificate=proof, path=[wall(which, highest + np.where(np.arange(3) == i, -1e-3, 5e-3))])
     with pytest.raises(Broken, match="exceeded"):
-        near.bounded(near.case.windows[0])
+        constraints.bounded(near, near.windows[0])
     # row by row, and at single deviations
-    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in judged.case.windows[0].seen.facets]
+    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in judged.windows[0].seen.facets]
     rng = np.random.default_rng(5)
     for t in (0, 60, int(np.searchsorted(times, loop.breakpoints[1])), times.size - 1):
         said = {"constraint": "path", "time": float(times[t]), "violation": 0.0}
-        found = np.array(judged.exceeded(said)[0]).reshape(-1, len(DIRECTIONS)).max(axis=0)
+        found = np.array(replay.exceeded(judged, said)[0]).reshape(-1, len(DIRECTIONS)).max(axis=0)
         truth = np.maximum(*(side[t] for side in sides)) - highest - 5e-3
         assert found == pytest.approx(truth[order], abs=1e-9)
         off, named = admissible(loop, rng)
         piece = int(np.clip(np.searchsorted(loop.breakpoints, times[t], side="right") - 1, 0, loop.breakpoints.size))
         direction = np.append(DIRECTIONS[i], BESIDE[i] if which == "mixed" else [])
-        over, slack = judged.driven({**said, **named, "direction": direction.tolist(), "piece": piece})
+        over, slack = replay.witnessed(judged, {**said, **named, "direction": direction.tolist(), "piece": piece})
         along = beside(name, which)[t, i]
         assert float(over.mid()) == pytest.approx(along[0] + along[1:] @ off - highest[i] - 5e-3, abs=1e-9)
         assert 0.0 < slack < 1e-7
@@ -140,15 +141,16 @@ def test_the_top_of_a_wave_between_breakpoints_counts_to_what_counts_as_none() -
         t, top = near[found.argmax()], found.max()
     proof = {"proof": {"path": {"tolerance": 1e-9, "lower": [[t - 0.125]], "upper": [[t + 0.0625]]}}}
     wall = sr.PathConstraint(sr.Polytope(row, [top]), t - 0.125, t + 0.0625)
-    unit = float(claims("fast", path=[wall]).case.units(claims("fast", path=[wall]).case.windows[0]).rows[0])
+    plain = case_of("fast", path=[wall])
+    unit = float(plain.units(plain.windows[0]).rows[0])
     for share in (NOTHING, 2e-9):
         wall = replace(wall, set=sr.Polytope(row, [top - share * unit]))
-        judged = claims("fast", certificate=proof, path=[wall])
+        judged = case_of("fast", certificate=proof, path=[wall])
         if share == NOTHING:
-            assert judged.bounded(judged.case.windows[0])
+            assert constraints.bounded(judged, judged.windows[0])
         else:
             with pytest.raises(Broken, match="exceeded"):
-                judged.bounded(judged.case.windows[0])
+                constraints.bounded(judged, judged.windows[0])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -158,30 +160,28 @@ def test_controls_and_steps_are_as_large_as_the_worst_deviation_makes_them(name:
     before = np.zeros_like(U[:1])
     before[0, 0, 0] = 0.2
     for steps, judged, tell in (
-        (U, "control", "control"),
-        (np.diff(np.concatenate([before, U]), axis=0), "steps", STEP),
+        (U, claims._control, "control"),
+        (np.diff(np.concatenate([before, U]), axis=0), claims._steps, STEP),
     ):
         ends = [float(loop.height(s * steps[:, 0]).max()) for s in (-1.0, 1.0)]
         unit = min(abs(ends[0]), abs(ends[1]), sum(ends))
         for side, share in product((0, 1), (-NOTHING, TOO_MUCH)):
             low, high = -ends[0] + unit * share * (side == 0), ends[1] - unit * share * (side == 1)
-            one = claims(
-                name, initial_control=[0.2], **{"control" if judged == "control" else STEP: Box([low], [high])}
-            )
+            one = case_of(name, initial_control=[0.2], **{"control" if tell == "control" else STEP: Box([low], [high])})
             if share < 0.0:
-                assert getattr(one, judged)()
+                assert judged(one)
             else:
                 with pytest.raises(Broken, match="leaves its set"):
-                    getattr(one, judged)()
+                    judged(one)
         for k, at in enumerate(loop.breakpoints[:-1].tolist()):
             said = {"constraint": tell, "time": at, "violation": 0.0}
             wide = {"control": Box([-9.0], [8.0]), STEP: Box([-9.0], [8.0])}
-            found = claims(name, initial_control=[0.2], **wide).exceeded(said)[0]
+            found = replay.exceeded(case_of(name, initial_control=[0.2], **wide), said)[0]
             truth = sorted([loop.height(steps[k, 0]) - 8.0, loop.height(-steps[k, 0]) - 9.0])
             assert sorted(found) == pytest.approx(truth, abs=1e-9)
             off, named = admissible(loop, np.random.default_rng(k))
-            witness = {**said, **named, "direction": [-2.0], "time": at + 1e-3 * (judged == "control")}
-            over, slack = claims(name, initial_control=[0.2], **wide).driven(witness)
+            witness = {**said, **named, "direction": [-2.0], "time": at + 1e-3 * (tell == "control")}
+            over, slack = replay.witnessed(case_of(name, initial_control=[0.2], **wide), witness)
             told = -2.0 * (steps[k, 0, 0] + steps[k, 0, 1:] @ off) - 18.0
             assert float(over.mid()) == pytest.approx(told, abs=1e-9)
             assert slack == pytest.approx(1e-9 * 9.0, rel=1.0)
@@ -192,10 +192,10 @@ def test_what_a_policy_costs_is_the_integral_at_its_worst_deviations(name: str) 
     loop, v, _ = driven(name)
     _, _, U = states(name)
     lengths = np.diff(loop.breakpoints)
-    assert float(claims(name).cost().mid()) == pytest.approx(lengths @ np.abs(v[0]))
+    assert float(answers_of(case_of(name)).cost().mid()) == pytest.approx(lengths @ np.abs(v[0]))
     peaks = np.maximum(loop.height(U[:, 0]), loop.height(-U[:, 0]))
-    assert float(claims(name, "peak").cost().mid()) == pytest.approx(lengths @ peaks)
-    assert float(claims(name, "peak", weights=[3.0]).cost().mid()) == pytest.approx(3.0 * lengths @ peaks)
+    assert float(answers_of(case_of(name, "peak")).cost().mid()) == pytest.approx(lengths @ peaks)
+    assert float(answers_of(case_of(name, "peak", weights=[3.0])).cost().mid()) == pytest.approx(3.0 * lengths @ peaks)
 
 
 @pytest.mark.parametrize("name", ["box", "fast"])
@@ -204,8 +204,7 @@ def test_a_row_is_what_the_policy_makes_of_it_at_its_deviations(name: str) -> No
     loop, v, M = driven(name)
     rng, d = np.random.default_rng(8), 2
     mixed = wall("mixed", np.array([0.3, 0.4, 0.5]))
-    judged = claims(name, path=[mixed], terminal=[END], initial_control=[0.2], control_step=Box([-0.4], [0.3]))
-    case, rest = judged.case, judged.loop_at_rest
+    case = case_of(name, path=[mixed], terminal=[END], initial_control=[0.2], control_step=Box([-0.4], [0.3]))
     for place in range(6):
         off, named = admissible(loop, rng)
         at = float(rng.uniform(START, STOP)) if place else float(loop.breakpoints[1])
@@ -221,40 +220,40 @@ def test_a_row_is_what_the_policy_makes_of_it_at_its_deviations(name: str) -> No
             ({"constraint": STEP, "time": float(loop.breakpoints[k]), "direction": [1.0]},
              U[k, 0] - (U[k - 1, 0] if k else 0.2) - 0.3),
         ):  # fmt: skip
-            (row,) = _Row.of(case, rest, {**entry, **named, "multiplier": 2.0}, "nominal")
-            assert float(row.multiplier.mid()) == 2.0
-            slope = np.array([[float(g.mid()) for g in piece] for piece in row.nominal])
+            ((y, row),) = bounds.rows_of(case, {**entry, **named, "multiplier": 2.0})
+            assert y == 2.0
+            slope = np.array([[float(g.mid()) for g in piece] for piece in row.slope])
             seen = np.array([[float(e.mid()) for e in part] for part in row.innovations])
             made = v.T + np.einsum("kjmp,jp->km", M, seen)
             assert float(row.constant.mid()) + (slope * made).sum() == pytest.approx(truth, abs=1e-9), entry
     with pytest.raises(Broken, match="no constraint"):
         entry = {"constraint": STEP, "time": 0.0, "direction": [1.0], "multiplier": 1.0, **named}
-        _Row.of(claims(name).case, rest, entry, "nominal")
+        bounds.rows_of(case_of(name), entry)
     for wrong in ({"piece": 1.0}, {"piece": True}, {"time": 1.9}, {"direction": [1.0] * d}, {"multiplier": 0.0}):
         entry = {"constraint": "path", "time": 1.0, "direction": [*DIRECTIONS[0], *BESIDE[0]], "piece": 1, **named}
         with pytest.raises(Broken):
-            _Row.of(case, rest, {"multiplier": 1.0, **entry, **wrong}, "nominal")
+            bounds.rows_of(case, {"multiplier": 1.0, **entry, **wrong})
 
 
 def test_a_row_of_measurable_disturbances_is_at_a_signal_that_jumps_where_it_says() -> None:
     loop, v, M = driven("measurable")
     jumping = replace(loop, changes=np.array([0.0, 0.3, 1.1, 2.0]), measurable=False)
-    judged = claims("measurable", terminal=[END])
+    case = case_of("measurable", terminal=[END])
     off, named = admissible(jumping, np.random.default_rng(9))
     entry = {"constraint": "terminal", "time": 2.0, "direction": [0.0, -2.0], "multiplier": 1.0, **named}
     entry["changes"] = [0.0, 0.3, 1.1]
-    (row,) = _Row.of(judged.case, judged._told(entry), entry, "nominal")
+    ((_, row),) = bounds.rows_of(case, entry)
     x = jumping.states(v, M, np.array([2.0]))[0][0]
-    slope = np.array([[float(g.mid()) for g in piece] for piece in row.nominal])
+    slope = np.array([[float(g.mid()) for g in piece] for piece in row.slope])
     seen = np.array([[float(e.mid()) for e in part] for part in row.innovations])
     made = v.T + np.einsum("kjmp,jp->km", M, seen)
     truth = -2.0 * (x[1, 0] + x[1, 1:] @ off) - 0.5
     assert float(row.constant.mid()) + (slope * made).sum() == pytest.approx(truth, abs=1e-9)
     for wrong in ([0.0, 0.3], [0.1, 0.3, 1.1], [0.0, 1.1, 0.3], [0.0, 0.3, 2.0], [], [[0.0]], None):
         with pytest.raises(Broken):
-            _Row.of(judged.case, judged._told({**entry, "changes": wrong}), entry, "nominal")
+            bounds.rows_of(case, {**entry, "changes": wrong})
     with pytest.raises(Broken, match="expected"):
-        judged._told("nothing")
+        bounds.rows_of(case, "nothing")
 
 
 @pytest.mark.parametrize("name", ["box", "outputs"])
@@ -262,13 +261,14 @@ def test_multipliers_prove_no_more_than_every_policy_of_the_kind_pays(name: str)
     """Random policies whose control stays in its set: the weighted sum of the rows is never less than what is told."""
     loop, _, _ = driven(name)
     rng = np.random.default_rng(3)
-    judged = claims(name, control=Box([-1.0], [0.5]), terminal=[END])
+    judged = case_of(name, control=Box([-1.0], [0.5]), terminal=[END])
     entries, offs, sums = [], [], []
     for y, direction in ((0.5, [1.0, 0.0]), (0.25, [0.0, -1.0]), (1.0, [-1.0, 0.0])):
         off, named = admissible(loop, rng)
         entries.append({"constraint": "terminal", "time": 2.0, "direction": direction, "multiplier": y, **named})
         offs.append((y, np.array(direction), off, float(END.support(np.array(direction)))))
-    told = float(judged.multiplied(entries, priced=False).upper())
+    said = {**judged.certificate, "multipliers": {"constraints": entries, "equalities": []}}
+    told = float(bounds.multiplied(replace(judged, certificate=said), priced=False).upper())
     for _ in range(15):
         v, M = gains(rng, loop, 1.0)
         M[:, : loop.begun is None] = 0.0
@@ -289,7 +289,7 @@ def test_what_is_written_of_a_policy_is_what_the_problem_asks_for() -> None:
     rows = [[[0, 0]], [[0, 1]], [[0, 0], [2, 2]]]
 
     def judged(answers: Any, cost: Any = "peak", own: str = "peak") -> str:
-        return _policy(claims("outputs", own, {"policy": {"answers": answers, "cost": cost}}).case)
+        return claims._policy(case_of("outputs", own, {"policy": {"answers": answers, "cost": cost}}))
 
     every = [[[0, k]] for k in range(3)]
     assert judged(every)

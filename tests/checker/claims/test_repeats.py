@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import ctx
+from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.claims import claims, feedback
+from sparserob_core.checker.claims import claims
+from sparserob_core.checker.claims.answers import Named, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.claims import ASIDE
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -94,9 +95,12 @@ def test_what_counts_as_no_violation_of_the_return_is_still_an_initial_state() -
 
 def test_the_next_periods_deviation_is_one_of_the_initial_states() -> None:
     case = replace(case_of(**begun(0.25)), policy=sr.AffinePolicy())
-    ((inside,),) = feedback._following(case, {"following": [0.2]}, "return")
+    answers = answers_of(case)
+    now = Named(case, answers.loop_at_rest, [[arb(0.1)]])
+    ((inside,),) = answers.following(now, {"following": [0.2]}, "return").z
     assert float(inside.mid()) == pytest.approx(0.2)
     for wrong in ([0.25 + 1e-15], [-0.3], [0.1, 0.1], [], None, "0.1"):
         with pytest.raises(Broken, match=r"following|deviation"):
-            feedback._following(case, {"following": wrong}, "return")
-    assert feedback._following(replace(case_of(), policy=sr.AffinePolicy()), {}, "return") == []
+            answers.following(now, {"following": wrong}, "return")
+    alone = answers_of(replace(case_of(), policy=sr.AffinePolicy()))
+    assert alone.following(Named(alone.case, alone.loop_at_rest, []), {}, "return").z == []

@@ -18,11 +18,12 @@ from flint import arb, ctx
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.jets import Monomials
-from sparserob_core.checker.claims import claims, constraints, replay
+from sparserob_core.checker.claims import claims, constraints, multipliers, replay
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.causal import _shared, causal_bound
 from sparserob_core.checker.claims.cells import Place, _cut
-from sparserob_core.checker.claims.cost import _integrated, _semidefinite
+from sparserob_core.checker.cost.nominal import integrated
+from sparserob_core.checker.cost.price import _semidefinite
 from sparserob_core.checker.outcome import Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.tube import Polynomial
@@ -514,9 +515,9 @@ def test_quadratic_costs_are_integrals_by_hand():
     linear = (state + control + final) - constant - bent
     assert case.price.added(case.pieces) == pytest.approx(0.75 + constant + bent + abs(linear))
     with pytest.raises(Broken, match="tangent"):
-        claims._touched(case, {"tangent": [[0.0]]})
-    assert len(claims._touched(case, {"tangent": [[0.0, 0.0]]})) == 2
-    assert claims._touched(case_of(), {}) is None
+        multipliers.touched_by(case, {"tangent": [[0.0]]})
+    assert len(multipliers.touched_by(case, {"tangent": [[0.0, 0.0]]})) == 2
+    assert multipliers.touched_by(case_of(), {}) is None
 
 
 def test_the_length_of_a_group_counts_once():
@@ -554,12 +555,12 @@ def test_an_integral_of_a_flow_is_the_closed_form_however_often_it_is_doubled():
     from fractions import Fraction
 
     for a, h in ((0.3, 1.0), (3.0, 2.0), (40.0, 1.5)):
-        flow, weight = _integrated(stacked([balls([-a])]), stacked([balls([1.0])]), Fraction(h))
+        flow, weight = integrated(stacked([balls([-a])]), stacked([balls([1.0])]), Fraction(h))
         assert float(flow[0, 0].mid()) == pytest.approx(math.exp(-a * h))
         assert float(weight[0, 0].mid()) == pytest.approx((1 - math.exp(-2 * a * h)) / (2 * a))
         assert (2 * a * weight[0, 0] + (-2 * arb(a) * arb(h)).exp() - 1).contains(0)
     with pytest.raises(Unchecked):
-        _integrated(stacked([balls([1e70])]), stacked([balls([1.0])]), Fraction(1))
+        integrated(stacked([balls([1e70])]), stacked([balls([1.0])]), Fraction(1))
 
 
 def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it_can_reach():
@@ -607,11 +608,11 @@ def test_a_bound_with_groups_uses_the_length_of_the_slope():
             tangent = [[at[0]] * 2, [at[1]] * 2]
             said = {"multipliers": {"constraints": entries, "equalities": [], "pieces": None, "tangent": tangent}}
             case = case_of(certificate=said, control=control, **plane)
-            assert float(claims._multiplied(case, priced=True).mid()) == pytest.approx(value)
+            assert float(multipliers.multiplied(case, priced=True).mid()) == pytest.approx(value)
         # a slope that is longer than the weight by a tenth costs that, as far as the control reaches
         longer = [{**entry, "multiplier": 1.1 * entry["multiplier"]} for entry in entries]
         said["multipliers"] = {**said["multipliers"], "constraints": longer}
-        found = float(claims._multiplied(case_of(certificate=said, control=control, **plane), priced=True).mid())
+        found = float(multipliers.multiplied(case_of(certificate=said, control=control, **plane), priced=True).mid())
         assert found <= 1.1 - 2 * 0.1 * 1.0 + 1e-12
         assert found >= 1.1 - 2 * 0.1 * 1.5
 

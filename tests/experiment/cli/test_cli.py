@@ -204,7 +204,7 @@ def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws
 
 
 @pytest.mark.slow
-def test_the_check_of_a_small_run_imports_neither_sparse_matrices_nor_what_only_policies_need(
+def test_the_check_of_a_small_run_imports_neither_sparse_matrices_nor_what_transcribes(
     repository: Path, tmp_path: Path, command: Command
 ) -> None:
     directory = str(tmp_path / "run")
@@ -218,7 +218,6 @@ def test_the_check_of_a_small_run_imports_neither_sparse_matrices_nor_what_only_
     assert {"flint", "sparserob_core.checker.claims.claims"} <= loaded
     assert not loaded & {
         "scipy.sparse",
-        "sparserob_core.checker.claims.feedback",
         "sparserob_core.control.transcription",
     }
 

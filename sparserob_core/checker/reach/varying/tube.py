@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.reach.disturbance_support import Scene, bounded
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.tube import Polynomial
+from sparserob_core.checker.reach.tube import Known, Polynomial
 from sparserob_core.checker.reach.varying.flow import VaryingFlow, prefixes
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
@@ -27,15 +26,6 @@ if TYPE_CHECKING:
 ORDER = 6  # of polynomials in the time on a cell: half of it takes shorter cells, twice it takes longer for each
 
 EFFECTS_KEPT = 16  # nodes, at which the effect of every piece before is remembered; cells come one after another
-
-
-class Known(NamedTuple):
-    """There are no parameters that anything depends on: those of `Flow`."""
-
-    monomials: Monomials = Monomials(0, 0)
-    centre: tuple[float, ...] = ()
-    radius: tuple[float, ...] = ()
-    sizes: Array = np.zeros(1)
 
 
 @final

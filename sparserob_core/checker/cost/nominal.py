@@ -1,4 +1,4 @@
-"""What a control costs, in balls: norms of groups, and quadratic terms of the nominal trajectory by integrals of the
+"""The integrals of a quadratic cost along the nominal trajectory, and their slopes, in balls: by exponentials of the
 flow (Van Loan 1978), none of it shared with what solves."""
 
 from __future__ import annotations
@@ -7,7 +7,6 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
@@ -15,10 +14,9 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
-from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
+from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
-from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic, nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -26,185 +24,12 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-ENOUGH = 1e-20  # of the sizes that are added up: how closely the quadratic terms are wanted
-MOST_BITS = 8192
 EVERY = 1000  # terms of a series, more than there are
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Tangent:
-    """``constant + sum_k slope_k u_k`` lies below the quadratic terms of the cost and touches them at one control;
-    ``slope`` has ``m`` balls per piece of the control."""
-
-    constant: arb
-    slope: list[list[arb]]
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Price:
-    """The cost of a problem whose control is constant on the pieces of a dictionary."""
-
-    problem: OptimalControlProblem
-    control: Dictionary
-    clock: Clock = NO_LIMIT
-    varying: VaryingFlow | None = None
-
-    @cached_property
-    def _changing(self) -> _Changing | None:
-        """The nominal motion of a system that changes with time."""
-        return None if self.varying is None else _Changing(self.problem, self.varying)
-
-    @cached_property
-    def _lengths(self) -> list[Fraction]:
-        ends = [Fraction(t) for t in self.clock.each(self.control.breakpoints.tolist())]
-        return [b - a for a, b in self.clock.each(pairwise(ends))]
-
-    @property
-    def is_quadratic(self) -> bool:
-        return any(term is not None for term in self._terms)
-
-    @cached_property
-    def costs(self) -> list[list[arb]]:
-        """What a channel's absolute value costs on every piece, ``(K, m)``: its weights, integrated."""
-        from flint import arb
-
-        l1, ends = arb(float(self.problem.cost.l1)), [Fraction(t) for t in self.control.breakpoints.tolist()]
-        times = [Fraction(t) for t in self._changes[0]]
-        rows = [balls(row) for row in self._changes[1]]
-        found, first = [], 0
-        for begin, end in self.clock.each(pairwise(ends)):
-            while first + 1 < len(times) and times[first + 1] <= begin:
-                first += 1
-            total, now, row = [arb(0)] * len(rows[0]), begin, first
-            while now < end:
-                until = min(end, times[row + 1]) if row + 1 < len(times) else end
-                total = [one + w * _ball(until - now) for one, w in zip(total, rows[row], strict=True)]
-                now, row = until, row + 1
-            found.append([l1 * one for one in total])
-        return found
-
-    @cached_property
-    def counts(self) -> np.ndarray:
-        """What a channel counts per time that it acts ``(m,)``: its weight, and 1 where weights change with time."""
-        return self._changes[1][0] if np.asarray(self.problem.weights).ndim == 1 else np.ones(self._changes[1].shape[1])
-
-    @property
-    def highest(self) -> np.ndarray:
-        """The highest of all weights of every channel ``(m,)``."""
-        return np.asarray(self._changes[1].max(axis=0))
-
-    @cached_property
-    def _changes(self) -> tuple[list[float], np.ndarray]:
-        """The times from which weights count, and these ``(r, m)``."""
-        rows = np.asarray(self.problem.weights, dtype=float)
-        return ([0.0], rows[None]) if rows.ndim == 1 else (rows[:, 0].tolist(), rows[:, 1:])
-
-    @cached_property
-    def blocks(self) -> list[list[int]]:
-        """The channels that count together, those alone as groups of one."""
-        groups: list[list[int]] = []
-        if isinstance(self.problem.cost.group, tuple):
-            groups = [[int(channel) - 1 for channel in group] for group in self.problem.cost.group]
-        taken = {channel for group in groups for channel in group}
-        return groups + [[c] for c in range(self.problem.system.controls) if c not in taken]
-
-    def of(self, pieces: Sequence[arb_mat]) -> arb:
-        """``J`` of a control ``(m, 1)`` on every piece."""
-        from flint import arb
-
-        total = arb(0)
-        for costs, piece in self.clock.each(zip(self.costs, pieces, strict=True)):
-            total = total + self._norms(costs, piece.entries())
-        return total + self.squares(pieces)
-
-    def squares(self, pieces: Sequence[arb_mat]) -> arb:
-        """The quadratic terms of a control ``(m, 1)`` on every piece."""
-        from flint import arb
-
-        return self._quadratic(pieces).value if self.is_quadratic else arb(0)
-
-    def _norms(self, costs: Sequence[arb], u: Sequence[arb]) -> arb:
-        from flint import arb
-
-        found = arb(0)
-        for block in self.blocks:
-            size = abs(u[block[0]]) if len(block) == 1 else norm(stacked([[u[c]] for c in block]))
-            found = found + costs[block[0]] * size
-        return found
-
-    def tangent(self, pieces: Sequence[arb_mat]) -> Tangent:
-        """The tangent of the quadratic terms at a control ``(m, 1)`` on every piece."""
-        found = self._quadratic(pieces)
-        constant = found.value
-        for piece, slope in self.clock.each(zip(pieces, found.slope, strict=True)):
-            constant = constant - sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), constant * 0)
-        return Tangent(constant, found.slope)
-
-    def added(self, pieces: Sequence[arb_mat], lengths: arb | None = None) -> float:
-        """The absolute values of what the program adds up to the cost of a control: its norms, unless its ``lengths``
-        cost something else, and of the quadratic terms the linear, the quadratic and the constant part."""
-        parts = zip(self.costs, pieces, strict=True)
-        norms = lengths
-        if norms is None:
-            norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), _ball(Fraction(0)))
-        if not self.is_quadratic:
-            return float(norms.mid())
-        found, still = self._quadratic(pieces), [piece * 0 for piece in pieces]
-        constant, linear = self._quadratic(still).value, -found.value
-        for piece, slope in zip(pieces, found.slope, strict=True):
-            linear = linear + sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), linear * 0)
-        bent = linear + constant  # slope'u - value + constant = u'P u / 2
-        linear = found.value - constant - bent
-        return float((norms + abs(linear) + abs(bent) + abs(constant)).mid())
-
-    @cached_property
-    def largest(self) -> float:
-        """What a gap is relative to: the largest cost of the absolute values, and the largest of the quadratic terms
-        at a control that stays 0, or stays at one end of one channel."""
-        m = self.problem.system.controls
-        axes = np.eye(m)
-        ends = [
-            [float(known(self.problem.control).support(balls(s * axis)).mid()) for s in (1.0, -1.0)] for axis in axes
-        ]
-        reach = [max(abs(high), abs(low)) for high, low in ends]
-        lasting = np.diff([*self._changes[0], self.problem.horizon])
-        total = float(self.problem.cost.l1) * float(lasting @ self._changes[1] @ np.asarray(reach))
-        if not self.is_quadratic:
-            return total
-        still = [np.zeros(m)] + [s * r * axis for axis, r in zip(axes, reach, strict=True) for s in (1.0, -1.0)]
-        held = [[stacked([[u] for u in balls(control)])] * len(self._lengths) for control in still]
-        return total + max(float(self._quadratic(pieces).value.mid()) for pieces in held)
-
-    @property
-    def _terms(self) -> tuple[Quadratic | None, ...]:
-        return self.problem.cost.terms
-
-    def convex(self) -> None:
-        """Show that every matrix is positive semidefinite; raises `Broken`."""
-        for name, term in zip(("state", "control", "final"), self._terms, strict=True):
-            if term is not None and not _semidefinite(term):
-                raise Broken(f"the matrix of the cost's {name} term is not positive semidefinite")
-
-    def _quadratic(self, pieces: Sequence[arb_mat]) -> _Walk:
-        """The quadratic terms and their slopes, with as many bits as it takes."""
-        from flint import ctx
-
-        bits = int(ctx.prec)
-        while True:
-            with ctx.workprec(bits):
-                found = _walked(self.problem, self.control, pieces, self._changing)
-            if found.blurred <= ENOUGH:
-                return found
-            bits *= 2
-            if bits > MOST_BITS:
-                raise Unchecked("the quadratic cost cannot be resolved: the state grows too far over the horizon")
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class _Walk:
+class Walk:
     """The quadratic terms at a control, their derivatives on every piece, and the largest radius of them, relative to
     the sizes that are added up."""
 
@@ -213,14 +38,14 @@ class _Walk:
     blurred: float
 
 
-def _walked(
-    problem: OptimalControlProblem, control: Dictionary, pieces: Sequence[arb_mat], changing: _Changing | None
-) -> _Walk:
+def walked(
+    problem: OptimalControlProblem, control: Dictionary, pieces: Sequence[arb_mat], changing: Changing | None
+) -> Walk:
     """``z = (x, 1, u)`` along the nominal trajectory, and back with the costates of what it costs; a control acts on
     the state as late as the system says, and costs when it is given."""
     from flint import arb, arb_mat
 
-    modes, d, m = _Nominal.of(problem), problem.system.states, problem.system.controls
+    modes, d, m = Nominal.of(problem), problem.system.states, problem.system.controls
     still = stacked([[arb(0)] for _ in range(m)])
     x, walked = modes[0].start, []
     for start, stop, k, leg in _acting(problem, control):
@@ -245,14 +70,14 @@ def _walked(
     if R is not None:
         matrix, ends = stacked([balls(row) for row in R.Q]), [Fraction(float(t)) for t in control.breakpoints]
         for k, (start, stop) in enumerate(pairwise(ends)):
-            push = matrix * pieces[k] * _ball(stop - start)
+            push = matrix * pieces[k] * ball_of(stop - start)
             value = value + (pieces[k].transpose() * push)[0, 0]
             slope[k] = [g + 2 * entry for g, entry in zip(slope[k], push.entries(), strict=True)]
     sizes = [abs(float(value.mid())), *(abs(float(g.mid())) for entry in slope for g in entry)]
     radii = [float(value.rad()), *(float(g.rad()) for entry in slope for g in entry)]
     exact = max(radii) == 0.0
     blurred = 0.0 if exact else float("inf") if not np.isfinite(sum(radii)) else max(radii) / (max(sizes) or 1.0)
-    return _Walk(value, slope, blurred)
+    return Walk(value, slope, blurred)
 
 
 def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[Fraction, Fraction, int, int]]:
@@ -271,7 +96,7 @@ def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[F
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Nominal:
+class Nominal:
     """``z' = F z`` for ``z = (x, 1, u)``, with every uncertainty at its nominal point; ``waiting``: the same while the
     control before time 0 still acts. The cost ``z'M z`` per time, ``start = (x(0), 1)``, and the final cost of
     ``(x, 1)``."""
@@ -284,14 +109,14 @@ class _Nominal:
     _known: dict[tuple[Fraction, bool], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
 
     @staticmethod
-    def of(problem: OptimalControlProblem) -> list[_Nominal]:
+    def of(problem: OptimalControlProblem) -> list[Nominal]:
         """Those of the systems that take turns."""
         parameters = problem.system.parameters
         point = () if parameters is None else tuple(map(float, nominal_point(parameters)))
-        return [_Nominal._of(problem, flow) for flow in flows(problem.system, point)]
+        return [Nominal._of(problem, flow) for flow in flows(problem.system, point)]
 
     @staticmethod
-    def _of(problem: OptimalControlProblem, flow: Flow) -> _Nominal:
+    def _of(problem: OptimalControlProblem, flow: Flow) -> Nominal:
         from flint import arb
 
         d, m, zero = problem.system.states, problem.system.controls, arb(0)
@@ -312,7 +137,7 @@ class _Nominal:
         if problem.initial_set is not None:
             begin = [x + e for x, e in zip(begin, balls(nominal_point(problem.initial_set)), strict=True)]
         start = [[x] for x in (*begin, arb(1))]
-        return _Nominal(
+        return Nominal(
             stacked([[*A[i], drift[i], *B[i][:m]] for i in range(d)] + below),
             stacked([[*A[i], waiting[i], *[zero] * m] for i in range(d)] + below),
             stacked(M),
@@ -323,14 +148,14 @@ class _Nominal:
     def over(self, length: Fraction, acting: bool) -> tuple[arb_mat, arb_mat]:
         """What a time does to ``z``, and what it costs."""
         if (length, acting) not in self._known:
-            self._known[length, acting] = _integrated(self.F if acting else self.waiting, self.M, length)
+            self._known[length, acting] = integrated(self.F if acting else self.waiting, self.M, length)
         return self._known[length, acting]
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Changing:
-    """`_Nominal` of a system that changes with time, of which ``law`` is the flow."""
+class Changing:
+    """`Nominal` of a system that changes with time, of which ``law`` is the flow."""
 
     problem: OptimalControlProblem
     law: VaryingFlow
@@ -403,12 +228,12 @@ def _deviation(term: Quadratic | None, size: int) -> list[list[arb]]:
     return [*rows, [*(side for (side,) in beside.tolist()), corner]]
 
 
-def _integrated(F: arb_mat, M: arb_mat, length: Fraction) -> tuple[arb_mat, arb_mat]:
+def integrated(F: arb_mat, M: arb_mat, length: Fraction) -> tuple[arb_mat, arb_mat]:
     """``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``: one exponential for a short time, then doubled."""
     from flint import arb, arb_mat
 
     n, zero = F.nrows(), arb(0)
-    doublings, size = 0, norm(F) * _ball(length)
+    doublings, size = 0, norm(F) * ball_of(length)
     while not size <= 1:
         doublings, size = doublings + 1, size / 2
         if doublings > 200:
@@ -416,7 +241,7 @@ def _integrated(F: arb_mat, M: arb_mat, length: Fraction) -> tuple[arb_mat, arb_
     turned = (-F.transpose()).tolist()
     rows = [[*a, *b] for a, b in zip(turned, M.tolist(), strict=True)]
     rows += [[zero] * n + row for row in F.tolist()]
-    whole = (stacked(rows) * _ball(length / 2**doublings)).exp().tolist()
+    whole = (stacked(rows) * ball_of(length / 2**doublings)).exp().tolist()
     flow = arb_mat([row[n:] for row in whole[n:]])
     weight = flow.transpose() * arb_mat([row[n:] for row in whole[:n]])
     for _ in range(doublings):
@@ -425,25 +250,8 @@ def _integrated(F: arb_mat, M: arb_mat, length: Fraction) -> tuple[arb_mat, arb_
     return flow, weight
 
 
-def _ball(value: Fraction) -> arb:
+def ball_of(value: Fraction) -> arb:
+    """The ball of a rational number."""
     from flint import arb, fmpq
 
     return arb(fmpq(value.numerator, value.denominator))
-
-
-def _semidefinite(term: Quadratic) -> bool:
-    """Symmetric elimination in rational numbers: no pivot is negative, and none is 0 beside an entry that is not."""
-    from flint import fmpq
-
-    exact = [[Fraction(float(entry)) for entry in row] for row in term.Q]
-    rows = [[fmpq(entry.numerator, entry.denominator) for entry in row] for row in exact]
-    if any(rows[i][j] != rows[j][i] for i in range(len(rows)) for j in range(i)):
-        return False
-    for k, row in enumerate(rows):
-        if row[k] < 0 or (row[k] == 0 and any(entry != 0 for entry in row[k + 1 :])):
-            return False
-        for i in range(k + 1, len(rows)):
-            if row[k] != 0 and rows[i][k] != 0:
-                factor = rows[i][k] / row[k]
-                rows[i] = [entry - factor * other for entry, other in zip(rows[i], row, strict=True)]
-    return True

@@ -1,4 +1,4 @@
-"""Guards checker/claims/feedback: a plant so small that every figure of a policy is known by hand.
+"""Guards checker/claims of controls that answer: a plant so small that every figure of a policy is known by hand.
 
 ``x' = u + w``, ``x(0) = 0.5``, two pieces of length 1, ``|w| <= 0.25``; ``u_0 = 0.3`` and ``u_1 = -0.2 - w_0 / 2``,
 since what is measured at 1 beyond what was predicted is ``w_0``. So ``x(1) = 0.8 + w_0`` and
@@ -15,8 +15,10 @@ from flint import ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims import claims, constraints, replay
+from sparserob_core.checker.claims import multipliers as bounds
+from sparserob_core.checker.claims.answers import Answers, _chords, _reach, _width, answers_of
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.feedback import FeedbackClaims, _chords, _fixed, _reach, _width
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
@@ -39,7 +41,7 @@ def gains_of(pieces=2, **entries):
     return gains
 
 
-def claims(control=1.0, wall=None, gains=None, cost="nominal", policy=None, certificate=None, pieces=2, **more):
+def case_of(control=1.0, wall=None, gains=None, cost="nominal", policy=None, certificate=None, pieces=2, **more):
     problem = sr.OptimalControlProblem(
         **{
             "system": LinearSystem(np.zeros((1, 1)), np.ones((1, 1)), E=np.ones((1, 1))),
@@ -60,7 +62,13 @@ def claims(control=1.0, wall=None, gains=None, cost="nominal", policy=None, cert
         "proof": {"path": WALL, "terminal": END},
         **(certificate or {}),
     }
-    return FeedbackClaims(Case(problem, grid, grid, said, policy=policy or AffinePolicy(cost=cost)))
+    return Case(problem, grid, grid, said, policy=policy or AffinePolicy(cost=cost))
+
+
+def multiplied(case, rows, priced):
+    """The bound of rows that are written as the multipliers of a certificate."""
+    said = {**case.certificate, "multipliers": {"constraints": list(rows), "equalities": []}}
+    return bounds.multiplied(replace(case, certificate=said), priced)
 
 
 @pytest.fixture(autouse=True)
@@ -70,94 +78,96 @@ def precision():
 
 
 def test_a_control_is_as_large_as_its_answers_make_it():
-    assert "2 pieces" in claims(0.325 / (1 + NOTHING)).control()
+    assert "2 pieces" in claims._control(case_of(0.325 / (1 + NOTHING)))
     for size in (0.325 / (1 + TOO_MUCH), 0.31):
-        with pytest.raises(Broken, match="piece 2"):
-            claims(size).control()
-    with pytest.raises(Broken, match="piece 1"):
-        claims(0.35, gains=gains_of(m11=0.0), certificate={"decision": [[0.4, 0.0]]}).control()
+        with pytest.raises(Broken, match="from t = 1"):
+            claims._control(case_of(size))
+    with pytest.raises(Broken, match="from t = 0"):
+        claims._control(case_of(0.35, gains=gains_of(m11=0.0), certificate={"decision": [[0.4, 0.0]]}))
     # one side only, and a set that is curved where it is larger than a segment
-    assert claims(Box([-0.325], [9.0])).control()
+    assert claims._control(case_of(Box([-0.325], [9.0])))
     with pytest.raises(Broken):
-        claims(Box([-9.0], [0.299])).control()
+        claims._control(case_of(Box([-9.0], [0.299])))
 
 
 def test_a_control_in_a_curved_set_is_as_large_as_its_answers_make_it():
     """``u_1`` is between -0.325 and -0.075; of a segment around 0.1 it is the lower end that counts."""
     for radius, kept in ((0.425 / (1 + NOTHING), True), (0.425 / (1 + TOO_MUCH), False), (0.3, False)):
-        judged = claims(NormBall(p=2.0, radius=radius, centre=[0.1]))
+        judged = case_of(NormBall(p=2.0, radius=radius, centre=[0.1]))
         if kept:
-            assert "2 pieces in their set" in judged.control()
+            assert "2 pieces in their set" in claims._control(judged)
         else:
             with pytest.raises(Broken):
-                judged.control()
+                claims._control(judged)
     for radius, kept in ((0.3 * (1 + 1e-8), True), (0.3 * (1 - 1e-8), False)):  # u_0 is 0.3, whatever happens
-        judged = claims(Ellipsoid([0.0], [[radius**2]]), gains=gains_of(m11=0.0))
+        judged = case_of(Ellipsoid([0.0], [[radius**2]]), gains=gains_of(m11=0.0))
         if kept:
-            assert judged.control()
+            assert claims._control(judged)
         else:
             with pytest.raises(Broken):
-                judged.control()
+                claims._control(judged)
 
 
 def test_a_step_is_as_large_as_the_answers_of_both_pieces_make_it():
     """``u_1 - u_0 = -0.5 - w_0 / 2``."""
     for size, kept in ((0.625 / (1 + NOTHING), True), (0.625 / (1 + TOO_MUCH), False), (0.55, False)):
-        judged = claims(control_step=box(size))
+        judged = case_of(control_step=box(size))
         if kept:
-            assert "steps in their set" in judged.steps()
+            assert "steps in their set" in claims._steps(judged)
         else:
             with pytest.raises(Broken, match="t = 1"):
-                judged.steps()
-    assert float(claims(control_step=box(1.0))._change(1)[0, 1].mid()) == pytest.approx(-0.5)
-    assert claims(control_step=box(1.0))._change(1)[0, 0].mid() == pytest.approx(-0.5)
+                claims._steps(judged)
+    assert float(answers_of(case_of(control_step=box(1.0))).changes(1)[0][0, 1].mid()) == pytest.approx(-0.5)
+    assert answers_of(case_of(control_step=box(1.0))).changes(1)[0][0, 0].mid() == pytest.approx(-0.5)
 
 
 def test_the_costs_of_a_policy_are_by_hand():
-    assert float(claims(cost="nominal").cost().mid()) == pytest.approx(0.5)
-    assert float(claims(cost="peak").cost().mid()) == pytest.approx(0.3 + 0.325)
-    assert float(claims(cost="peak", weights=[2.0]).cost().mid()) == pytest.approx(2 * 0.625)
-    assert float(claims(cost="worst", certificate={"cost": 0.625 + 1e-10}).cost().mid()) == pytest.approx(0.625)
+    assert float(answers_of(case_of(cost="nominal")).cost().mid()) == pytest.approx(0.5)
+    assert float(answers_of(case_of(cost="peak")).cost().mid()) == pytest.approx(0.3 + 0.325)
+    assert float(answers_of(case_of(cost="peak", weights=[2.0])).cost().mid()) == pytest.approx(2 * 0.625)
+    assert float(answers_of(case_of(cost="worst", certificate={"cost": 0.625 + 1e-10})).cost().mid()) == pytest.approx(
+        0.625
+    )
     for short in (1e-9, 0.125):
         with pytest.raises(Broken):
-            claims(cost="worst", certificate={"cost": 0.625 - short}).cost()
+            answers_of(case_of(cost="worst", certificate={"cost": 0.625 - short})).cost()
 
 
 def test_answers_to_what_is_not_measured_or_is_forgotten_are_refused():
     for wrong in (gains_of(m01=0.1), gains_of(m00=0.1), gains_of(m10=1e-300)):
         with pytest.raises(Broken, match="not measured"):
-            claims(gains=wrong).gains  # noqa: B018
+            answers_of(case_of(gains=wrong)).gains  # noqa: B018
     with pytest.raises(Broken, match="shape"):
-        claims(gains=gains_of(3)).gains  # noqa: B018
-    begun = claims(gains=gains_of(m10=-0.5), initial_set=box(0.1))
-    assert (begun.gains == gains_of(m10=-0.5)).all()
+        answers_of(case_of(gains=gains_of(3))).gains  # noqa: B018
+    begun = case_of(gains=gains_of(m10=-0.5), initial_set=box(0.1))
+    assert (answers_of(begun).gains == gains_of(m10=-0.5)).all()
     for memory, kept in ((1.0, True), (1.0 - 1e-9, False)):
-        judged = claims(gains=gains_of(m10=-0.5), initial_set=box(0.1), policy=AffinePolicy(memory=memory))
+        judged = case_of(gains=gains_of(m10=-0.5), initial_set=box(0.1), policy=AffinePolicy(memory=memory))
         if kept:
-            assert judged.gains.any()
+            assert answers_of(judged).gains.any()
         else:
             with pytest.raises(Broken, match="measured at 0, which its policy does not"):
-                judged.gains  # noqa: B018
+                answers_of(judged).gains  # noqa: B018
 
 
 def test_a_state_is_as_far_as_its_worst_disturbance_takes_it():
     """The largest ``x`` is 1.05, at 1; ``x(2)`` is 0.975 at most."""
     for size, kept in ((1.05 / (1 + NOTHING), True), (1.05 / (1 + TOO_MUCH), False), (1.0, False)):
-        judged = claims(wall=box(size))
-        window = judged.case.windows[0]
+        judged = case_of(wall=box(size))
+        window = judged.windows[0]
         if kept:
-            assert "kept for every disturbance" in judged.bounded(window)
+            assert "kept" in constraints.bounded(judged, window)
         else:
             with pytest.raises(Broken, match="t = 1"):
-                judged.bounded(window)
+                constraints.bounded(judged, window)
     for size, kept in ((0.975 / (1 + NOTHING), True), (0.975 / (1 + TOO_MUCH), False)):
-        judged = claims(terminal=[box(size)])
-        window = judged.case.windows[0]
+        judged = case_of(terminal=[box(size)])
+        window = judged.windows[0]
         if kept:
-            assert judged.bounded(window)
+            assert constraints.bounded(judged, window)
         else:
             with pytest.raises(Broken, match="t = 2"):
-                judged.bounded(window)
+                constraints.bounded(judged, window)
 
 
 @pytest.mark.parametrize(
@@ -172,56 +182,62 @@ def test_a_state_is_as_far_as_its_worst_disturbance_takes_it():
     ],
 )
 def test_a_proof_that_leaves_something_out_is_none(proof, match):
-    judged = claims(wall=box(9.0), certificate={"proof": proof})
+    judged = case_of(wall=box(9.0), certificate={"proof": proof})
     with pytest.raises(Broken, match=match):
-        judged.bounded(judged.case.windows[0])
-    undecided = claims(wall=box(9.0), certificate={"proof": {}, "status": "undecided"})
+        constraints.bounded(judged, judged.windows[0])
+    undecided = case_of(wall=box(9.0), certificate={"proof": {}, "status": "undecided"})
     with pytest.raises(Unchecked):
-        undecided.bounded(undecided.case.windows[0])
+        constraints.bounded(undecided, undecided.windows[0])
 
 
 def test_a_curved_wall_is_kept_and_left_like_the_segment_that_it_is():
     for square, kept in ((1.06**2, True), (1.04**2, False)):
         faces = [[0.0, -1.0], [0.0, 1.0]], [[2.0, -1.0], [2.0, 1.0]]
         proof = {"path": {"tolerance": 1e-9, "lower": faces[0], "upper": faces[1]}}
-        judged = claims(wall=Ellipsoid([0.0], [[square]]), certificate={"proof": proof})
+        judged = case_of(wall=Ellipsoid([0.0], [[square]]), certificate={"proof": proof})
         if kept:
-            assert "cells" in judged.bounded(judged.case.windows[0])
+            assert "cells" in constraints.bounded(judged, judged.windows[0])
         else:
             with pytest.raises(Broken):
-                judged.bounded(judged.case.windows[0])
+                constraints.bounded(judged, judged.windows[0])
 
 
 def test_what_the_worst_disturbance_exceeds_is_told_row_by_row():
-    judged = claims(0.3, wall=box(1.0), control_step=box(0.6))
+    judged = case_of(0.3, wall=box(1.0), control_step=box(0.6))
     said = {"violation": 0.0}
-    over, close = judged.exceeded({"constraint": "path", "time": 1.0, **said})
+    over, close = replay.exceeded(judged, {"constraint": "path", "time": 1.0, **said})
     assert over == pytest.approx([0.05, -1.55] if len(over) == 2 else [0.05, -1.55] * 2)
     assert close == pytest.approx(1e-9, rel=1e-6)
-    assert judged.exceeded({"constraint": "path", "time": 0.5, **said})[0][:2] == pytest.approx([-0.225, -1.525])
-    assert judged.exceeded({"constraint": "path", "time": 2.0, **said})[0][:2] == pytest.approx([-0.025, -1.225])
-    over, close = judged.exceeded({"constraint": "control", "time": 1.0, **said})
+    assert replay.exceeded(judged, {"constraint": "path", "time": 0.5, **said})[0][:2] == pytest.approx(
+        [-0.225, -1.525]
+    )
+    assert replay.exceeded(judged, {"constraint": "path", "time": 2.0, **said})[0][:2] == pytest.approx(
+        [-0.025, -1.225]
+    )
+    over, close = replay.exceeded(judged, {"constraint": "control", "time": 1.0, **said})
     assert over == pytest.approx([-0.375, 0.025])
     assert close == pytest.approx(1e-9 * 0.3)
-    assert judged.exceeded({"constraint": "control", "time": 0.99, **said})[0] == pytest.approx([0.0, -0.6])
-    over, close = judged.exceeded({"constraint": "control_step", "time": 1.0, **said})
+    assert replay.exceeded(judged, {"constraint": "control", "time": 0.99, **said})[0] == pytest.approx([0.0, -0.6])
+    over, close = replay.exceeded(judged, {"constraint": "control_step", "time": 1.0, **said})
     assert over == pytest.approx([-0.975, 0.025])
     assert close == pytest.approx(1e-9 * 0.6)
     for name, time in (("control_step", 0.5), ("control_step", 2.0), ("path", 2.1), ("path", -0.1), ("nobody", 1.0)):
         with pytest.raises(Broken):
-            judged.exceeded({"constraint": name, "time": time, **said})
+            replay.exceeded(judged, {"constraint": name, "time": time, **said})
 
 
 def test_a_witness_is_driven_by_its_own_disturbance():
-    judged = claims(0.3, wall=box(1.0), control_step=box(0.6))
+    judged = case_of(0.3, wall=box(1.0), control_step=box(0.6))
     data = {"constraint": "path", "time": 2.0, "direction": [1.0], "disturbance": [[0.25, -0.2]], "violation": 0.0}
-    over, slack = judged.driven(data)
+    over, slack = replay.witnessed(judged, data)
     assert float(over.mid()) == pytest.approx(0.6 + 0.125 - 0.2 - 1.0)
     assert slack == pytest.approx(1e-9, rel=1e-6)
-    assert float(judged.driven({**data, "time": 1.0, "direction": [-1.0]})[0].mid()) == pytest.approx(-1.05 - 1.0)
-    over, slack = judged.driven({**data, "constraint": "control", "time": 1.0, "direction": [-1.0]})
+    assert float(replay.witnessed(judged, {**data, "time": 1.0, "direction": [-1.0]})[0].mid()) == pytest.approx(
+        -1.05 - 1.0
+    )
+    over, slack = replay.witnessed(judged, {**data, "constraint": "control", "time": 1.0, "direction": [-1.0]})
     assert (float(over.mid()), slack) == (pytest.approx(0.325 - 0.3), pytest.approx(3e-10))
-    over, slack = judged.driven({**data, "constraint": "control_step", "time": 1.0, "direction": [-1.0]})
+    over, slack = replay.witnessed(judged, {**data, "constraint": "control_step", "time": 1.0, "direction": [-1.0]})
     assert (float(over.mid()), slack) == (pytest.approx(0.625 - 0.6), pytest.approx(6e-10))
     for wrong in (
         {"disturbance": [[0.25 + 1e-15, 0.0]]},
@@ -232,20 +248,24 @@ def test_a_witness_is_driven_by_its_own_disturbance():
         {"constraint": "nobody"},
     ):
         with pytest.raises(Broken):
-            judged.driven({**data, **wrong})
+            replay.witnessed(judged, {**data, **wrong})
     with pytest.raises(Unchecked):
-        judged.driven({**data, "disturbance": None})
+        replay.witnessed(judged, {**data, "disturbance": None})
 
 
 def test_without_control_the_disturbance_adds_up_and_with_it_the_state_and_control_are_seen_together():
-    judged = claims()
-    assert float(judged.disturbed(np.ones(1), 2.0, balls([0.25])[0]).mid()) == pytest.approx(0.5 + 0.5 - 0.25)
-    assert float(judged.farthest(np.ones(1), np.zeros(1), 2.0, None).mid()) == pytest.approx(0.975)
-    assert float(judged.farthest(np.ones(1), np.zeros(1), 0.5, None).mid()) == pytest.approx(0.65 + 0.125)
-    assert float(judged.disturbed(np.ones(1), 0.5, balls([0.25])[0]).mid()) == pytest.approx(0.5 + 0.125 - 0.25)
+    judged = case_of()
+    assert float(answers_of(judged).disturbed(np.ones(1), 2.0, balls([0.25])[0]).mid()) == pytest.approx(
+        0.5 + 0.5 - 0.25
+    )
+    assert float(answers_of(judged).farthest(np.ones(1), np.zeros(1), 2.0, None).mid()) == pytest.approx(0.975)
+    assert float(answers_of(judged).farthest(np.ones(1), np.zeros(1), 0.5, None).mid()) == pytest.approx(0.65 + 0.125)
+    assert float(answers_of(judged).disturbed(np.ones(1), 0.5, balls([0.25])[0]).mid()) == pytest.approx(
+        0.5 + 0.125 - 0.25
+    )
     # x(2) + u_1 = 0.4 + w_1
-    assert float(judged.farthest(np.ones(1), np.ones(1), 2.0, 1).mid()) == pytest.approx(0.65)
-    assert float(judged.farthest(np.ones(1), -np.ones(1), 2.0, 1).mid()) == pytest.approx(0.8 + 0.25 + 0.25)
+    assert float(answers_of(judged).farthest(np.ones(1), np.ones(1), 2.0, 1).mid()) == pytest.approx(0.65)
+    assert float(answers_of(judged).farthest(np.ones(1), -np.ones(1), 2.0, 1).mid()) == pytest.approx(0.8 + 0.25 + 0.25)
 
 
 def test_fixed_states_are_met_where_every_deviation_is_answered():
@@ -258,7 +278,7 @@ def test_fixed_states_are_met_where_every_deviation_is_answered():
         (-0.49, 0.6, False),
         (-0.51, 0.6, False),
     ):
-        judged = claims(
+        judged = case_of(
             gains=gains_of(m00=g, m10=g),
             system=plant,
             disturbance=None,
@@ -266,12 +286,12 @@ def test_fixed_states_are_met_where_every_deviation_is_answered():
             terminal=[Equality([goal])],
         )
         if met:
-            assert "kept for every disturbance" in judged.equalities()
+            assert "kept" in constraints.equalities(judged)
         else:
             with pytest.raises(Broken, match="x1 is missed"):
-                judged.equalities()
+                constraints.equalities(judged)
         missed = abs(0.6 - goal) + abs(1 + 2 * g) * 0.2
-        over, close = judged.exceeded({"constraint": "equals", "time": 2.0, "violation": 0.0})
+        over, close = replay.exceeded(judged, {"constraint": "equals", "time": 2.0, "violation": 0.0})
         assert over == pytest.approx([missed], abs=1e-15)
         assert 2.5e-9 <= close <= 1e-8  # at least the start 0.5 and what the control can add, 2, are added up
 
@@ -287,10 +307,10 @@ UP, DOWN = (REACH, REACH), (-REACH, REACH)
 
 def test_multipliers_at_two_disturbances_prove_the_least_nominal_cost():
     """``x(2) <= 0.2`` asks ``v_0 + v_1 <= -0.3 - (1 + g) w_0 - w_1``: 0.55 at least, whatever the gain ``g``."""
-    judged = claims(terminal=[box(0.2)])
+    judged = case_of(terminal=[box(0.2)])
 
     def bound(*rows, priced=True):
-        return float(judged.multiplied(rows, priced).mid())
+        return float(multiplied(judged, rows, priced).mid())
 
     assert bound(row(UP, 0.5), row(DOWN, 0.5)) == pytest.approx(0.55)
     # what the gains could still lower is taken off: the width of the control 2 for the chord 0.5 of the disturbance
@@ -317,23 +337,23 @@ def test_multipliers_at_two_disturbances_prove_the_least_nominal_cost():
 
 
 def test_multipliers_of_peaks_and_of_the_effort_prove_their_least_costs_too():
-    peaks = claims(terminal=[box(0.2)], cost="peak")
+    peaks = case_of(terminal=[box(0.2)], cost="peak")
 
     def peak(w, y, time):
         return row(w, y, constraint="peak", time=time, direction=[-1.0])
 
     def bound(first):
         rows = [row(UP, 0.5), row(DOWN, 0.5), peak(UP, first, 0.0), peak(UP, 0.5, 1.0), peak(DOWN, 0.5, 1.0)]
-        return float(peaks.multiplied(rows, True).mid())
+        return float(multiplied(peaks, rows, True).mid())
 
     assert bound(1.0) == pytest.approx(0.55)
     assert bound(0.9) == pytest.approx(0.55 - 0.1)
     assert bound(1.1) == pytest.approx(0.55 - 0.1 - 0.1)
     for wrong in ([1.0, 0.0], [0.5], [0.0]):
         with pytest.raises(Broken):
-            peaks.multiplied([{**peak(UP, 1.0, 0.0), "direction": wrong}], True)
+            multiplied(peaks, [{**peak(UP, 1.0, 0.0), "direction": wrong}], True)
 
-    effort = claims(terminal=[box(0.2)], cost="worst")
+    effort = case_of(terminal=[box(0.2)], cost="worst")
 
     def of_effort(w, y, shares):
         return row(w, y, constraint="effort", time=0.0, direction=shares)
@@ -341,7 +361,7 @@ def test_multipliers_of_peaks_and_of_the_effort_prove_their_least_costs_too():
     def least(y, share=-1.0):
         shares = [share, -1.0]
         rows = [row(UP, 0.5), row(DOWN, 0.5), of_effort(UP, y / 2, shares), of_effort(DOWN, y / 2, shares)]
-        return float(effort.multiplied(rows, True).mid())
+        return float(multiplied(effort, rows, True).mid())
 
     assert least(1.0) == pytest.approx(0.55)
     assert least(0.9) == pytest.approx(0.55 - 2 * 0.1)
@@ -349,27 +369,27 @@ def test_multipliers_of_peaks_and_of_the_effort_prove_their_least_costs_too():
     assert least(1.0, -0.5) == pytest.approx(0.55 - 0.5)
     for wrong in ([-1.0], [-1.0 - 1e-15, 0.0], [1.0, 1.0, 1.0]):
         with pytest.raises(Broken):
-            effort.multiplied([of_effort(UP, 1.0, wrong)], True)
+            multiplied(effort, [of_effort(UP, 1.0, wrong)], True)
 
 
 def test_multipliers_of_the_control_and_of_its_steps_are_rows_too():
     """A control of at most 0.1 a piece cannot bring down what asks for 0.55: the sum of rows is above 0."""
-    judged = claims(0.1, terminal=[box(0.2)])
+    judged = case_of(0.1, terminal=[box(0.2)])
     rows = [
         row(UP, 0.5),
         row(DOWN, 0.5),
         *(row(w, 0.5, constraint="control", time=t, direction=[-1.0]) for w in (UP, DOWN) for t in (0.0, 1.0)),
     ]
-    assert float(judged.multiplied(rows, False).mid()) == pytest.approx(0.55 - 0.2)
+    assert float(multiplied(judged, rows, False).mid()) == pytest.approx(0.55 - 0.2)
     with pytest.raises(Broken):
-        judged.multiplied([row(UP, 0.5, constraint="control", time=0.0, direction=[-1.0, 0.0])], False)
-    stepped = claims(terminal=[box(0.2)], control_step=box(0.1), certificate={})
+        multiplied(judged, [row(UP, 0.5, constraint="control", time=0.0, direction=[-1.0, 0.0])], False)
+    stepped = case_of(terminal=[box(0.2)], control_step=box(0.1), certificate={})
     # u_1 - u_0 <= 0.1 with the weight 1/2: slopes become 1 - 1/2 and 1 + 1/2
     steps = [row(w, 0.25, constraint="control_step", time=1.0, direction=[1.0]) for w in (UP, DOWN)]
-    proven = float(stepped.multiplied([row(UP, 0.5), row(DOWN, 0.5), *steps], True).mid())
+    proven = float(multiplied(stepped, [row(UP, 0.5), row(DOWN, 0.5), *steps], True).mid())
     assert proven == pytest.approx(0.55 - 0.5 * 0.1 - 0.5 * 1.0)
     with pytest.raises(Broken):
-        stepped.multiplied([{**steps[0], "direction": [1.0, 0.0]}], True)
+        multiplied(stepped, [{**steps[0], "direction": [1.0, 0.0]}], True)
 
 
 @pytest.mark.parametrize(
@@ -392,18 +412,18 @@ def test_chords_are_how_long_a_set_is_through_its_middle(shape, chords):
 
 
 def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
-    judged = claims()
-    delayed = replace(judged.case.problem.system, delay=0.5)
-    problem = replace(judged.case.problem, system=delayed)
-    for policy in (None, judged.case.policy):
-        free = replace(judged.case, problem=replace(problem, disturbance_class="measurable"), policy=policy)
+    judged = case_of()
+    delayed = replace(judged.problem.system, delay=0.5)
+    problem = replace(judged.problem, system=delayed)
+    for policy in (None, judged.policy):
+        free = replace(judged, problem=replace(problem, disturbance_class="measurable"), policy=policy)
         with pytest.raises(Unchecked, match="undelayed"):
-            FeedbackClaims(free).loop  # noqa: B018
+            Answers(free).loop  # noqa: B018
     one = LinearSystem(lambda p: p[0] * np.ones((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)), parameters=box(0.1))
-    for policy, kind in ((judged.case.policy, "piecewise_constant"), (None, "measurable")):
-        problem = replace(judged.case.problem, system=one, disturbance_class=kind)
+    for policy, kind in ((judged.policy, "piecewise_constant"), (None, "measurable")):
+        problem = replace(judged.problem, system=one, disturbance_class=kind)
         with pytest.raises(Unchecked, match="known systems only"):
-            FeedbackClaims(replace(judged.case, problem=problem, policy=policy)).loop  # noqa: B018
+            Answers(replace(judged, problem=problem, policy=policy)).loop  # noqa: B018
 
 
 def test_how_far_and_how_wide_a_set_is_along_a_channel():
@@ -417,8 +437,8 @@ def test_how_far_and_how_wide_a_set_is_along_a_channel():
 
 
 def test_a_direction_of_a_fixed_state_is_that_state_alone_at_the_end():
-    case = claims(terminal=[Equality([0.6])]).case
-    assert [float(_fixed(case, np.array([c]), 2.0).mid()) for c in (1.0, -2.0)] == [0.6, -1.2]
+    case = case_of(terminal=[Equality([0.6])])
+    assert [float(bounds.fixed_limit(case, np.array([c]), 2.0).mid()) for c in (1.0, -2.0)] == [0.6, -1.2]
     for direction, time in (([0.0], 2.0), ([1.0], 1.9), ([1.0], 0.0)):
         with pytest.raises(Broken, match="fixed final state"):
-            _fixed(case, np.array(direction), time)
+            bounds.fixed_limit(case, np.array(direction), time)

@@ -1,0 +1,521 @@
+"""The answers of a control, derived anew from its gains in ball arithmetic: the loop that they close, the deviations
+that a certificate names and what is seen of them, and how far all gains together can lower a weighted sum of
+constraints. A control that answers nothing has no deviations here, and no innovations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims.case import STEP, Case, number, numbers
+from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.closed_loop import ClosedLoop
+from sparserob_core.checker.reach.effort import at_most
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.measurable import MeasurableLoop
+from sparserob_core.checker.reach.preimages import Pushed, Seen
+from sparserob_core.checker.reach.varying.loop import VaryingLoop
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import along
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+PEAK, WORST = "peak", "worst"
+FIGURES = 1e-11  # of an effort: how closely it is known
+
+
+@final
+class Answers:
+    """The answers of the control of a case, from its ``gains (K, K, m, p)``."""
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+
+    @cached_property
+    def gains(self) -> Array:
+        """The gains, none of a control that answers nothing; raises `Broken` where they answer what is not yet
+        measured, or what the policy does not answer."""
+        case = self.case
+        if not case.answering:
+            return self._none
+        gains = numbers(case.certificate.get("gains"), "gains")
+        if gains.shape != self._none.shape:
+            raise Broken(f"the gains have shape {gains.shape}, expected {self._none.shape}")
+        times, measured = case.control.breakpoints, case.problem.measurements
+        told = case.problem.initial_set is not None or (measured is not None and measured.noise is not None)
+        for k, j in np.argwhere(gains.any(axis=(2, 3))).tolist():
+            if j > k or (j == 0 and not told):
+                raise Broken(f"the control from t = {float(times[k]):.6g} on answers what is not measured yet")
+            if not case.answers[k, j]:
+                raise Broken(
+                    f"the control from t = {float(times[k]):.6g} on answers what was measured at"
+                    f" {float(times[j]):.6g}, which its policy does not"
+                )
+        return gains
+
+    @property
+    def _none(self) -> Array:
+        """Gains that answer nothing, ``(K, K, m, p)``."""
+        system, measured, K = self.case.problem.system, self.case.problem.measurements, self.case.control.pieces
+        return np.zeros((K, K, system.controls, system.states if measured is None else measured.outputs))
+
+    @cached_property
+    def observer(self) -> Array | None:
+        """What makes innovations of the outputs, ``(K, d, p)``; any is right that is written."""
+        case = self.case
+        if case.problem.measurements is None or not case.answering:
+            return None
+        shape = case.control.pieces, case.problem.system.states, case.problem.measurements.outputs
+        found = numbers(case.certificate.get("observer"), "observer")
+        if found.shape != shape:
+            raise Broken(f"the observer has shape {found.shape}, expected {shape}")
+        return found
+
+    @cached_property
+    def loop(self) -> ClosedLoop:
+        """The system under the nominal control and the gains."""
+        return self._loop(self.case.theta, self.gains)
+
+    def _loop(self, nominal: Array, gains: Array, changes: list[float] | None = None) -> ClosedLoop:
+        """The loop; where ``changes`` are given, under disturbances that jump there only."""
+        case = self.case
+        system, answers = case.problem.system, case.answering and not case.measurable
+        if system.parameter_count or not (answers or isinstance(system, LinearSystem)):
+            raise Unchecked("the checker knows feedback and measurable disturbances of known systems only")
+        if not answers and not (case.control.is_indicators and system.delay == 0.0):
+            raise Unchecked(
+                "of measurable disturbances the checker knows controls of their own on every piece, undelayed"
+            )
+        held = (changes or []) if case.measurable else (case.changes or [])
+        measured = case.problem.measurements if case.answering else None
+        if measured is not None and case.measurable:
+            raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
+        parts = (
+            case.problem.system,
+            [float(v) for v in np.asarray(case.problem.initial_state)],
+            nominal,
+            gains,
+            sorted({*case.grid, *held}),
+            [float(t) for t in case.control.breakpoints],
+            held,
+            case.problem.disturbance,
+            case.problem.initial_set,
+            tuple(float(v) for v in before(case.problem)),
+            measured,
+            self.observer,
+        )
+        if case.changing is not None:
+            return VaryingLoop(*parts, law=case.changing)
+        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(*parts)
+
+    @cached_property
+    def commands(self) -> list[arb_mat]:
+        """The control on every piece, ``(m, 1)``, and what it answers of every deviation beside it, ``(m, 1 + Q)``."""
+        return (
+            [self.loop.inputs(k) for k in range(self.case.control.pieces)] if self.case.answering else self.case.pieces
+        )
+
+    def changes(self, k: int) -> list[arb_mat]:
+        """The change of the control at the beginning of piece ``k``, as a sum of parts that deviate apart. Across the
+        seam of a plan that repeats the last control of a period and the first one of the next are chosen apart: what
+        each answers is another's."""
+        if k == self.case.control.pieces:
+            return [self.commands[0], -self.commands[k - 1]]
+        if k:
+            return [self.commands[k] - self.commands[k - 1]]
+        none = [0.0] * (self.commands[0].ncols() - 1)
+        return [self.commands[0] - stacked([balls([u, *none]) for u in before(self.case.problem)])]
+
+    def parts_at(self, name: str, time: float) -> list[arb_mat]:
+        """The control at a time, or its change there, as a sum of parts that deviate apart."""
+        case = self.case
+        if name != STEP:
+            return [self.commands[case.duality.control_piece(time)]]
+        places = [k for k in steps(case.problem, case.control) if float(case.control.breakpoints[k]) == time]
+        if not places:
+            raise Broken(f"{name}: there is no step at t = {time!r}")
+        return self.changes(places[0])
+
+    def support(self, responses: list[arb]) -> arb:
+        """How far deviations take what has these ``responses (Q,)`` to them; 0 of none."""
+        return self.loop.support(responses) if responses else balls([0.0])[0]
+
+    def heights(self, parts: Sequence[arb_mat], rows: arb_mat) -> list[arb]:
+        """The largest ``c'u`` for every row ``c`` of ``rows (r, m)`` of a sum of ``parts (m, 1 + Q)`` that deviate
+        apart."""
+        every = [[row[0] + self.support(row[1:]) for row in (rows * part).tolist()] for part in parts]
+        return [sum(heights[1:], heights[0]) for heights in zip(*every, strict=True)]
+
+    def added(self, state: int) -> float:
+        """The size of the numbers that are added up in a state at the end: of what the system does without control, and
+        with it, and of what deviations add to both."""
+        total = 0.0
+        for loop in (self.loop_at_rest, self.loop):
+            first, *responses = (float(abs(x).upper()) for x in loop.nodes[-1].tolist()[state])
+            total += first + float(np.array(responses) @ loop.radii)
+        return total
+
+    def cost(self) -> arb:
+        """The cost of the control; where absolute values are charged as an effort, the written one, which is shown to
+        be none too small."""
+        from flint import arb
+
+        case, total = self.case, arb(0)
+        if case.charge not in (PEAK, WORST):
+            return case.price.of(case.pieces)
+        squares = case.price.squares(case.pieces)
+        if case.charge == WORST:
+            written = arb(number(case.certificate, "cost"))
+            self._effort(written - squares + FIGURES * abs(written))
+            return written
+        for k, costs in enumerate(case.price.costs):
+            for i, price in enumerate(costs):
+                u, row = arb(float(case.theta[i, k])), self.loop.effects[k][i]
+                height = (u + self.loop.support(row)).max(-u + self.loop.support([-x for x in row]))
+                total = total + price * height
+        return total + squares
+
+    def _effort(self, limit: arb) -> None:
+        """Show that no deviation causes an effort beyond a limit."""
+        from flint import arb
+
+        case, loop = self.case, self.loop
+        a, A = [], []
+        for k, costs in enumerate(case.price.costs):
+            for i, price in enumerate(costs):
+                a.append(price * arb(float(case.theta[i, k])))
+                A.append([price * x for x in loop.effects[k][i]])
+        reach = [
+            float(known(shape).support(balls([float(b == axis) for b in range(shape.dimension)])).mid()) - about[axis]
+            for shape, about in loop.sets
+            for axis in range(shape.dimension)
+        ]
+        at_most(a, A, loop.support, np.array(reach), limit, case.clock)
+
+    def disturbed(self, direction: Array, time: float, limit: arb) -> arb:
+        """By how much ``c'x(t)`` exceeds a limit without any control, for the worst disturbance and initial state."""
+        return self.at_rest.highest(self.case.piece_at(time), time, direction[None])[0] - limit
+
+    def farthest(self, c: Array, gain: Array, time: float, k: int | None) -> arb:
+        """The largest ``c'x(t) + gain'u``, ``u`` the control on piece ``k``, over all deviations."""
+        beside = None if k is None else stacked([balls(gain)]) * self.loop.inputs(k)
+        return self.loop.highest(self.case.piece_at(time), time, c[None], beside)[0]
+
+    @cached_property
+    def at_rest(self) -> ClosedLoop:
+        """The system without any control, under the disturbances of the problem."""
+        K, m = self.case.control.pieces, self.case.problem.system.controls
+        return self._loop(np.zeros((m, K)), self._none)
+
+    def least(self, rows: Sequence[tuple[float, Row]], priced: bool) -> arb:
+        """At most what gains, and peaks or an effort that are charged, add to the sum of ``rows`` times their
+        multipliers; 0 where nothing is answered.
+
+        Of peaks and of the effort only how far the set of the control lets them go is used; of the gains that the
+        control that they cause is no wider than its set, ``h(F_kl) + h(-F_kl) <= width`` summed over the blocks ``l``.
+        """
+        from flint import arb
+
+        case, total, most = self.case, arb(0), arb(0)
+        for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
+            for i, price in enumerate(costs):
+                reach = _reach(case.problem.control, i)
+                most = most + price * reach
+                if case.charge == PEAK:
+                    left = price * int(priced) - sum((arb(y) for y, row in rows if row.charged == (k, i)), arb(0))
+                    total = total + (left * reach).min(arb(0))
+        if case.charge == WORST:
+            left = arb(int(priced)) - sum((arb(y) for y, row in rows if row.charged == EFFORT), arb(0))
+            total = total + (left * most).min(arb(0))
+        return total - self._of_gains(rows)
+
+    def _of_gains(self, rows: Sequence[tuple[float, Row]]) -> arb:
+        """How much the gains can lower the sum of rows times their multipliers, at most."""
+        from flint import arb
+
+        case, total = self.case, arb(0)
+        rows = [(y, row) for y, row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
+        if not rows:
+            return total
+        loop = self.loop_at_rest
+        K, m, d = case.control.pieces, case.problem.system.controls, loop.outputs
+        left = stacked([[arb(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
+        right = stacked([[x for part in row.innovations for x in part] for _, row in rows])
+        product = (left * right).tolist()
+        width = [_width(case.problem.control, i) for i in range(m)]
+        for k in range(K):
+            clusters = self._clusters(loop, k)
+            for i in range(m):
+                sizes = [arb(0)]
+                for members, inverse, blocks in clusters:
+                    z = (
+                        inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])
+                    ).entries()
+                    shares = iter(z)
+                    sizes += [
+                        sum((abs(next(shares)) / chord for chord in self._chords[block].values()), arb(0))
+                        for block in blocks
+                    ]
+                total = total + width[i] * _largest(sizes)
+        return total
+
+    def _clusters(self, loop: ClosedLoop, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
+        """The breakpoints that the control on a piece answers, those that see a block in common together; for each what
+        gives, from a combination of the states seen there, a combination of the blocks, ``(q, J d)``."""
+        groups: list[tuple[list[int], set[int]]] = []
+        for j in np.flatnonzero(self.case.answers[k, : k + 1]).tolist():
+            seen = {block for block in loop.seen[j] if self._chords[block]}
+            if not seen:
+                continue
+            mine, rest = ([j], seen), []
+            for members, blocks in groups:
+                if blocks & mine[1]:
+                    mine = (members + mine[0], mine[1] | blocks)
+                else:
+                    rest.append((members, blocks))
+            groups = [*rest, mine]
+        return [(sorted(members), *self._inverse(loop, tuple(sorted(members)))) for members, _ in groups]
+
+    def _inverse(self, loop: ClosedLoop, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
+        """What gives, of any combination of the states seen at these breakpoints, one of the blocks that is seen so."""
+        from flint import arb
+
+        if members not in self._inverses:
+            blocks = sorted({block for j in members for block in loop.seen[j] if self._chords[block]})
+            d, zero = loop.outputs, arb(0)
+            table: list[list[arb]] = []
+            for j in members:
+                lists = {block: push.tolist() for block, push in loop.seen[j].items()}
+                table += [
+                    [lists[block][s][b] if block in lists else zero for block in blocks for b in self._chords[block]]
+                    for s in range(d)
+                ]
+            groups = [self._pushed(loop, block) for block in blocks]
+            pattern = np.vstack(
+                [np.hstack([g.pattern & (b in loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
+                 for j in members]
+            )  # fmt: skip
+            most = max(group.states for group in groups)
+            rows = [(d * (k + 1), most) for k in range(len(members))]
+            ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
+            columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
+            self._inverses[members] = Seen(stacked(table), pattern, rows, columns).inverse(), blocks
+        return self._inverses[members]
+
+    def _pushed(self, loop: ClosedLoop, block: int) -> Pushed:
+        """Who can see the deviations of a block; of the initial state everyone sees its own."""
+        d, varying = loop.system.states, tuple(self._chords[block])
+        if loop.measured is not None:  # outputs see what the observer makes of everything: as many as there are
+            return Pushed(np.ones((loop.outputs, len(varying)), dtype=bool), loop.outputs, len(varying))
+        if self.case.problem.initial_set is not None and block == loop.begun:
+            return Pushed(np.eye(d, dtype=bool)[:, list(varying)], len(varying), len(varying))
+        if varying not in self._pushes:
+            self._pushes[varying] = loop.pushed(varying)
+        return self._pushes[varying]
+
+    @cached_property
+    def _pushes(self) -> dict[tuple[int, ...], Pushed]:
+        return {}
+
+    @cached_property
+    def _chords(self) -> list[dict[int, arb]]:
+        """Of every block how long its set is along the axes, those along which it is a point left out: what cannot
+        deviate is never seen."""
+        loop = self.loop_at_rest
+        found = {id(shape): _chords(shape, about) for shape, about in loop.sets}
+        return [{b: chord for b, chord in enumerate(found[id(shape)]) if chord > 0} for shape, _ in loop.sets]
+
+    @cached_property
+    def loop_at_rest(self) -> ClosedLoop:
+        """The same system without any control; of measurable disturbances under some of them, that jump often enough to
+        push the state wherever any do."""
+        case = self.case
+        if not case.measurable:
+            return self._resting(None)
+        parts = np.arange(case.problem.system.states) / case.problem.system.states
+        ends = zip(case.grid[:-1], case.grid[1:], strict=True)
+        return self._resting([float(t) for a, b in ends for t in a + parts * (b - a)])
+
+    def _resting(self, changes: list[float] | None) -> ClosedLoop:
+        K, m = self.case.control.pieces, self.case.problem.system.controls
+        return self._loop(np.zeros((m, K)), self._none, changes)
+
+    def named(self, entry: Mapping[str, Any], name: str) -> Named:
+        """The deviations that an entry of a certificate names, under measurable disturbances of one that jumps where it
+        says."""
+        loop = self.loop_at_rest
+        if self.case.measurable:
+            changes = numbers(entry.get("changes"), f"{name}: changes")
+            if changes.ndim != 1 or not changes.size or changes[0] != 0.0 or not (np.diff(changes) > 0.0).all():
+                raise Broken(f"{name}: the disturbance must change at increasing times from 0 on")
+            if changes[-1] >= self.case.grid[-1]:
+                raise Broken(f"{name}: the disturbance changes at {float(changes[-1]):.6g}, after the end")
+            loop = self._resting([float(t) for t in changes])
+        return Named(self.case, loop, _deviations(self.case, loop, entry, name))
+
+    def following(self, named: Named, entry: Mapping[str, Any], name: str) -> Named:
+        """The deviations across the seam of a plan that repeats: no disturbance yet, and the initial state of the next
+        period that an entry names, which must be in its set; none where there is one initial state."""
+        from flint import arb
+
+        calm = [[arb(0) for _ in block] for block in named.z[: named.loop.begun]]
+        if self.case.problem.initial_set is None:
+            return Named(self.case, named.loop, calm)
+        point = numbers(entry.get("following"), f"{name}: following")
+        held = known(self.case.problem.initial_set)
+        if point.shape != (self.case.problem.system.states,) or not held.contains(point):
+            raise Broken(f"{name}: the next deviation {point.tolist()} is not shown to be in its set")
+        about = self.loop_at_rest.sets[-1][1]
+        begun = [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]
+        return Named(self.case, named.loop, [*calm, begun])
+
+    @cached_property
+    def _inverses(self) -> dict[tuple[int, ...], tuple[arb_mat, list[int]]]:
+        return {}
+
+
+def commanded(case: Case, name: str) -> ConvexSet | None:
+    """The set that a constraint of that name keeps the control, or its changes, in; ``None`` for one of the state."""
+    if any(window.name == name for window in case.windows):
+        return None
+    return {case.of_control: case.problem.control, STEP: case.problem.control_step}.get(name)
+
+
+@lru_cache(maxsize=2)
+def answers_of(case: Case) -> Answers:
+    """What the control of a case answers, made once."""
+    return Answers(case)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Named:
+    """Deviations ``z`` from their middles, block by block, under which the system of ``loop`` is at rest."""
+
+    case: Case
+    loop: ClosedLoop
+    z: list[list[arb]]
+
+    def of(self, rows: Sequence[list[arb]]) -> list[arb]:
+        """What is nominal and has responses, ``(1 + Q,)`` each, under these deviations."""
+        every = [x for block in self.z for x in block]
+        return [sum((a * b for a, b in zip(row[1:], every, strict=True)), row[0]) for row in rows]
+
+    @property
+    def innovations(self) -> list[list[arb]]:
+        """What is seen of them at every breakpoint, ``(K, p)``."""
+        from flint import arb
+
+        return [
+            [
+                sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(self.z[block])), arb(0))
+                for s in range(self.loop.outputs)
+            ]
+            for seen in self.loop.seen
+        ]
+
+    def given(self, direction: Array, time: float) -> arb:
+        """What the disturbance and the initial state give to ``c'x(t)`` where no control answers them."""
+        from flint import arb
+
+        case, loop = self.case, self.loop
+        weights = case.duality.pushed(direction, time, loop.changes)
+        parts = [*zip(loop.sets, self.z, strict=True)]
+        parts = parts[: loop.blocks] + parts[loop.begun :]  # noise reaches the state through answers alone
+        weights += [] if case.problem.initial_set is None else [case.duality.carried(direction, time)]
+        return sum(
+            (
+                weight * (arb(float(m)) + off)
+                for row, ((_, about), block) in zip(weights, parts, strict=True)
+                for weight, m, off in zip(row, about, block, strict=True)
+            ),
+            arb(0),
+        )
+
+
+def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
+    """The deviations, block by block, of the ``disturbance (mw, blocks)``, of the ``noise (K, p)`` and of the initial
+    state, ``deviation (d,)`` from its centre, that an entry names, which must be in their sets."""
+    from flint import arb
+
+    points: list[Array] = []
+    if case.problem.disturbance is not None:
+        w = numbers(entry.get("disturbance"), f"{name}: disturbance")
+        if w.shape != (loop.width, loop.blocks):
+            raise Broken(f"{name}: a disturbance of shape {w.shape}, expected {(loop.width, loop.blocks)}")
+        points = list(w.T)
+    if loop.noises and loop.measured is not None:
+        v = numbers(entry.get("noise"), f"{name}: noise")
+        if v.shape != (loop.noises, loop.outputs):
+            raise Broken(f"{name}: a noise of shape {v.shape}, expected {(loop.noises, loop.outputs)}")
+        points += list(v)
+    if case.problem.initial_set is not None:
+        points.append(numbers(entry.get("deviation"), f"{name}: deviation"))
+        if points[-1].shape != (case.problem.system.states,):
+            raise Broken(f"{name}: a deviation of the initial state of shape {points[-1].shape}")
+    for number_of, (point, (shape, _)) in enumerate(zip(points, loop.sets, strict=True)):
+        if not known(shape).contains(point):
+            kinds = ("disturbance", "noise", "deviation of the initial state")
+            what = kinds[(number_of >= loop.blocks) + (number_of >= loop.begun)]
+            raise Broken(f"{name}: the {what} {point.tolist()} is not shown to be in its set")
+    return [
+        [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]
+        for point, (_, about) in zip(points, loop.sets, strict=True)
+    ]
+
+
+def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
+    return known(shape).support(balls([sign * float(i == channel) for i in range(shape.dimension)]))
+
+
+def _width(shape: ConvexSet, channel: int) -> arb:
+    return _axis(shape, channel, 1.0) + _axis(shape, channel, -1.0)
+
+
+def _reach(shape: ConvexSet, channel: int) -> arb:
+    return _axis(shape, channel, 1.0).max(_axis(shape, channel, -1.0)).max(_axis(shape, channel, 1.0) * 0)
+
+
+def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
+    """Numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: how long it is along the
+    axes through its middle."""
+    from flint import arb
+
+    if isinstance(shape, Product):
+        return [chord for part, own in shape.split(middle) for chord in _chords(part, own)]
+    if isinstance(shape, NormBall):
+        return [2 * arb(shape.radius)] * shape.dimension
+    if isinstance(shape, Ellipsoid):
+        inverse = stacked([[arb(float(v)) for v in row] for row in shape.shape]).inv()
+        return [2 / inverse[b, b].sqrt() for b in range(shape.dimension)]
+    flat = known(shape).facets
+    if flat is None:
+        raise Unchecked("the checker does not know how long the disturbance's set is along the axes")
+    found = []
+    for axis in range(shape.dimension):
+        reach = []
+        for sign in (1.0, -1.0):
+            ends = [(b - along(c, balls(middle))) / arb(abs(float(c[axis]))) for c, b in flat if sign * c[axis] > 0]
+            least = ends[0]
+            for end in ends[1:]:
+                least = least.min(end)
+            reach.append(least)
+        found.append(reach[0] + reach[1])
+    return found
+
+
+def _largest(values: list[arb]) -> arb:
+    largest = values[0]
+    for value in values[1:]:
+        largest = largest.max(value)
+    return largest

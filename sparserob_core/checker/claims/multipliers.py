@@ -1,0 +1,214 @@
+"""The lower bound that the multipliers of a certificate prove: each names a constraint of the problem, at a time and a
+parameter, and at single deviations where the control answers them, else at the worst."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims.answers import PEAK, WORST, Named, answers_of
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
+from sparserob_core.checker.claims.duality import EFFORT, Row
+from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.sets.known import known
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+MOST_MULTIPLIERS = 100_000
+
+
+def multiplied(case: Case, priced: bool) -> arb:
+    """The bound that the certificate's multipliers give: of the cost, or not ``priced`` of by how much a weighted sum
+    of constraints is missed at least."""
+    data = case.certificate.get("multipliers")
+    rows, pieces = weighted(case, data)
+    price, touched = (case.price, touched_by(case, data)) if priced else (None, None)
+    lengths = case.charge not in (PEAK, WORST)
+    return case.duality.bound(rows, pieces, price, touched, lengths) + answers_of(case).least(rows, priced)
+
+
+def weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
+    """Multipliers with their constraints, and those of the control's pieces."""
+    from flint import arb
+
+    if data is None:
+        raise Unchecked("the certificate holds no multipliers, which this method does not offer")
+    if not isinstance(data, Mapping):
+        raise Broken("multipliers: expected those of constraints, equalities and pieces")
+    entries = listed(data, "constraints")
+    if len(entries) > MOST_MULTIPLIERS:
+        raise Broken(f"{len(entries)} multipliers are too many to be checked")
+    rows = [weighted_row for entry in entries for weighted_row in rows_of(case, entry)]
+    nu = numbers(listed(data, "equalities"), "equalities")
+    if nu.shape != (0 if case.answering else len(case.equalities),):  # where it answers these are rows of deviations
+        raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
+    bound = case.problem.system.parameters
+    middle = [] if bound is None else bound.interior_point().tolist()
+    for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
+        direction = np.eye(case.problem.system.states)[state]
+        row = case.duality.row(direction, case.problem.horizon, middle, arb(value), disturbed=False)
+        rows.append((multiplier, row))
+    if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
+        return rows, None
+    pieces, expected = numbers(data.get("pieces"), "pieces"), (case.problem.system.controls, case.control.pieces)
+    if pieces.shape != expected:
+        raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
+    return rows, pieces
+
+
+def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
+    """The control at which the certificate replaces the cost by its tangent, on every piece."""
+    if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
+        return None
+    said = data.get("tangent") if isinstance(data, Mapping) else None
+    at, expected = numbers(said, "tangent"), (case.problem.system.controls, case.control.functions)
+    if at.shape != expected:
+        raise Broken(f"the tangent's control has shape {at.shape}, expected {expected}")
+    case.price.convex()
+    return case.on_pieces(at)
+
+
+def rows_of(case: Case, entry: object) -> list[tuple[float, Row]]:
+    """A multiplier with its constraint, which must be one of the problem's; a step across the seam of a plan that
+    answers is the sum of two, of the last control and of the first one, which answer what they see of two periods."""
+    case.clock.check()
+    if not isinstance(entry, Mapping):
+        raise Broken("multipliers: expected a constraint, a time, a parameter, a direction and a number each")
+    name = str(entry.get("constraint"))
+    direction, time = numbers(entry.get("direction"), f"{name}: direction"), number(entry, "time")
+    y, parameter = number(entry, "multiplier"), numbers(entry.get("parameter", []), f"{name}: parameter")
+    if not y > 0:
+        raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
+    if parameter.size:  # what is asked of the control alone is at none
+        sized(parameter, case.problem.system.parameter_count, name)
+    named = answers_of(case).named(entry, name) if case.answering else None
+    if any(window.name == name for window in case.windows) or (case.answering and name == EQUALS and case.equalities):
+        return [(y, _of_state(case, entry, (name, direction, time, parameter), named))]
+    if name == EFFORT and case.charge == WORST:
+        return [(y, _of_effort(case, direction, named))]
+    sized(direction, case.problem.system.controls, name)
+    if name in (case.of_control, PEAK) and (name != PEAK or case.charge == PEAK):
+        return [(y, _of_control(case, name, direction, time, named))]
+    if name != STEP:
+        raise Broken(f"the problem has no constraint {name!r}")
+    row = case.duality.step_row(direction, time)
+    if named is None:
+        return [(y, row)]
+    seen = replace(row, innovations=named.innovations)
+    if time != float(case.control.breakpoints[-1]):
+        return [(y, seen)]
+    begun, none = answers_of(case).following(named, entry, name), case.duality.nothing
+    zero = [[none] * direction.size] * (case.control.pieces - 1)
+    return [
+        (y, replace(seen, slope=[*zero, balls(-direction)])),
+        (y, Row(none, [balls(direction), *zero], None, begun.innovations)),
+    ]
+
+
+def _of_state(case: Case, entry: Mapping[str, Any], said: tuple[str, Array, float, Array], named: Named | None) -> Row:
+    """The constraint on the state, and on the control on a piece of it, that an entry names."""
+    name, direction, time, parameter = said
+    window = None if name == EQUALS and case.equalities else case.window(name)
+    sized(direction, case.problem.system.states if window is None else window.shape.dimension, name)
+    if window is not None:
+        admissible(case, window, time, parameter)
+    key = name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
+    if key not in case.rows:
+        case.rows[key] = _undisturbed(case, window, entry, said)
+    row = case.rows[key]
+    if named is None:
+        return row
+    given = named.given(direction[: case.problem.system.states], time)
+    return replace(row, constant=row.constant + given, innovations=named.innovations)
+
+
+def _undisturbed(
+    case: Case, window: Window | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
+) -> Row:
+    """The same for the worst deviations, or without any where the control answers them."""
+    _, direction, time, parameter = said
+    c, gain = np.split(direction, [case.problem.system.states])
+    limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
+    row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.looped)
+    if case.measurable and not case.answering:
+        row = replace(row, constant=answers_of(case).disturbed(c, time, limit))
+    row = replace(row, sizes=None if case.execution is None else case.execution.least(c, time))
+    if window is not None and window.is_mixed:
+        piece = piece_of(case, window, entry, time)
+        row.slope[piece] = [a + b for a, b in zip(row.slope[piece], balls(gain), strict=True)]
+    return row
+
+
+def _of_control(case: Case, name: str, direction: Array, time: float, named: Named | None) -> Row:
+    """The constraint on the control on one piece, or on its peak."""
+    row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
+    if named is not None:
+        seen = named.innovations
+        row = replace(row, innovations=[*seen[: piece + 1], *([x * 0 for x in part] for part in seen[piece + 1 :])])
+    if name != PEAK:
+        return row
+    if sorted(np.abs(direction).tolist()) != [0.0] * (direction.size - 1) + [1.0]:
+        raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
+    return replace(row, constant=case.duality.nothing, charged=(piece, int(np.abs(direction).argmax())))
+
+
+def _of_effort(case: Case, shares: Array, named: Named | None) -> Row:
+    """The control at deviations, each entry of it times a share of ``[-1, 1]``, is at most the effort."""
+    from flint import arb
+
+    K, m = case.control.pieces, case.problem.system.controls
+    if shares.shape != (m * K,) or not (np.abs(shares) <= 1.0).all():
+        raise Broken(f"{EFFORT}: expected {m * K} numbers from -1 to 1")
+    slope = [
+        [price * arb(float(shares[i * K + k])) for i, price in enumerate(costs)]
+        for k, costs in enumerate(case.price.costs)
+    ]
+    return Row(arb(0), slope, None, () if named is None else named.innovations, EFFORT)
+
+
+def fixed_limit(case: Case, direction: Array, time: float) -> arb:
+    """The value of ``c'x(T)`` for a direction of one fixed state or its opposite."""
+    from flint import arb
+
+    values = dict(case.equalities)
+    states = np.flatnonzero(direction).tolist()
+    if len(states) != 1 or states[0] not in values or time != case.problem.horizon:
+        raise Broken(f"{EQUALS}: the direction {direction.tolist()} at t = {time!r} is not that of a fixed final state")
+    return arb(float(direction[states[0]])) * arb(values[states[0]])
+
+
+def piece_of(case: Case, window: Window, entry: Mapping[str, Any], time: float) -> int:
+    """The piece of the control that a mixed constraint speaks of."""
+    piece = entry.get("piece")
+    if type(piece) is not int:
+        raise Broken(f"{window.name}: piece is {piece!r}, expected the number of a piece of the control")
+    window.meets(case.control.breakpoints.tolist(), piece, time)
+    return piece
+
+
+def admissible(case: Case, window: Window, time: float, parameter: Array) -> None:
+    """Raise `Broken` unless a constraint asks something at a time, and a parameter is shown to be in its set."""
+    asked(case, window, time, parameter)
+    if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
+        raise Broken(f"{window.name}: the parameter {parameter.tolist()} is not shown to be in its set")
+
+
+def asked(case: Case, window: Window, time: float, parameter: Array) -> None:
+    """Raise `Broken` unless a constraint asks something at a time, and the parameter has as many numbers as there
+    are."""
+    sized(parameter, case.problem.system.parameter_count, f"{window.name}: parameter")
+    if not window.start <= time <= window.stop:
+        raise Broken(f"{window.name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
+
+
+def sized(vector: Array, size: int, name: str) -> None:
+    """Raise `Broken` unless a vector has the size that is expected."""
+    if vector.shape != (size,):
+        raise Broken(f"{name}: {vector.size} numbers where {size} are expected")
