@@ -29,7 +29,7 @@ def made(name: str, which: str) -> tuple[Any, Any, np.ndarray, np.ndarray]:
     return model, family, x, np.column_stack([times, heights])
 
 
-FIRST = {("alone", "fixed"), ("known", "moving"), ("turning", "mixed"), ("late", "moving"), ("varying", "mixed")}
+FIRST = {("alone", "fixed"), ("known", "moving"), ("turning", "mixed"), ("late", "moving")}
 EVERY = [
     pytest.param(name, which, marks=() if (name, which) in FIRST else pytest.mark.slow)
     for name in KINDS
