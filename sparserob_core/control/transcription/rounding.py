@@ -71,6 +71,9 @@ def _added(model: Transcription, result: Result) -> float:
     functionals = model.functionals
     sizes += np.einsum("klm,ml->k", np.abs(weights), np.abs(functionals.known))
     sizes += (np.abs(functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1)
+    if functionals.execution is not None:
+        lengths = functionals.execution.lengths(times, directions)
+        sizes += lengths @ np.repeat(_far(model.problem.control), model.control.pieces)
     if model.problem.disturbance is not None:
         sizes += (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
     return float(multipliers @ sizes) + besides

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.control.transcription import rounding
+from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.check.check import check
+from sparserob_core.sip.evidence import Cut
 
 
 def on(pieces: int | list[float], problem: dict[str, Any]) -> dict[str, Any]:
@@ -56,9 +61,15 @@ LARGE = on(
         "terminal": [{"box": [300.0, 300.0]}],
     },
 )
+ERRING = {
+    **LARGE,
+    "problem": {**LARGE["problem"], "execution": 0.02, "system": {"A": [[0, "1 + 0*t"], [-2, -0.5]], "B": [[0], [1]]}},
+}
 
 
-@pytest.mark.parametrize("config", [SHORT_AND_STRONG, CHEAP, LARGE], ids=["short and strong", "cheap", "large"])
+@pytest.mark.parametrize(
+    "config", [SHORT_AND_STRONG, CHEAP, LARGE, ERRING], ids=["short and strong", "cheap", "large", "erring"]
+)
 def test_the_bound_that_is_written_is_never_above_the_one_that_its_multipliers_prove(
     config: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -68,3 +79,19 @@ def test_the_bound_that_is_written_is_never_above_the_one_that_its_multipliers_p
     assert outcome.result.dual.bound == outcome.result.lower_bound
     found = {claim.name: claim.verdict for claim in check(tmp_path / "run").claims}
     assert found["lower bound"] == found["status"] == "holds"
+
+
+def test_what_errors_of_execution_bring_to_a_row_is_added_up_too() -> None:
+    dictionary = sr.Dictionary.indicators([0.0, 1.0, 2.0])
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0.0]], [[1.0]]),
+        horizon=2.0,
+        initial_state=[-1.0],
+        control=sr.Box([-3.0], [3.0]),
+        terminal=[sr.Box([-0.1], [0.1])],
+        execution=[0.05],
+    )
+    model = prepare(problem, dictionary, dictionary)
+    result = SimpleNamespace(dual=SimpleNamespace(cuts=[Cut("terminal", np.array([2.0]), 1, 1.0)], mu=np.zeros(0)))
+    # the beginning, 1, and what a command of 3 and 5 % of it bring in 2 units of time
+    assert rounding._added(model, result) == pytest.approx(1.0 + 6.0 + 0.3)  # type: ignore[arg-type]
