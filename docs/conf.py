@@ -32,6 +32,8 @@ nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
+smartquotes = False  # `--option` and its quotes in the help of a command are pasted as they are read
+
 default_role = "py:obj"
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"

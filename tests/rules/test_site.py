@@ -85,4 +85,5 @@ def test_the_site_builds_without_a_warning(tmp_path):
     build = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "-q", ROOT / "docs", tmp_path]
     done = subprocess.run(build, capture_output=True, text=True, timeout=1800, check=False)
     assert done.returncode == 0, done.stderr
+    assert "\N{EN DASH}" not in re.sub(r"<code.*?</code>", "", (tmp_path / "reference.html").read_text())
     assert (tmp_path / "generated" / "components" / "maximiser" / "sequool.html").exists()
