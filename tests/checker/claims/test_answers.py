@@ -20,6 +20,7 @@ from sparserob_core.checker.claims import multipliers as bounds
 from sparserob_core.checker.claims.answers import Answers, _chords, _reach, _width, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Product
@@ -106,6 +107,25 @@ def test_a_control_in_a_curved_set_is_as_large_as_its_answers_make_it():
         else:
             with pytest.raises(Broken):
                 claims._control(judged)
+
+
+def test_a_control_in_an_ellipse_is_as_far_along_every_direction_as_its_answers_take_it():
+    for radius, kept in ((0.425 / (1 + NOTHING), True), (0.425 / (1 + TOO_MUCH), False), (0.3, False)):
+        judged = case_of(Ellipsoid([0.1], [[radius**2]]))
+        if kept:
+            assert "2 pieces in their set" in claims._control(judged)
+        else:
+            with pytest.raises(Broken):
+                claims._control(judged)
+
+
+def test_across_the_seam_the_controls_of_two_periods_answer_apart():
+    """``u = (0.3, -0.2) - e / 2`` with ``|e| <= 0.2``, one of each period: from one to the next at most 0.7."""
+    answers = answers_of(case_of(gains=gains_of(m00=-0.5, m10=-0.5), initial_set=box(0.2), disturbance=None))
+    (within,) = answers.heights(answers.changes(1), exactly(np.ones((1, 1))))
+    (across,) = answers.heights(answers.changes(2), exactly(np.ones((1, 1))))
+    assert float(within.mid()) == pytest.approx(-0.5)
+    assert float(across.mid()) == pytest.approx(0.5 + 2 * 0.5 * 0.2)
 
 
 def test_a_step_is_as_large_as_the_answers_of_both_pieces_make_it():
