@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
-os.environ["SPARSEROB_SHAPES"] = "1"  # before anything else of the package: shapes in annotations are checked here
+# before anything else of the package: shapes in annotations are checked here, but not where time is measured
+os.environ["SPARSEROB_SHAPES"] = "" if "benchmark" in sys.argv else "1"
 import sparserob_core.shapes
 
 # processes that a test starts run as a user's do; where nobody compiles for the next one, each takes half a second more
@@ -22,7 +24,8 @@ from tests.support.drafts import drafts
 from tests.support.places import ROOT
 from tests.support.stub import command, config, process
 
-assert sparserob_core.shapes.CHECKED
+MEASURES = "benchmark" in sys.argv  # of `-m benchmark`: what is timed is a process as a user has it
+assert sparserob_core.shapes.CHECKED is not MEASURES
 
 __all__ = ["command", "config", "drafts", "process"]
 
@@ -30,12 +33,14 @@ __all__ = ["command", "config", "drafts", "process"]
 settings.register_profile("repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
-gc.set_threshold(50_000, 20, 20)
+if not MEASURES:
+    gc.set_threshold(50_000, 20, 20)
 
 
 def pytest_collection_finish() -> None:
     """What modules and thousands of collected tests hold need not be searched for cycles again and again."""
-    gc.freeze()
+    if not MEASURES:
+        gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -42,8 +42,8 @@ class MaxLIPO(sr.Maximiser, sr.Options):
     those that change one or few blocks of the best point. The time per evaluation grows in proportion to their number:
     use it for functions that take a millisecond or more.
 
-    Notes ``local`` (0 or 1, of the last step) and, while quadratics are fitted, the ``radius`` of the trust region in
-    widths of the box.
+    Notes ``local`` (0 or 1, of the last step) and, in widths of the box, the ``radius`` of the trust region while
+    quadratics are fitted, else the ``reach`` of the local step: half of the changes that it draws are shorter.
     """
 
     candidates: int = Field(default=1000, ge=10, le=100_000)
@@ -99,14 +99,16 @@ class _Steps:
         return value
 
     def note(self, local: bool) -> None:
-        """Note what the last step was."""
-        fitted = {"radius": self.ascents.radius} if self.dimension <= MODELLED else {}
-        self.objective.note(local=float(local), **fitted)
-        if self.objective.observed and fitted and self.ascents.radius > 0.0:
-            domain, reach = self.objective.domain, self.ascents.radius
+        """Note what the last step was, and how far the local ones go from the best point."""
+        fitted = self.dimension <= MODELLED
+        reach = self.ascents.radius if fitted else self.reach
+        self.objective.note(local=float(local), **{"radius" if fitted else "reach": reach})
+        if self.objective.observed and reach > 0.0:
+            domain = self.objective.domain
             ends = np.array([self.slopes.top - reach, self.slopes.top + reach])
             lower, upper = domain.lower + ends * (domain.upper - domain.lower)
-            self.objective.sketch("trust region", lower[np.newaxis], upper[np.newaxis], rounded=True)
+            role = "trust region" if fitted else "reach of a local step"
+            self.objective.sketch(role, lower[np.newaxis], upper[np.newaxis], rounded=fitted)
 
     def step_locally(self) -> bool:
         """Whether there was a local step to make."""

@@ -254,13 +254,20 @@ def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of
     from sparserob_rerun.options import LandscapeOptions
     from sparserob_rerun.search.explorer import Aim, Explorer
 
-    def levels(value: Callable[[np.ndarray], float]) -> list[tuple[int, float]]:
+    spent: list[int] = []
+
+    def levels(value: Callable[[np.ndarray], float], interchangeable: bool = True) -> list[tuple[int, float]]:
         box = sr.Box(np.zeros(1), np.ones(1))
         g: Any = SimpleNamespace(at=value, slot=box, names=("t",), kinds=("time",), coordinates=(0,))
-        g.deciding, g.interchangeable = (lambda: np.array([0, 1, -1, -1])), True
+        g.deciding, g.interchangeable = (lambda: np.array([0, 1, -1, -1])), interchangeable
         view: Any = SimpleNamespace(relaxed_value=lambda count, epsilon: g)
         drawn: list[tuple[int, float]] = []
-        explorer = Explorer(lambda shown, aim: drawn.append((shown.level, aim.value)), view, LandscapeOptions())
+
+        def draw(shown: sr.Landscape, aim: Aim) -> None:
+            drawn.append((shown.level, aim.value))
+            spent.append(shown.spent)
+
+        explorer = Explorer(draw, view, LandscapeOptions())
         explorer.aim(Aim(np.array([[0.2], [0.7]]), 0.1, 1.0, ""))
         while len(drawn) < 4:
             explorer.step(hurry=True)
@@ -270,3 +277,5 @@ def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of
 
     assert levels(lambda slots: 3.0) == [(8, 1.0), (4, 1.0), (2, 1.0), (8, 2.0)]
     assert levels(lambda slots: 3.0 + slots[0, 0])[1] == (8, 2.0)
+    spent.clear()  # of a policy, each value of which is a robust program, a few come first
+    assert levels(lambda slots: 3.0 + slots[0, 0], interchangeable=False)[0] == (16, 1.0) and spent[0] <= 16

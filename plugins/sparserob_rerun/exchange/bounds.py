@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 LEFT, WIDTH, HEIGHT, GAP = 74.0, 640.0, 136.0, 66.0
 ABOVE = 36.0  # the caption, which is as wide as the plot, is above the highest number upwards
-ONE = (-20.0, LEFT + WIDTH + 94.0, -64.0, HEIGHT + 48.0)
+ONE = (-20.0, LEFT + WIDTH + 94.0, -64.0, HEIGHT + 62.0)
 BOTH = (-20.0, LEFT + WIDTH + 94.0, -64.0, 2 * HEIGHT + GAP + 48.0)
 """Left, right, top and bottom of the bounds, and of both drawings."""
 VIEW = 1.5  # the view reaches down by this many times the size of the best bound; first bounds may be far below
@@ -69,7 +69,7 @@ class Bounds:
         there, closes = np.isfinite(lower), bool(np.isfinite(best))
         shades = closes and there.sum() > 1
         drawing.frame(axes, "", "round")
-        caption = f"proven bounds on the cost: {said}{'; the gap is shaded' if shades else ''}"
+        caption = f"proven: {said}{'; the gap is shaded' if shades else ''}"
         drawing.text(axes.left + axes.width / 2, axes.top - ABOVE, caption)
         if closes:
             drawing.line("marks", axes.at(np.array(across), np.full(2, best)), ink.VERMILLION, 1.0)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 SIDE = 420.0
 SLICES = 36
 ROOM = 2.0  # the panel is half as large as the drawing
+LINE, ENTRY = 30.0, 300.0  # of words from one to the next, and how wide the longest are that say what is drawn
 
 
 def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
@@ -39,27 +40,26 @@ def _slices(data: sr.FigureData) -> Floats:
 
 def _plane(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
     axes = Axes(60.0, 0.0, SIDE, SIDE, _limits(data, 0), _limits(data, 1))
-    drawing = Drawing()
-    drawing.frame(
-        axes,
-        f"{data.names.state(1)} over {data.names.state(0)}: worst-case boxes along the way",
-        data.names.state(0),
-        room=ROOM,
-    )
+    drawing, drawn = Drawing(), [("dot: x(0)", ink.INK), ("worst-case boxes", ink.SKY)]
+    drawing.frame(axes, "", data.names.state(0), room=ROOM)
     for box in _slices(data):
         (a, b), (c, d) = box
         drawing.line("slices", axes.at(np.array([a, b, b, a, a]), np.array([c, c, d, d, c])), ink.TUBE, 1.0)
-    _walls(drawing, axes, data)
+    if _walls(drawing, axes, data):
+        drawn.append(("terminal set", ink.VERMILLION))
     for path in worst.get("states", ()):
         drawing.line("worst", axes.at(path[0], path[1]), ink.ORANGE, 1.2)
+    if len(worst.get("states", ())):
+        drawn.append(("worst cases", ink.ORANGE))
     drawing.line("curve", axes.at(data.state[0], data.state[1]), ink.SKY, 2.0)
     drawing.dot(axes.at(data.state[0, 0], data.state[1, 0]), ink.INK, 5.0)
-    start = axes.at(data.state[0, 0], data.state[1, 0])[0]
-    drawing.text(float(start[0]), float(start[1]) - 16.0 * ROOM, "x(0)")
+    for line, (words, colour) in enumerate(drawn):  # beside the plot, where no curve is
+        drawing.text(axes.left + axes.width + ENTRY / 2, ROOM * LINE * (line + 0.5), words, colour)
     return drawing
 
 
-def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> None:
+def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> bool:
+    """Draw what the states are held in; returns whether there is a terminal set."""
     end = [wall for wall in data.walls if wall.start == wall.end]
     if end:
         limits = [axes.x, axes.y]
@@ -67,9 +67,6 @@ def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> None:
             limits[wall.state] = (max(wall.lower, limits[wall.state][0]), min(wall.upper, limits[wall.state][1]))
         (a, b), (c, d) = limits
         drawing.line("wall", axes.at(np.array([a, b, b, a, a]), np.array([c, c, d, d, c])), ink.VERMILLION, 2.0)
-        drawing.text(
-            float(axes.at((a + b) / 2, d)[0, 0]), float(axes.at(a, d)[0, 1]) - 12.0, "terminal set", ink.VERMILLION
-        )
     for wall in data.walls:
         if wall.start == wall.end or wall.moves:
             continue
@@ -79,6 +76,7 @@ def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> None:
                 span = (min(edge, outside), max(edge, outside))
                 across, up = (span, axes.y) if wall.state == 0 else (axes.x, span)
                 drawing.hatched("hatch", axes, across, up, ink.HATCH)
+    return bool(end)
 
 
 def _limits(data: sr.FigureData, state: int) -> tuple[float, float]:

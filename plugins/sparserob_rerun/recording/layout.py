@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import sparserob_core as sr
 
 
-PHASE = (-30.0, 560.0, -64.0, 506.0)  # left, right, top and bottom of the phase plane
+PHASE = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the phase plane
 
 
 @final
@@ -111,7 +111,7 @@ def _log(rrb: Any, shown: Shown) -> Any:
 
 def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     if problem.system.states == 2:
-        return view("/physics/phase", "Phase plane", PHASE)
+        return view("/physics/phase", f"Phase plane: {problem.names.state(1)} over {problem.names.state(0)}", PHASE)
     states = problem.system.states
     name = (
         "State space"

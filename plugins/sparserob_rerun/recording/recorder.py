@@ -255,7 +255,7 @@ class Recorder:
             self.draw(LANDSCAPE, explorer.finish, left - (0.5 * self.over if shown and not waits else 0.0))
             if explorer.waiting is not None or explorer.urgent:
                 left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
-                self.draw(LANDSCAPE, explorer.finish, left, 8, COARSE)
+                self.draw(LANDSCAPE, explorer.finish, left, 16, COARSE)  # any level is one
             self.mark()
             if self.shown.answers and self.shown.landscape and self.terrain.known is None and self.shown.clash is None:
                 self.say(f"no landscape: {PATIENT if self.answerable else KEPT}")

@@ -17,7 +17,7 @@ from sparserob_rerun.search.way import Stage
 MOVES = (
     4  # coordinates of one evaluation that are shown; a search that changes all of them at once would bury the panel
 )
-LOGARITHMIC = ("temperature", "scale", "constant", "radius", "slope", "step", "spread")
+LOGARITHMIC = ("temperature", "scale", "constant", "radius", "reach", "slope", "step", "spread")
 NOTES = {  # what a maximiser notes: the words for it, and its colour
     "temperature": ("log10 of the temperature", ink.VERMILLION),
     "accepted": ("share accepted of the last 50 moves that changed g", ink.GREEN),
@@ -34,6 +34,7 @@ NOTES = {  # what a maximiser notes: the words for it, and its colour
     "start": ("number of the start", ink.GREEN),
     "slope": ("log10 of the largest slope", ink.SKY),
     "radius": ("log10 of the radius of the trust region", ink.SKY),
+    "reach": ("log10 of the reach of a local step", ink.SKY),
     "step": ("log10 of the local step", ink.GREEN),
     "local": ("0: global, 1: local step", ink.GREEN),
     "cycle": ("how often it was heated again", ink.GREY),

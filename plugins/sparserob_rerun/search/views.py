@@ -10,7 +10,7 @@ from sparserob_rerun.drawing.canvas import view
 from sparserob_rerun.search import climb as stages
 from sparserob_rerun.search.search import LOGARITHMIC, NOTES
 
-FIRST = ("temperature", "depth", "constant", "radius", "spread", "slope")  # of what is noted, for the overview
+FIRST = ("temperature", "depth", "constant", "radius", "reach", "spread", "slope")  # of what is noted, for the overview
 SHARES = ("accepted", "rejected")
 
 
@@ -20,7 +20,7 @@ def landscape(searches: bool, answers: bool) -> Any:
     return view("/landscape/map", f"{name}: when the run is over" if answers else name, EXTENT)
 
 
-EXTENT = (-60.0, 1000.0, -76.0, 490.0)
+EXTENT = (-60.0, 1000.0, -76.0, 520.0)
 
 
 def climb() -> Any:

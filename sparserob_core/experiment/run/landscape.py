@@ -20,6 +20,10 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import DECIDING
 
 STRIDES = (8, 4, 2, 1)
+COARSEST = 16
+"""The stride before them where one value is a robust program of its own: sixteen values, which come within a second.
+With twice as large a one there is hardly more than the corners; with half of it 36 are not there when a run of two
+seconds ends on a busy machine."""
 FLAT = 1e-9  # of g: smaller differences are the solver's
 CLOSE = 0.01  # of the distance of two lines of the grid
 
@@ -88,6 +92,11 @@ class Landscape:
         values = np.union1d(even, [self.anchor[place]])
         return values, int(np.searchsorted(values, self.anchor[place])), np.searchsorted(values, even)
 
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """From coarse to fine: those of a policy begin with `COARSEST`."""
+        return STRIDES if self.g.interchangeable else (COARSEST, *STRIDES)
+
     def lines(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
         """Which values of either axis belong to the grid of a stride: its ends and the anchor's always do."""
         one, other = (
@@ -100,7 +109,7 @@ class Landscape:
         """Evaluate one point at each step, the anchor first; ``True`` where a level has become complete."""
         self._fill(*self.at)
         yield False
-        for stride in STRIDES:
+        for stride in self.strides:
             across, up = self.lines(stride)
             for turn, i in enumerate(across):
                 # neighbours follow one another: the last optimum is a good start
@@ -137,7 +146,7 @@ class Landscape:
     @property
     def shown(self) -> tuple[Array, Array, Array]:
         """The finest grid that is complete: its values along both axes, and those of ``g (a, b)`` there."""
-        across, up = self.lines(self.level or STRIDES[0])
+        across, up = self.lines(self.level or self.strides[0])
         return self.axes[0][across], self.axes[1][up], self.values[np.ix_(across, up)]
 
     @property

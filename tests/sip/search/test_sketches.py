@@ -4,6 +4,7 @@ being looked at changes nothing."""
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -58,6 +59,25 @@ def test_sketches_are_in_the_box_and_being_looked_at_changes_nothing(name, role,
     maximiser = load_own_registry().build("maximiser", name, options)
     alone = maximise(Target(hills, BOX), maximiser, 120, np.random.default_rng(0), notify=ignore)
     assert (alone.trace.points == report.trace.points).all()
+
+
+@pytest.mark.slow
+def test_nearly_half_of_what_a_local_step_of_maxlipo_changes_in_many_coordinates_stays_in_the_reach_that_it_shows():
+    box = sr.Box(np.zeros(36), np.arange(1.0, 37.0))
+    events: list[EvaluationsFinished] = []
+    maximiser = load_own_registry().build("maximiser", "maxlipo", {"candidates": 10})
+    target = Target(lambda points: -np.abs(points / box.upper - 0.4).sum(axis=1), box)
+    trace = maximise(target, maximiser, 120, np.random.default_rng(0), notify=events.append).trace
+    shares = []
+    for before, event in pairwise(events):
+        reach = before.sketches.get("reach of a local step")
+        if reach is not None and event.notes["local"] == 1.0:
+            best = trace.points[: before.total][trace.values[: before.total].argmax()]
+            assert (reach.lower <= best).all() and (best <= reach.upper).all()
+            moved = trace.points[event.total - 1]
+            changed = moved != best
+            shares += ((moved >= reach.lower[0]) & (moved <= reach.upper[0]))[changed].tolist()
+    assert len(shares) > 40 and 0.3 < np.mean(shares) < 0.6  # of what is drawn half
 
 
 def test_the_points_that_sequool_evaluates_next_are_in_the_cells_that_it_opens():
