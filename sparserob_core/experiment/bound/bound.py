@@ -97,6 +97,7 @@ def bound(
             given,
             time.perf_counter() - started,
             remarks=tuple(f"{row.constraint}: {row.sense} {row.quantity}: {row.reason}" for row in rows if row.reason),
+            time_unit=problem.names.time,
         )
 
     if out is None and not write:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import measured, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,8 +41,8 @@ def draw_bound(found: Bound) -> Figure:
     figure, axes = look.panels(len(shown), 1.9, extra=0.3)
     for ax, rows in zip(axes, shown, strict=True):
         _panel(ax, rows)
-    axes[0].set_title(found.title)
-    axes[-1].set_xlabel("time $t$")
+    axes[0].set_title(plain(found.title))
+    axes[-1].set_xlabel(measured("time $t$", found.time_unit))
     look.draw_legend(figure, axes)
     return figure
 
@@ -67,5 +68,4 @@ def _panel(ax: Axes, rows: list[WorstCase]) -> None:
             if ends[0] < ends[1]:
                 spanned = [row.start, row.stop]
                 ax.fill_between(spanned, *ends, **look.EXCLUDED, label="beyond the wall")
-    unit = f" [{rows[0].unit}]" if rows[0].unit else ""
-    ax.set_ylabel(f"{rows[0].quantity}{unit}")
+    ax.set_ylabel(measured(plain(rows[0].quantity), rows[0].unit))

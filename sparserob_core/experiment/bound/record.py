@@ -112,7 +112,8 @@ class Bound:
 
     ``status``: ``certified`` (the two sides of every row are as close as the ``tolerance`` asks, relative to the worst
     case, or to a thousandth of the largest value that is met where that is larger), ``undecided`` (some are farther
-    apart, and hold all the same). ``directory``: where it was written to, if it was.
+    apart, and hold all the same). ``directory``: where it was written to, if it was; ``time_unit``: that of times,
+    where it is known.
     """
 
     title: str
@@ -123,6 +124,7 @@ class Bound:
     seconds: float
     directory: Path | None = None
     remarks: tuple[str, ...] = ()
+    time_unit: str = ""
 
     __repr__ = brief
 
@@ -168,4 +170,7 @@ def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
     ]
 
 
-COLUMNS = ("constraint", "worst case", "at least", "at most", "at t", "wall", "margin")
+def columns_told(found: Bound) -> tuple[str, ...]:
+    """The names of the columns of `bound_rows_told`."""
+    time = f"at t [{found.time_unit}]" if found.time_unit else "at t"
+    return "constraint", "worst case", "at least", "at most", time, "wall", "margin"

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.figure_data import plain
+from sparserob_core.experiment.figures.figure_data import measured, plain
 from sparserob_core.experiment.figures.style import require_matplotlib, require_writable, style, write_figure
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     drawn = [
         (curve, label) for curve, label in zip(comparison.curves, comparison.labels, strict=True) if curve.bound.size
     ]
-    curves, texts = [curve for curve, _ in drawn], [fill(label, LINE) for _, label in drawn]
+    curves, texts = [curve for curve, _ in drawn], [fill(plain(label), LINE) for _, label in drawn]
     columns = 2 if max(map(len, texts)) <= LINE // 2 else 1
     lines = ceil((sum(text.count("\n") + 1 for text in texts) + 1) / columns)
     figure = Figure(figsize=(look.WIDTH, 3.2 + 0.165 * lines), layout="constrained")
@@ -62,7 +62,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
         _draw_curve(left, curve.evaluations, curve.bound, curve.all_evaluations, {**pen, "label": text})
         _draw_curve(right, curve.seconds, curve.bound, curve.all_seconds, pen)
     _draw_axes(left, right, comparison.exact, curves, comparison.cost_unit)
-    figure.suptitle(comparison.title, x=0.012, ha="left", fontsize=11.5)
+    figure.suptitle(plain(comparison.title), x=0.012, ha="left", fontsize=11.5)
     figure.legend(
         *left.get_legend_handles_labels(),
         loc="outside lower left",
@@ -111,7 +111,7 @@ def _draw_axes(left: Axes, right: Axes, exact: float, curves: list[Curve], unit:
                 label=f"exact optimum {exact:.9g}",
             )
     left.set_ylim(*_view(exact, curves))
-    left.set_ylabel("lower bound of the cost $J$" + (f" [{plain(unit)}]" if unit else ""))
+    left.set_ylabel(measured("lower bound of the cost $J$", unit))
     searched = {curve.searched for curve in curves}
     left.set_xlabel(
         " or ".join(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.figure_data import FigureData
+from sparserob_core.experiment.figures.figure_data import FigureData, plain
 from sparserob_core.experiment.figures.run_figures import draw_time_axis, draw_walls
 from sparserob_core.experiment.figures.style import draw_legend, held, panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.convex_set import Array
@@ -47,7 +47,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
                 path,
                 linewidth=1.4,
                 zorder=3 - 0.01 * number,
-                label=f"worst case of {name}",
+                label=f"worst case of {plain(str(name))}",
                 **pen,
             )
             if arrays["directions"][number, component]:
@@ -77,8 +77,21 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
         ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
         ax.set_ylabel(f"$w_{{{channel + 1}}}(t)$" if channels > 1 else "$w(t)$")
         ax.margins(y=0.15)
-    caption(figure, axes, data, "the worst case of every constraint: disturbance, parameter and initial state")
+    caption(figure, axes, data, f"the worst case of every constraint: {_uncertain(arrays, data)}")
     return figure
+
+
+def _uncertain(arrays: Mapping[str, Array], data: FigureData) -> str:
+    """What differs in a worst case from the nominal one, of what there is."""
+    begun = not np.allclose(arrays["initial_states"], data.state[:, 0], rtol=1e-9, atol=0.0)
+    kinds = {
+        "disturbance": arrays["disturbances"].any(),
+        "parameter": arrays["parameters"].shape[1] > 0,
+        "noise": "noises" in arrays,
+        "initial state": begun,
+    }
+    words = [kind for kind, there in kinds.items() if there]
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]])) or "nothing is uncertain"
 
 
 def draw_tube(ax: Axes, data: FigureData, component: int) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import measured
 from sparserob_core.experiment.figures.style import require_matplotlib, style, write_figure
 from sparserob_core.sip.result import SearchTrace
 
@@ -29,17 +30,18 @@ FIRST = ("temperature", "accepted", "scale", "depth", "constant")
 
 
 def write_climb(
-    directory: Path, trace: SearchTrace, title: str, upper: float = np.inf, *, exact: bool = False
+    directory: Path, trace: SearchTrace, title: str, upper: float = np.inf, *, exact: bool = False, unit: str = ""
 ) -> list[Path]:
     """Draw ``climb`` into ``directory``, as PDF and PNG. ``upper``: the proven upper bound of the unregularised
-    program, ``inf`` where there is none; ``exact``: the two bounds have met, so that it is its value. Returns the
-    files; raises `InputError` where they cannot be written, and without matplotlib."""
+    program, ``inf`` where there is none; ``exact``: the two bounds have met, so that it is its value; ``unit``: that of
+    the cost, where it is known. Returns the files; raises `InputError` where they cannot be written, and without
+    matplotlib."""
     require_matplotlib()
     with style():
-        return write_figure(directory / "climb", draw_climb(trace, title, upper, exact=exact))
+        return write_figure(directory / "climb", draw_climb(trace, title, upper, exact=exact, unit=unit))
 
 
-def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: bool = False) -> Figure:
+def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: bool = False, unit: str = "") -> Figure:
     """Against the evaluations: how far g is below the highest value of its stage of epsilon, for every proposal, for
     the accepted walk where the maximiser walks, and for the best so far; the proven lower bound, also as a share of the
     exact value, or of the upper bound, where that is known; and up to three of the maximiser's notes, the temperature
@@ -53,8 +55,8 @@ def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: 
         figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0],
     )
     stages = list(_stages(trace))
-    _draw_climb(axes[0], trace, stages)
-    _draw_bound(axes[1], trace, upper, exact)
+    _draw_climb(axes[0], trace, stages, unit)
+    _draw_bound(axes[1], trace, upper, exact, unit)
     for ax, name in zip(axes[2:], noted, strict=True):
         changing = np.nan_to_num(trace.gains) != 0.0 if name == "accepted" else True
         _draw_note(ax, name, np.where(changing, trace.notes[name], np.nan), stages)
@@ -79,7 +81,7 @@ def _stages(trace: SearchTrace) -> Iterator[tuple[float, int, int]]:
         yield float(trace.epsilon[first]), int(first), int(last)
 
 
-def _draw_climb(ax: Axes, trace: SearchTrace, stages: list[tuple[float, int, int]]) -> None:
+def _draw_climb(ax: Axes, trace: SearchTrace, stages: list[tuple[float, int, int]], unit: str) -> None:
     short, lead, tops = _below(trace, stages)
     floor = _floor(np.concatenate([short, lead]), tops)
     short, lead = np.maximum(short, floor), np.maximum(lead, floor)
@@ -101,7 +103,7 @@ def _draw_climb(ax: Axes, trace: SearchTrace, stages: list[tuple[float, int, int
     ticks = [10.0**power for power in range(-15, 16) if 3.0 * floor <= 10.0**power <= ax.get_ylim()[0]]
     ax.set_yticks([floor, *ticks], ["highest", *(f"$10^{{{round(np.log10(tick))}}}$" for tick in ticks)], minor=False)
     ax.minorticks_off()
-    ax.set_ylabel("$g$ below the highest\nof its stage")
+    ax.set_ylabel(measured("$g$ below the highest\nof its stage", unit))
 
 
 def _below(trace: SearchTrace, stages: list[tuple[float, int, int]]) -> tuple[Array, Array, list[float]]:
@@ -178,7 +180,7 @@ def _restarts(trace: SearchTrace) -> list[int]:
     return [int(place) for place in other[risen]]
 
 
-def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool) -> None:
+def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool, unit: str) -> None:
     number = np.arange(1, trace.bound.size + 1)
     known = np.isfinite(trace.bound)
     ax.plot(
@@ -190,7 +192,7 @@ def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool) -> None
         label="proven lower bound of $J$",
         zorder=3,
     )
-    ax.set_ylabel("cost $J$")
+    ax.set_ylabel(measured("cost $J$", unit))
     if not known.any():
         ax.text(0.5, 0.5, "no bound was proven", transform=ax.transAxes, ha="center", color=look.GREY)
         return

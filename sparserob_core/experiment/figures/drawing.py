@@ -21,7 +21,7 @@ from sparserob_core.control.transcription.transcribe import path_names
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
-from sparserob_core.experiment.figures.figure_data import FigureData, Limit, Outputs, Plane, Wall
+from sparserob_core.experiment.figures.figure_data import FigureData, Limit, Outputs, Plane, Wall, plain
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
@@ -109,7 +109,7 @@ def _data(
     longest = 0.0 if program.activity is None else float(program.activity.sum())
     counts = counting(experiment.loaded)[0] and longest > 0.0
     return FigureData(
-        title=printable(experiment.title),
+        title=plain(experiment.title),
         breakpoints=dictionary.breakpoints,
         control=control,
         control_lower=-problem.control.support(-axes),
@@ -209,7 +209,7 @@ def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
     loop = model.feedback.loop
     return {
         "answers": np.einsum("kjid,jd->kji", loop.gains(decision), loop.innovations @ worst.deviation),
-        "worst_case": f"the worst case of {printable(worst.name)} at t = {worst.time:.4g}",
+        "worst_case": f"the worst case of {plain(worst.name)} at t = {worst.time:.4g}",
     }
 
 

@@ -203,7 +203,7 @@ class FigureData:
 
     def time_label(self) -> str:
         """The label of the time axis."""
-        return f"time $t$ [{plain(self.names.time)}]" if self.names.time else "time $t$"
+        return measured("time $t$", self.names.time)
 
 
 def label(names: Sequence[str], units: Sequence[str], letter: str, index: int, count: int, at: str = "t") -> str:
@@ -211,7 +211,12 @@ def label(names: Sequence[str], units: Sequence[str], letter: str, index: int, c
     known."""
     symbol = f"${letter}_{{{index + 1}}}({at})$" if count > 1 else f"${letter}({at})$"
     shown = plain(names[index]) + ("" if at == "t" else f"$({at})$") if names else symbol
-    return f"{shown} [{plain(units[index])}]" if units and units[index] else shown
+    return measured(shown, units[index] if units else "")
+
+
+def measured(text: str, unit: str) -> str:
+    """The label of an axis, with the unit in brackets where it is known."""
+    return f"{text} [{plain(unit)}]" if unit else text
 
 
 def plain(text: str) -> str:

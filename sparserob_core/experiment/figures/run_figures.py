@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall, plain
+from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall, measured, plain
 from sparserob_core.experiment.figures.plane_figure import draw_plane
 from sparserob_core.experiment.figures.style import draw_legend, held, panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.result import relative_gap
@@ -109,7 +109,7 @@ def draw_switching(data: FigureData) -> Figure:
         )
         _rug(ax, data.active_times)
         ax.set_ylim(-reach, reach)
-        ax.set_ylabel(f"push on {data.names.control(channel)}")
+        ax.set_ylabel(f"push on {plain(data.names.control(channel))}")
     draw_time_axis(axes[-1], data)
     _title(axes[0], data.title, "1 is what it costs to act: the control acts where the push leaves the band")
     draw_legend(figure, axes)
@@ -297,8 +297,7 @@ def draw_convergence(data: FigureData) -> Figure:
     upper = np.array([entry.upper_bound for entry in data.history])
     best = float(upper.min())
     _draw_bounds(bounds, rounds, lower, upper, best)
-    unit = f" [{plain(data.cost_unit)}]" if data.cost_unit else ""
-    bounds.set_ylabel(("time of action" if data.counts else "cost $J$") + unit)
+    bounds.set_ylabel(measured("time of action" if data.counts else "cost $J$", data.cost_unit))
     _draw_gaps(gaps, rounds, np.array([relative_gap(bound, best, data.cost_scale) for bound in lower]), data)
     bounds.set_title(data.title)
     gaps.set_xlim(0.6, len(data.history) + 0.4)

@@ -34,10 +34,10 @@ class InitialStates:
     ``d'x <= bound`` that contain the set, and ``reached (n,)``: what proven points reach. ``points (v, 2)`` with
     ``costs (v,)``: initial states and the cost of a proven control from each, and ``lower_bounds (v,)`` of its optimum.
     ``origin (d,)``: the config's initial state; the coordinates that are not in the plane are as there. ``path``:
-    sections of the path sets that hold at time 0. ``called``: the names of the
-    states. ``limit``: the bound on the coordinates where one was asked for, and
-    ``cut`` whether it cuts the set. ``status``: ``certified`` (the polygons differ by at most a thousandth of the
-    area), ``verified`` (by more), ``infeasible`` (the set is empty, proven) or ``undecided`` (no point is proven).
+    sections of the path sets that hold at time 0. ``called``: the names of the states, ``cost_unit`` what the costs are
+    measured in, where that is known. ``limit``: the bound on the coordinates where one was asked for, and ``cut``
+    whether it cuts the set. ``status``: ``certified`` (the polygons differ by at most a thousandth of the area),
+    ``verified`` (by more), ``infeasible`` (the set is empty, proven) or ``undecided`` (no point is proven).
     """
 
     title: str
@@ -57,6 +57,7 @@ class InitialStates:
     origin: Array = field(default_factory=lambda: np.zeros(0))
     path: Sequence[Array] = field(default=(), repr=False)
     called: Names = UNNAMED
+    cost_unit: str = ""
     limit: float | None = None
     cut: bool = False
     remarks: Sequence[str] = ()
@@ -150,6 +151,7 @@ class InitialStates:
             "values": len(self.costs),
             "least_cost": self.costs.min(initial=np.inf),
             "greatest_cost": self.costs.max(initial=-np.inf),
+            "cost_unit": self.cost_unit,
             "limit": self.limit,
             "cut": self.cut,
             "remarks": list(self.remarks),

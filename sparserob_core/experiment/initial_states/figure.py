@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.figure_data import label
+from sparserob_core.experiment.figures.figure_data import label, measured, plain
 from sparserob_core.experiment.figures.style import require_matplotlib, style, write_figure
 
 if TYPE_CHECKING:
@@ -58,7 +58,10 @@ def draw_initial_states(found: InitialStates) -> Figure:
         _costs(figure, ax, found)
     elif found.costs.size:
         _bar(
-            figure, ax, ax.scatter(found.points[:, 0], found.points[:, 1], c=found.costs, cmap=COLOURS, s=36, zorder=7)
+            figure,
+            ax,
+            ax.scatter(found.points[:, 0], found.points[:, 1], c=found.costs, cmap=COLOURS, s=36, zorder=7),
+            found.cost_unit,
         )
     _boundaries(ax, found)
     if near:
@@ -74,7 +77,7 @@ def draw_initial_states(found: InitialStates) -> Figure:
             clip_on=False,
             label="the config's initial state",
         )
-    ax.set_title(found.title)
+    ax.set_title(plain(found.title))
     labels = [
         label(found.called.states, found.called.state_units, "x", k, found.origin.size, "0") for k in found.states
     ]
@@ -110,12 +113,12 @@ def _costs(figure: Figure, ax: Axes, found: InitialStates) -> None:
     lines = ax.tricontour(mesh, found.costs, levels=levels[1:-1], colors="white", linewidths=0.5, alpha=0.7, zorder=3)
     for drawn in (bands, lines):
         drawn.set_clip_path(inside)
-    _bar(figure, ax, bands)
+    _bar(figure, ax, bands, found.cost_unit)
 
 
-def _bar(figure: Figure, ax: Axes, coloured: ScalarMappable) -> None:
+def _bar(figure: Figure, ax: Axes, coloured: ScalarMappable, unit: str) -> None:
     bar = figure.colorbar(coloured, ax=ax, pad=0.02, aspect=28)
-    bar.set_label("cost $J$ of a proven control")
+    bar.set_label(measured("cost $J$ of a proven control", unit))
     bar.outline.set_linewidth(0.0)
     bar.ax.tick_params(length=0)
 

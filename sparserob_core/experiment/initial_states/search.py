@@ -67,10 +67,16 @@ class InitialStatesSearch:
 
     def states(self, title: str, directions: int, values: int) -> InitialStates:
         self.directions = directions
-        origin = np.asarray(self.plane.model.problem.initial_state, dtype=float)
-        called = self.plane.model.problem.names
+        problem = self.plane.model.problem
+        origin = np.asarray(problem.initial_state, dtype=float)
         bare = InitialStates(
-            title=title, states=self.plane.states, status="undecided", message="", origin=origin, called=called
+            title=title,
+            states=self.plane.states,
+            status="undecided",
+            message="",
+            origin=origin,
+            called=problem.names,
+            cost_unit=problem.cost_unit,
         )
         limit = self._size(self.plane.radius)
         try:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.figure_data import plain
+from sparserob_core.experiment.figures.figure_data import measured, plain
 from sparserob_core.experiment.margin.search import FEASIBLE, Margin
 from sparserob_core.sip.convex_set import Array
 
@@ -82,7 +82,7 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
     ax.set_xlabel(varied.label)
     if varied.relative:
         _unit_axis(ax, found)
-    ax.set_title(found.title, pad=8)
+    ax.set_title(plain(found.title), pad=8)
     figure.legend(
         *ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
     )
@@ -91,7 +91,7 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
 
 def least_cost(found: Margin) -> str:
     """The label of an axis of costs, with their unit where it is known."""
-    return "least cost $J$" + (f" [{plain(found.cost_unit)}]" if found.cost_unit else "")
+    return measured("least cost $J$", found.cost_unit)
 
 
 def _band(factors: Array, lower: Array, upper: Array, rising: bool) -> tuple[Array, Array, Array]:
@@ -129,7 +129,7 @@ def _unit_axis(ax: Axes, found: Margin) -> None:
     above = ax.secondary_xaxis(
         "top", functions=(lambda x: share * np.asarray(x, dtype=float), lambda y: np.asarray(y, dtype=float) / share)
     )
-    above.set_xlabel(_mathematics(found.quantity))
+    above.set_xlabel(_mathematics(plain(found.quantity)))
     above.spines["top"].set_visible(True)
 
 

@@ -17,6 +17,7 @@ from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.finished import read_finished, stored_run
+from sparserob_core.experiment.figures.figure_data import plain
 from sparserob_core.experiment.figures.landscape_figure import LandscapeData, write_landscape
 from sparserob_core.experiment.figures.switching import Switching
 from sparserob_core.experiment.run.events import StudyProgress
@@ -30,7 +31,6 @@ from sparserob_core.experiment.run.landscape import (
     moving_of,
 )
 from sparserob_core.experiment.run.replay import stored_result
-from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.result import Result, SearchTrace
@@ -110,7 +110,12 @@ def drawings(
     if trace is not None and np.isfinite(trace.value).any():
         exact = result.status == "certified"
         yield lambda: write_climb(
-            directory / "figures", trace, printable(experiment.title), result.upper_bound, exact=exact
+            directory / "figures",
+            trace,
+            plain(experiment.title),
+            result.upper_bound,
+            exact=exact,
+            unit=_cost_unit(experiment),
         )
         yield lambda: _landscape(experiment, result, directory, notify)
 
@@ -137,8 +142,8 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
             known["adversary"] = lambda: draw_adversary(worst, data)
     trace = result.trace
     if trace is not None and np.isfinite(trace.value).any():
-        title, exact = printable(experiment.title), result.status == "certified"
-        known["climb"] = lambda: draw_climb(trace, title, result.upper_bound, exact=exact)
+        title, exact = plain(experiment.title), result.status == "certified"
+        known["climb"] = lambda: draw_climb(trace, title, result.upper_bound, exact=exact, unit=_cost_unit(experiment))
 
         def landscape() -> Figure | None:
             found = landscape_of(Inspection(experiment.loaded, experiment), trace, title)
@@ -185,6 +190,10 @@ def picture(experiment: Experiment, result: Result) -> bytes | None:
         return None
 
 
+def _cost_unit(experiment: Experiment) -> str:
+    return experiment.problem.cost_unit if isinstance(experiment, ControlExperiment) else ""
+
+
 def _active(experiment: ControlExperiment, result: Result) -> Array:
     """The times of the constraints that carry a multiplier."""
     about = {one.name for one in experiment.transcription.constraints}
@@ -206,7 +215,7 @@ def switching(experiment: ControlExperiment, result: Result) -> Array | None:
 def _landscape(experiment: Experiment, result: Result, directory: Path, notify: Notify) -> list[Path]:
     assert result.trace is not None
     inspection = Inspection(experiment.loaded, experiment)
-    data = landscape_of(inspection, result.trace, printable(experiment.title), notify)
+    data = landscape_of(inspection, result.trace, plain(experiment.title), notify)
     return [] if data is None else write_landscape(directory / "figures", data)
 
 
@@ -258,17 +267,19 @@ def landscape_of(
     landscape = Landscape(g, anchor, *axes.places(pair, anchor), GRID, epsilon, axes)
     _fill(landscape, notify)
     notes = {name: column[mine] for name, column in trace.notes.items()}
-    plain, (across, up, values) = list(g.coordinates), landscape.shown
-    widths = (g.slot.upper - g.slot.lower)[plain]
-    slots = deciding_slots(deciding_again(g, trace.points[mine], notes, SECONDS), tuples[:, :, plain], widths, pair)
-    places = tuples[:, :, plain][np.arange(mine.size)[:, np.newaxis], slots]
-    visited = axes.of(tuple(plain), places)
+    coordinates, (across, up, values) = list(g.coordinates), landscape.shown
+    widths = (g.slot.upper - g.slot.lower)[coordinates]
+    slots = deciding_slots(
+        deciding_again(g, trace.points[mine], notes, SECONDS), tuples[:, :, coordinates], widths, pair
+    )
+    places = tuples[:, :, coordinates][np.arange(mine.size)[:, np.newaxis], slots]
+    visited = axes.of(tuple(coordinates), places)
     assert visited is not None
     return LandscapeData(
         title=title,
         epsilon=epsilon,
         axes=[across, up],
-        names=landscape.names("" if inspection.problem is None else printable(inspection.problem.names.time)),
+        names=landscape.names("" if inspection.problem is None else plain(inspection.problem.names.time)),
         values=values,
         best=np.array([landscape.axes[k][landscape.at[k]] for k in (0, 1)]),
         best_value=landscape.value,

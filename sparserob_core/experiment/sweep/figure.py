@@ -13,6 +13,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.plain import value_text
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import measured, plain
 from sparserob_core.experiment.sweep.axes import Axis
 from sparserob_core.experiment.sweep.study import Study
 from sparserob_core.experiment.sweep.table import Row
@@ -87,9 +88,9 @@ def _grouped(rows: Sequence[Row], axes: Sequence[Axis]) -> dict[str, list[Row]]:
     """Rows by the values of axes, in words."""
     found: dict[str, list[Row]] = {}
     for row in rows:
-        plain = len(axes) == 1 and not axes[0].numeric
-        said = ", ".join(value_text(row[one.key]) if plain else _named(one, row[one.key]) for one in axes)
-        found.setdefault(shorten(said, LETTERS, placeholder="...") if axes else "", []).append(row)
+        alone = len(axes) == 1 and not axes[0].numeric
+        said = ", ".join(value_text(row[one.key]) if alone else _named(one, row[one.key]) for one in axes)
+        found.setdefault(plain(shorten(said, LETTERS, placeholder="...")) if axes else "", []).append(row)
     return found
 
 
@@ -124,7 +125,7 @@ def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
     _scale(ax.set_xscale, along, [float(row[along.key]) for row in study.table])
     _cost_scale(ax.set_yscale, study.table)
     ax.set_xlabel(along.key)
-    ax.set_ylabel("cost $J$")
+    ax.set_ylabel(measured("cost $J$", study.cost_unit))
     _finish(figure, ax, study, told)
     return figure
 
@@ -186,7 +187,7 @@ def _map(study: Study, axes: Sequence[Axis]) -> Figure:
             colour = look.INK if status in ("infeasible", "failed") else "white"
             edge: dict[str, Any] = {"edgecolors": colour} if kind else {"color": colour}
             ax.scatter(places[:, 0], places[:, 1], marker=MARKS[status], s=26, linewidths=1.0, **kind, **edge)
-    figure.colorbar(drawn, ax=ax, label="cost $J$")
+    figure.colorbar(drawn, ax=ax, label=measured("cost $J$", study.cost_unit))
     ax.set_xlabel(first.key)
     ax.set_ylabel(second.key)
     for spine in ("top", "right"):
@@ -236,7 +237,7 @@ def _categories(study: Study, axes: Sequence[Axis]) -> Figure:
         right.set_xscale("log")
     else:
         right.set_xlim(left=0.0)
-    left.set_xlabel("cost $J$, down to its proven lower bound")
+    left.set_xlabel(measured("cost $J$", study.cost_unit) + ", down to its proven lower bound")
     right.set_xlabel("seconds of the method (s)")
     _finish(figure, left, study, told=False)
     return figure
@@ -256,7 +257,7 @@ def _finish(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable
     """The title, and below the figure what the marks mean, of those that occur."""
     from matplotlib.lines import Line2D
 
-    ax.set_title(study.title)
+    ax.set_title(plain(study.title))
     handles, labels = ax.get_legend_handles_labels() if told else ([], [])
     for status in (one for one in marked if one in study.counts):
         filled = MARKS[status] in FILLED

@@ -19,7 +19,7 @@ from sparserob_core.experiment.run.outcome import Outcome
 from sparserob_core.experiment.run.replay import stored_result
 from sparserob_core.experiment.sweep.axes import Axis
 from sparserob_core.experiment.sweep.plan import FILE, Arrangement, read_plan
-from sparserob_core.experiment.sweep.table import Row, read_table
+from sparserob_core.experiment.sweep.table import Row, read_table, shared_unit
 
 RUNS = "runs"
 COLUMNS = ("status", "cost", "relative gap", "active", "seconds")  # beside the axes, on a terminal
@@ -64,6 +64,11 @@ class Study:
         """How many points ended with each status."""
         return Counter(str(row["status"]) for row in self.table)
 
+    @property
+    def cost_unit(self) -> str:
+        """The unit of the costs, where it is known and the same of all."""
+        return shared_unit(self.table)
+
     def summary(self) -> dict[str, Any]:
         """The study in a few numbers, as plain data."""
         return {
@@ -79,10 +84,12 @@ class Study:
 
 def shown(study: Study) -> tuple[list[str], list[list[str]]]:
     """The table for a terminal: column names, and one row per point, or one per status where there are many."""
+    unit = f" [{study.cost_unit}]" if study.cost_unit else ""
     if len(study.table) > LINES:
-        return _by_status(study.table)
+        return _by_status(study.table, unit)
     keys = [axis.key for axis in study.axes]
-    return [*keys, *COLUMNS], [[*(value_text(row[key]) for key in keys), *short(row)] for row in study.table]
+    columns = [name + unit if name == "cost" else name for name in COLUMNS]
+    return [*keys, *columns], [[*(value_text(row[key]) for key in keys), *short(row)] for row in study.table]
 
 
 def short(row: Mapping[str, Any]) -> list[str]:
@@ -114,7 +121,7 @@ def remarks_of(study: Study) -> Iterator[str]:
         yield f"{study.stopped}; what is left: sparserob sweep --resume {quote(str(study.directory))}"
 
 
-def _by_status(table: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+def _by_status(table: Sequence[Row], unit: str) -> tuple[list[str], list[list[str]]]:
     rows = []
     for status in sorted({str(row["status"]) for row in table}):
         of = [row for row in table if row["status"] == status]
@@ -122,7 +129,7 @@ def _by_status(table: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
         seconds = sum(row.get("seconds") or 0.0 for row in of)
         least, most = (_number(pick(costs), ".9g") if costs else "-" for pick in (min, max))
         rows.append([status, str(len(of)), least, most, f"{seconds:.2f}"])
-    return ["status", "points", "least cost", "largest cost", "seconds"], rows
+    return ["status", "points", f"least cost{unit}", f"largest cost{unit}", "seconds"], rows
 
 
 def _number(value: Any, form: str) -> str:

@@ -53,13 +53,18 @@ MEANING = {
     "sparsity.channels": ("1", "number of channels, over which the least shares are the mean"),
     "sparsity.fewest_active.lower": ("1", "share of the time that every admissible control acts at least"),
     "sparsity.fewest_active.upper": ("1", "share of the time for which some admissible control acts"),
+    "units.cost": ("", "what the cost and its bounds are measured in, where the names of the config tell"),
+    "units.worst": ("", "what the worst violation is measured in, where the names of the config tell"),
+    "units.time": ("", "what times are measured in, where the names of the config tell"),
     "stopped": ("", "the limit that ended the run early"),
     "message": ("", "the result in a sentence, or why there is none"),
     "run": ("", "the run's directory below runs"),
     "hash": ("", "SHA-256 of the run's config, without where it was solved, who watched, its title and its limits"),
     "seconds": ("s", "what the method took"),
 }
-"""Unit and meaning of the columns. ``cost``, ``constraint`` and ``time``: the units in which the config states them."""
+"""Unit and meaning of the columns. ``cost``, ``constraint`` and ``time``: the units in which the config states them;
+the columns of `UNITS` tell those that it names."""
+UNITS = {"cost": "units.cost", "constraint": "units.worst", "time": "units.time"}
 
 
 def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str, digest: str, said: str = "") -> Row:
@@ -73,6 +78,8 @@ def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str,
             found |= {
                 key: one for key, one in inside.items() if key not in LEFT and not isinstance(one, list | Mapping)
             }
+    units = (summary or {}).get("units") or {}
+    found |= {name: units[name.partition(".")[2]] for name in UNITS.values() if units.get(name.partition(".")[2])}
     told = {**_numbers(axes), **axes}
     return {**told, **{key: one for key, one in found.items() if key not in told}, "run": run, "hash": digest}
 
@@ -131,11 +138,18 @@ def table_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
     return _csv([names, *([_cell(row.get(name)) for name in names] for row in rows)])
 
 
+def shared_unit(rows: Iterable[Row], kind: str = "cost") -> str:
+    """The unit of the costs, constraints or times of `UNITS`, where every row that has one has the same; else empty."""
+    found = {str(row.get(UNITS[kind]) or "") for row in rows if row.get("cost") is not None}
+    return found.pop() if len(found) == 1 else ""
+
+
 def columns_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
     """The unit and the meaning of every column, as CSV."""
     lines = [["column", "unit", "meaning"]]
     for name in columns_of(axes, rows):
         unit, meaning = ("", "an axis: this key of the config") if name in axes else MEANING.get(name, ("1", ""))
+        unit = (shared_unit(rows, unit) or unit) if unit in UNITS else unit
         if axis := _entry_of(name, axes):
             unit, meaning = "", f"the number at place {name.rpartition('.')[2]} of {axis}"
         lines.append([name, unit, meaning or (f"{name.partition('.')[2]} of {name.partition('.')[0]} in result.json")])
@@ -174,7 +188,7 @@ def _cell(value: object) -> str:
 def _read(name: str, cell: str) -> Any:
     if cell == "":
         return None
-    if name in ("message", "stopped", "run", "hash", "status", "worst.constraint"):
+    if name in ("message", "stopped", "run", "hash", "status", "worst.constraint", *UNITS.values()):
         return cell
     try:
         return json.loads(cell)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.bound.record import bound_rows_told
+from sparserob_core.experiment.bound.record import bound_rows_told, columns_told
 from tests.support.places import matrices, needs_plants
 
 OSCILLATOR = {"A": [[0, 1], [-1, 0]], "B": [[0], [1]]}
@@ -252,7 +252,9 @@ def test_two_runs_write_the_same_numbers(written: Path, tmp_path: Path) -> None:
 
 
 def test_what_the_table_shows_holds_too() -> None:
-    found = sr.bound(config(initial_state=[1 / 3, 0], terminal=[{"box": [2.0, None]}]))
+    names = {"units": {"time": "s"}}
+    found = sr.bound(config(initial_state=[1 / 3, 0], terminal=[{"box": [2.0, None]}], names=names))
+    assert columns_told(found)[4] == "at t [s]"
     for told, row in zip(bound_rows_told(found), found.rows, strict=True):
         assert float(told[2]) <= row.lower <= row.upper <= float(told[3])
 

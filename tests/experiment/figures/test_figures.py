@@ -87,6 +87,30 @@ def test_the_legend_speaks_of_a_worst_case_only_where_something_is_uncertain(dat
     assert "state" in labels[1]
 
 
+def test_what_a_user_calls_things_is_no_formula() -> None:
+    from matplotlib.text import Text
+
+    wild = r"a $\frac{ b_ $ c"
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(-np.eye(1), np.ones((1, 1))),
+        horizon=1.0,
+        initial_state=[1.0],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=sr.Box([-0.1], [0.1]),
+        terminal=[sr.Box([-0.2], [0.2])],
+        title=wild,
+        names=sr.Names(states=[wild + "x"], controls=[wild + "u"], state_units=[wild], control_units=[wild], time=wild),
+    )
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
+    for name in ("switching", "adversary"):
+        figure = result.plot(name)
+        texts = [text.get_text() for text in figure.findobj(Text)]
+        assert sum(wild.replace("$", r"\$") in text for text in texts) >= 2
+        assert not [text for text in texts if r"$\frac" in text.replace(r"\$", "")]
+    assert "parameter" not in figure.axes[0].texts[0].get_text()
+    assert "disturbance" in figure.axes[0].texts[0].get_text()
+
+
 @pytest.mark.parametrize(("radius", "proven"), [(0.01, True), (5.0, False)])
 def test_the_title_says_where_nothing_is_proven(radius: float, proven: bool, tmp_path: Path) -> None:
     problem = sr.OptimalControlProblem(

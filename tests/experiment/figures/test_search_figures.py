@@ -60,9 +60,10 @@ def test_the_highest_value_of_a_stage_is_above_every_other_one(trace: SearchTrac
 
 
 def test_the_bound_is_drawn_where_it_is_known_and_beside_the_exact_value(trace: SearchTrace) -> None:
-    figure = draw_climb(trace, "Search", 0.5, exact=True)
+    figure = draw_climb(trace, "Search", 0.5, exact=True, unit="N s")
     figure.draw_without_rendering()
     axes = figure.axes[1]
+    assert axes.get_ylabel() == "cost $J$ [N s]"
     ((place, bound),) = lines(axes, "proven lower bound of $J$")
     assert place.tolist() == list(range(2, 9)) and bound[-1] == 0.4
     ((_, exact),) = lines(axes, "exact value of $J$: 0.5")

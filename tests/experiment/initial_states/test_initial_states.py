@@ -4,6 +4,7 @@ polygons, and the command that draws them."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -234,7 +235,8 @@ def test_other_coordinates_are_those_about_which_the_plane_lies() -> None:
 @pytest.mark.slow
 def test_the_figure_names_its_axes_and_shows_every_boundary() -> None:
     found = sr.initial_states(CART, directions=8, values=4)
-    ax = draw_initial_states(found).axes[0]
+    ax, bar = draw_initial_states(replace(found, cost_unit="N s")).axes
+    assert bar.get_ylabel() == "cost $J$ of a proven control [N s]"
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x_{1}(0)$", "$x_{2}(0)$")
     labels = ax.get_legend_handles_labels()[1]
     assert labels == [

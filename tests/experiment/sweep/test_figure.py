@@ -11,7 +11,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.sweep.axes import parse_axes
 from sparserob_core.experiment.sweep.figure import MARKS, draw_study, write_study_figure
-from sparserob_core.experiment.sweep.study import Study
+from sparserob_core.experiment.sweep.study import Study, shown
 from sparserob_core.sip.result import MEANING
 
 pytest.importorskip("matplotlib")
@@ -111,6 +111,18 @@ def test_categories_show_costs_down_to_their_bounds_and_seconds() -> None:
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["piqp", "clarabel"]
     assert [list(line.get_xdata()) for line in lines(figure)][:2] == [[0.9, 1.0], [1.0]]
     assert figure.axes[1].get_xlabel() == "seconds of the method (s)"
+
+
+def test_costs_have_the_unit_that_all_runs_share_and_names_are_no_formulas() -> None:
+    for units, told in (["N s", "N s"], " [N s]"), (["N s", "s"], ""), (["N s", None], ""):
+        rows = [
+            {"solver": name, "units.cost": unit} for name, unit in zip((r"$\frac{", "clarabel"), units, strict=True)
+        ]
+        known = study({"solver": [r"$\frac{", "clarabel"]}, rows)
+        figure = draw_study(known)
+        assert figure.axes[0].get_xlabel() == f"cost $J${told}, down to its proven lower bound"
+        assert f"cost{told}" in shown(known)[0]
+    figure.draw_without_rendering()
 
 
 def test_many_seeds_of_a_category_are_a_box() -> None:

@@ -25,7 +25,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.directory.lock import NAME, Lock
 from sparserob_core.experiment.sweep.study import read_study
-from sparserob_core.experiment.sweep.table import columns_of, read_table, row_of
+from sparserob_core.experiment.sweep.table import columns_of, columns_text, read_table, row_of
 from tests.experiment.cli.test_process import started, wait_for
 from tests.support.places import ROOT
 from tests.support.stub import CONFIG, Command
@@ -170,6 +170,18 @@ def test_numbers_of_an_axis_do_not_displace_another_axis() -> None:
     assert columns_of(["box", "box.1"], [row])[:3] == ["box", "box.0", "box.1"]
     assert "box.0" not in row_of({"box": [[0, 1], [2, 3]]}, None, "run", "hash")
     assert "box.0" not in row_of({"box": [True]}, None, "run", "hash")
+
+
+def test_columns_say_the_units_that_all_rows_share() -> None:
+    found = {"status": "certified", "cost": 1.0, "worst": {"violation": 0.0, "time": 1.0}}
+    rows = [
+        row_of({"seed": seed}, {**found, "units": {"cost": "N s", "worst": worst, "time": ""}}, "run", "hash")
+        for seed, worst in enumerate(["m", "m/s"])
+    ]
+    stated = {line["column"]: line["unit"] for line in csv.DictReader(io.StringIO(columns_text(["seed"], rows)))}
+    assert (stated["cost"], stated["lower_bound"]) == ("N s", "N s")
+    assert (stated["worst.violation"], stated["worst.time"]) == ("constraint", "time")
+    assert [row["units.worst"] for row in rows] == ["m", "m/s"] and "units.time" not in rows[0]
 
 
 def test_a_study_is_read_again_as_it_was(counting: Path, tmp_path: Path) -> None:

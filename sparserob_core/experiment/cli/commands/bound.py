@@ -50,7 +50,7 @@ def bound(
     all the same, 130 interrupted.
     """
     from sparserob_core.experiment.bound.bound import bound as find
-    from sparserob_core.experiment.bound.record import COLUMNS, bound_rows_told, summary_of_bound
+    from sparserob_core.experiment.bound.record import bound_rows_told, columns_told, summary_of_bound
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
     from sparserob_core.experiment.terminal.table import print_table
 
@@ -59,7 +59,7 @@ def bound(
     if as_json:
         print_json(summary_of_bound(found))
     else:
-        print_table(found.title, COLUMNS, bound_rows_told(found))
+        print_table(found.title, columns_told(found), bound_rows_told(found))
         for remark in (*found.remarks, f"{found.status} in {found.seconds:.2f} s", f"written to {found.directory}"):
             say(printable(remark))
     return status_unless_interrupted(EXIT[found.status])
