@@ -146,8 +146,9 @@ def test_the_bounds_are_drawn_where_they_are_with_the_gap_between_them() -> None
     tops = {round(float(strip[:, 1].min()), 3) for strip in gap}
     assert tops == {round(float(upper[-1, 1]), 3)}  # up to the best upper bound
     assert "0.95 ≤ J* ≤ 1" in " ".join(paper.labels("rounds/picture/bounds/labels"))
-    picture.end(0.99, 1.0)
+    picture.end(0.99, 1.0, 0.01)
     assert "0.99 ≤ J* ≤ 1" in " ".join(paper.labels("rounds/picture/bounds/labels"))
+    assert picture.rows[-1][3] == 0.01  # the gap beside it, too
 
 
 def test_an_upper_bound_of_a_simpler_program_is_none() -> None:

@@ -38,10 +38,10 @@ class Bounds:
         self.rows.append((float(event.round), event.lower_bound, upper, event.gap, event.violation))
         self._draw(np.array(self.rows))
 
-    def end(self, lower: float, upper: float) -> None:
-        """The bounds that the run ended with: rounding, and what was proven last, have moved them."""
+    def end(self, lower: float, upper: float, gap: float) -> None:
+        """The bounds that the run ended with, and their gap: rounding, and what was proven last, have moved them."""
         if self.rows and np.isfinite(lower):
-            number, _, _, gap, violation = self.rows[-1]
+            number, _, _, _, violation = self.rows[-1]
             self.rows[-1] = (number, lower, upper, gap, violation)
             self._draw(np.array(self.rows))
 

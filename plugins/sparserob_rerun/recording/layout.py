@@ -179,9 +179,7 @@ def _violation(rrb: Any, shown: Shown) -> Any:
 
 
 def _exchange(rrb: Any, shown: Shown) -> Any:
-    counts = rrb.TimeSeriesView(
-        origin="/rounds/counts", name="Numbers of active indices and of new cuts", plot_legend=rrb.Corner2D.LeftTop
-    )
+    counts = search.series(rrb, "/rounds/counts", "Numbers of active indices and of new cuts", legend="left")
     both = view("/rounds/picture", "Bounds on the cost, the gap and the violation, round by round", bounds.BOTH)
     left = rrb.Vertical(both, counts, row_shares=[2, 1])
     right = [_violation(rrb, shown)]

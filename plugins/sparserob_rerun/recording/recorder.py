@@ -315,7 +315,7 @@ class Recorder:
         self._page(event.status, lines)  # before anything that takes time
         if result is not None:
             if event.status != "infeasible":
-                self.draw(BOUNDS, self.rounds.picture.end, result.lower_bound, result.upper_bound)
+                self.draw(BOUNDS, self.rounds.picture.end, result.lower_bound, result.upper_bound, result.gap)
             self.draw("what clashes", self._clash, result)
             if result.decision is not None and self.physics is not None:
                 known = (result.decision, result.indices, result.dual.mu, result.dual.cuts)

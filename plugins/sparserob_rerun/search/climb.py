@@ -13,8 +13,8 @@ from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.way import Stage
 
 WIDTH, HEIGHT, GAP = 1150.0, 240.0, 110.0
-EXTENT = (-120.0, WIDTH + 50.0, -100.0, HEIGHT + 166.0)
-LINE = 44.0  # units between two lines of words
+EXTENT = (-120.0, WIDTH + 50.0, -120.0, HEIGHT + 166.0)
+LINE = 48.0  # units between two lines of words
 CORNERS, POINTS = 500, 300  # of a curve, and of a cloud, in one panel
 MOST = 4  # panels beside one another; of more stages the last ones
 LEAST = 5e-4
@@ -103,8 +103,8 @@ def _frame(drawing: Drawing, axes: Axes, stage: Stage, best: float) -> None:
         drawing.text(x, bottom + 26.0, f"{value:.0f}", ink.GREY)
     middle = (left + right) / 2
     if np.isfinite(stage.epsilon) and stage.epsilon > 0.0:
-        drawing.text(middle, top - 24.0 - LINE, f"epsilon {stage.epsilon:.3g}")
-    drawing.text(middle, top - 24.0, f"best {best:.6g}", ink.ORANGE)
+        drawing.text(middle, top - 36.0 - LINE, f"epsilon {stage.epsilon:.3g}")
+    drawing.text(middle, top - 36.0, f"best {best:.6g}", ink.ORANGE)
 
 
 def _corners(values: Floats) -> np.ndarray:

@@ -19,7 +19,7 @@ PIXELS, SIDE = 128, 384.0
 TRIED, LEG, LAST = 300, 400, 20  # points that stay visible, corners of the walk, and its last ones
 ROWS = {True: 37.0, False: 45.0}
 """Units between two lines of words: of a search the panel is larger, and has more lines. A line is 22 pixels high."""
-BESIDE = 700.0  # where the words are: at the right of the map
+BESIDE = 745.0  # where the words are: at the right of the map
 LETTERS = 46  # in a line; a word more does not fit there
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 LIFT = 0.015  # points stand this share of the height above the surface
@@ -201,7 +201,7 @@ class Terrain:
             )
 
         if stage.walks:
-            words = "white line and dot: the walk, and where it is now"
+            words = "white: the walk, and where it is now"
             legend.text(BESIDE, self._line(self.lines + len(legend.labels)), words, ink.GREY)
         self.legend = len(legend.labels)
         legend.log(self.rr, self.stream, "landscape/map/legend")
@@ -272,12 +272,12 @@ class Terrain:
                 [[*at, top]],
                 colors=[ink.ORANGE],
                 radii=self.rr.Radius.ui_points(6.0),
-                labels=[f"best {landscape.value:.6g}"],
             ),
         )
         names = landscape.names(self.unit)
         flat = landscape.flat
-        corners = {
+        corners = {  # words have one colour, which is legible on the surface too
+            (at[0], at[1], top + LIFT): f"best {landscape.value:.6g}",
             (0.5, -0.12, 0.0): f"{names[0]}: {across[0]:.3g} to {across[-1]:.3g}",
             (1.12, 0.5, 0.0): f"{names[1]}: {up[0]:.3g} to {up[-1]:.3g}",
             (0.0, 0.0, 1.05): ", ".join(_said(landscape)) if flat else f"g = {scale[1]:.4g}",

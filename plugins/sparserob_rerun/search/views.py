@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, Literal
 
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import view
@@ -20,7 +20,7 @@ def landscape(searches: bool, answers: bool) -> Any:
     return view("/landscape/map", f"{name}: when the run is over" if answers else name, EXTENT)
 
 
-EXTENT = (-60.0, 1000.0, -76.0, 520.0)
+EXTENT = (-60.0, 1090.0, -76.0, 520.0)
 
 
 def climb() -> Any:
@@ -28,8 +28,11 @@ def climb() -> Any:
     return view("/search/stages", "g (up) over the evaluations (across), one panel for each epsilon", stages.EXTENT)
 
 
-def series(rrb: Any, origin: str, name: str, contents: list[str] | None = None) -> Any:
-    """A plot against the timeline that shows the whole of it, however long it is."""
+def series(
+    rrb: Any, origin: str, name: str, contents: list[str] | None = None, legend: Literal["left", "right"] = "right"
+) -> Any:
+    """A plot against the timeline that shows the whole of it, however long it is. ``legend``: the upper corner in which
+    the names of its lines are."""
     from rerun.encodings import TimeRange
 
     everything = TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
@@ -37,7 +40,9 @@ def series(rrb: Any, origin: str, name: str, contents: list[str] | None = None) 
         origin=origin,
         contents=contents or ["+ $origin/**"],
         name=name,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftBottom, visible=contents is None),
+        plot_legend=rrb.PlotLegend(
+            corner=rrb.Corner2D.RightTop if legend == "right" else rrb.Corner2D.LeftTop, visible=contents is None
+        ),
         axis_x=rrb.TimeAxis(view_range=everything),
     )
 
