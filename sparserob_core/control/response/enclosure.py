@@ -284,8 +284,12 @@ def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
     if not ends.any():
         return coefficients
     patterns, which = distinct_patterns(ends)
-    matrices = np.stack([face_matrix(space, pattern) for pattern in patterns])
-    return np.asarray(np.einsum("krab,krb->kra", matrices[which], coefficients))
+    on_faces = coefficients.copy()
+    for position, pattern in enumerate(patterns):
+        if pattern.any():
+            here = which == position
+            on_faces[here] = coefficients[here] @ face_matrix(space, pattern).T
+    return on_faces
 
 
 def _ends(

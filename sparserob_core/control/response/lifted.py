@@ -55,6 +55,9 @@ SHORT, MOST_CUTS = 0.5, 64
 LONG_STEP = 1.0  # in norm times duration: longer steps are taken by matrix exponentials
 TAYLOR_TERMS = 1e-17  # relative size below which further terms of the exponential series are left out
 PATHS_KEPT, PATHS_SIZE = 4, 20_000_000  # paths that are remembered, and the numbers in all of them beyond the first
+# Numbers in exponentials that are kept, for the same times are asked for in every direction. With a tenth of them those
+# of a dozen times of four states with a parameter are forgotten; ten times as many are 80 MB a cell of parameters.
+FLOWN_SIZE = 500_000
 SPANS = 256  # of several pieces each, for which what is left out is bounded, where there are four times as many pieces
 
 
@@ -288,8 +291,18 @@ class LiftedSystem:
         if not self.space.nu:
             return self.flows.rows(rows, durations)
         distinct, which = self.grid.distinct(durations)
-        flow, driven = self.backward.flows(distinct)
+        key, size = distinct.tobytes(), distinct.size * self.row_matrix.size
+        known = self._flown.get(key)
+        if known is None:
+            known = self.backward.flows(distinct)
+            if size <= FLOWN_SIZE:
+                remember(self._flown, key, known, max(1, FLOWN_SIZE // size))
+        flow, driven = known
         return rows @ flow[which], rows @ driven[which]
+
+    @cached_property
+    def _flown(self) -> dict[bytes, tuple[Array, Array]]:
+        return {}
 
     def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
         """The exponential series, for short steps: no matrix is built."""

@@ -315,27 +315,43 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
 
     In batches, so that memory does not grow with their number. Only where a deadline is set are batches as small as
     the time that they take asks for: what a cell costs is not known before, and a result that has no limit shall not
-    depend on how fast the machine is.
+    depend on how fast the machine is. Cells that differ in their first coordinate only share their work (`enclose`),
+    so that those go into one batch.
     """
     family, count = course.family, lower.shape[0]
     assert family.enclosure is not None
     bounds, split, bend = np.full(count, np.inf), (upper - lower).argmax(axis=1), np.full(count, np.inf)
-    known = True
-    start, size = 0, FIRST_BATCH if course.deadline.bounded or course.deadline.passed else BATCH
+    known, hurried = True, course.deadline.bounded or course.deadline.passed
+    start, size = 0, FIRST_BATCH if hurried else BATCH
+    order, ends = _together(lower, upper) if count > size else (np.arange(count), np.array([count]))
     while start < count and not (start and course.deadline.passed):
-        began, part = time.perf_counter(), slice(start, start + size)
+        began, stop = time.perf_counter(), min(start + size, count)
+        if hurried:  # to the end of what shares its work, unless that is far
+            stop = min(int(ends[np.searchsorted(ends, stop)]), start + BATCH)
+        part = order[start:stop]
         enclosed = family.enclosure(x, lower[part], upper[part])
         bounds[part] = np.where(np.isnan(enclosed.bounds), np.inf, enclosed.bounds)
         split[part] = enclosed.split
         known = known and enclosed.bend is not None
         bend[part] = np.inf if enclosed.bend is None else enclosed.bend
-        start, ended = start + size, time.perf_counter()
+        start, ended = stop, time.perf_counter()
         if course.deadline.bounded:
             size = min(BATCH, 2 * size) if ended - began < QUICK else max(1, size // 2)
         if start < count and ended - course.told > OFTEN:
-            at = int(bounds[:start].argmax())
+            at = order[bounds[order[:start]].argmax()]
             course.tell(count, float(bounds[at]), lower[at], upper[at], start)
     return bounds, split, bend if known else None
+
+
+def _together(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray]:
+    """An order ``(k,)`` of cells in which those that differ in their first coordinate only stand together, and where
+    each such group ends; cells with no other coordinate in the order that they have, of which each may be an end."""
+    count = lower.shape[0]
+    if lower.shape[1] == 1:
+        return np.arange(count), np.arange(1, count + 1)
+    _, which = np.unique(np.hstack([lower[:, 1:], upper[:, 1:]]), axis=0, return_inverse=True)
+    order = np.argsort(which.reshape(-1), kind="stable")
+    return order, np.append(np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1, count)
 
 
 def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend: Array) -> tuple[Array, Array] | None:
