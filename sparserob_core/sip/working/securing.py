@@ -43,6 +43,7 @@ DEAR = 0.1
 # gap. With a tenth of it there is no second one; with ten times as much four programs are solved in vain where nothing
 # keeps away at all.
 THINNER = 0.01
+NEARER = 0.25
 PAID = 2.0  # of what is left open, what the rows are tightened by: half of it is for what the new optimum violates
 
 
@@ -120,6 +121,7 @@ def _secure(
     """
     program, margin, spared, imposed = ledger.program, working.margin, SPARED, 0
     near: tuple[Answer, Found] | None = None  # of which a glance left cells open, and no search finds a violation
+    cells, dear = GLANCE, DEAR * abs(program.cost(answer.solution.x)) / max(working.priced(answer), np.finfo(float).tiny)
     for _ in range(SECURED):
         cost, price = abs(program.cost(answer.solution.x)), working.priced(answer)
         fresh = working.impose(violated)
@@ -133,7 +135,10 @@ def _secure(
         farther = working.tightened(ledger, answer, margin + more)
         if farther is None and more:  # nothing is that far away, but what was imposed may do
             farther = working.tightened(ledger, answer, margin)
-        if farther is None and near is not None:  # nor as far as large cells ask for: smaller ones
+        if farther is None and near is not None:  # nor as far as large cells ask for: smaller ones, as far as is borne
+            if dear * price > PAID * spared * cost:
+                cells, margin, missed, dear = CLOSER * GLANCE, working.margin + dear, (), NEARER * dear
+                continue
             kept, looked = near
             ledger.prove(kept, looked, prover(kept.solution.x, CLOSER * GLANCE))
             break
@@ -151,7 +156,7 @@ def _secure(
         missed, violated = [Missed.most(*one) for one in found], [above(*one) for one in found]
         if missed:
             continue
-        proofs = prover(x, GLANCE)
+        proofs = prover(x, cells)
         if ledger.prove(farther, looked, proofs) or not proofs:
             break
         missed, violated = left_open(program, proofs), witnesses(program, proofs)
