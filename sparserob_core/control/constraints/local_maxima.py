@@ -105,9 +105,13 @@ def turns(heights: Array, beside: np.ndarray, unit: float) -> tuple[np.ndarray, 
     The worst case of a disturbance that has corners has several maxima: what lies between sampled directions may make
     any of them the largest.
     """
-    around = heights[beside]
-    peak = heights >= around.max(axis=1)
-    promise = np.where(peak, 2.0 * heights - around.min(axis=1), -np.inf)
+    highest, lowest = heights[beside[:, 0]], heights[beside[:, 0]]
+    for near in beside.T[1:]:  # one by one: in six dimensions they are hundreds
+        around = heights[near]
+        np.maximum(highest, around, out=highest)
+        np.minimum(lowest, around, out=lowest)
+    peak = heights >= highest
+    promise = np.where(peak, 2.0 * heights - lowest, -np.inf)
     order = np.argsort(-np.where(peak, heights, -np.inf), axis=0, kind="stable")[:TURNS]
     rows, times = order.ravel(), np.tile(np.arange(heights.shape[1]), len(order))
     promised = promise[rows, times]

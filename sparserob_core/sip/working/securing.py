@@ -36,13 +36,17 @@ SECURED = 10
 # Of the cost, what the distance may cost at first. A tenth of it takes three times as many cells along a wall that is
 # ridden; ten times as much is a bound that nobody is content with.
 SPARED = 1e-3
-# Of the cost, up to which a violation that can be imposed is kept away from besides. With a tenth of it a wall between
-# two imposed times takes two rounds more; with all of the cost, what is far from feasible leaves nothing to choose.
+# Of the cost, up to which a violation that can be imposed is kept away from besides, and what is paid where cells are
+# too many nearer by. With a tenth of it a wall between two imposed times takes two rounds more, and a wall in four
+# dimensions with a parameter more than twice the cells; with all of the cost, what is far from feasible leaves nothing to
+# choose.
 DEAR = 0.1
 # Share of what is spared that is tried next where nothing is that far away, as long as it is more than the tolerated
 # gap. With a tenth of it there is no second one; with ten times as much four programs are solved in vain where nothing
 # keeps away at all.
 THINNER = 0.01
+# Of what is dear, what is tried next where nothing is that far away. With a tenth of it a distance is passed over that
+# takes a tenth of the cells; with nine tenths of it a program is solved for every tenth.
 NEARER = 0.25
 PAID = 2.0  # of what is left open, what the rows are tightened by: half of it is for what the new optimum violates
 
@@ -68,9 +72,9 @@ def proofs_of(
 
 
 def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found, number: int) -> bool:
-    """Secure a decision when time is due, though that of round ``number`` violates what was ``found``: where there is a
-    limit, as soon as little would pay for that, at certain shares of it, and when no more is left of it than that may
-    take; without a limit after some rounds. Whether constraints were imposed."""
+    """Secure a decision when time is due, though that of round ``number`` violates what was ``found``: as soon as
+    little would pay for that; where there is a limit, at certain shares of it, and when no more is left of it than that
+    may take; without a limit after some rounds. Whether constraints were imposed."""
     deadline, began = ledger.tools.deadline, [event.seconds for event in ledger.history]
     candidate = working.candidate(answer) if number & (number - 1) == 0 else None  # 1, 2, 4, 8, ...
     if candidate is not None and ledger.cheaper(candidate):
@@ -116,8 +120,9 @@ def _secure(
     better one goes on: the optimum of the imposed rows and of those that are ``violated``, all of them tightened by as
     much as `SPARED` of the cost of ``answer`` pays for and by more than what it ``missed``, and again by what that
     proof leaves open. What it missed is kept away from only as long as something is that far away, and what is imposed
-    for it not for ever; where nothing is as far away as is spared, a hundredth of that is tried. Nothing is claimed
-    where nothing keeps away at all. Whether anything was imposed.
+    for it not for ever; where nothing is as far away as is spared, a hundredth of that is tried, and where nothing is
+    as far away as large cells ask for, smaller cells at what is `DEAR` or a part of it. Nothing is claimed where
+    nothing keeps away at all. Whether anything was imposed.
     """
     program, margin, spared, imposed = ledger.program, working.margin, SPARED, 0
     near: tuple[Answer, Found] | None = None  # of which a glance left cells open, and no search finds a violation

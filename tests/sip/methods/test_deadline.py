@@ -96,20 +96,38 @@ def hidden_program(upper):
     return sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=upper, families=[family])
 
 
-@pytest.mark.parametrize(("upper", "least"), [(9.0, 1.0022), (1.0018, 1.0014)])
-def test_under_a_limit_what_little_would_pay_for_is_proven_at_once(upper, least):
-    """A thousandth away, and twice what was missed where there is room for that."""
-    result = sr.solve(hidden_program(upper), method="exchange", solver="piqp", seconds=600.0)
+@pytest.mark.parametrize(("upper", "least", "seconds"), [(9.0, 1.0022, 600.0), (1.0018, 1.0014, 600.0), (9.0, 1.0022, None)])
+def test_what_little_would_pay_for_is_proven_at_once(upper, least, seconds):
+    """A thousandth away, and twice what was missed where there is room for that; with a limit and without one."""
+    result = sr.solve(hidden_program(upper), method="exchange", solver="piqp", seconds=seconds)
     assert result.status == "certified"
     assert result.cost == pytest.approx(1.0004, abs=1e-6)
     assert [event.proven for event in result.history][:2] == [np.inf, np.inf]
     assert result.history[2].proven == pytest.approx(least, abs=2e-5)
 
 
-def test_without_a_limit_nothing_is_proven_before_the_optimum():
-    result = sr.solve(hidden_program(9.0), method="exchange", solver="piqp")
+def test_without_a_limit_a_decision_that_is_proven_next_is_not_proven_before_as_well():
+    looked = []
+    result = sr.solve(blunt_program(lambda x: looked.append(float(x[0])), 0.0), method="exchange", solver="piqp")
     assert result.status == "certified"
-    assert all(event.proven == np.inf for event in result.history)
+    assert len(looked) == 1
+
+
+def test_where_cells_are_dear_and_no_farther_one_will_do_a_tenth_of_the_cost_is_paid():
+    """Between a decision that takes ten times the cells of a second look, and one that is out of reach."""
+    looked = []
+
+    def enclosure(x, lower, upper):
+        looked.append(float(x[0]))
+        if x[0] < 1.0005 and max(looked) > 1.05:
+            raise KeyboardInterrupt
+        return Enclosure(upper[:, 0] - x[0] + 400.0 * (upper - lower)[:, 0], np.zeros(len(lower), dtype=int))
+
+    family = replace(slow_family(), enclosure=enclosure)
+    program = sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=1.15, families=[family])
+    result = sr.solve(program, method="exchange", solver="piqp")
+    assert result.status == "verified"
+    assert 1.09 <= result.upper_bound <= 1.11
 
 
 def test_an_interrupt_returns_the_decision_that_was_proven_before():

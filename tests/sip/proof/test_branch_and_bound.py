@@ -18,7 +18,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.method import Tools
+from sparserob_core.sip.method import Deadline, Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import ConstraintFamily, Enclosure
 from sparserob_core.sip.proof.branch_and_bound import prove_family
@@ -238,6 +238,29 @@ def polynomial_family(bound_of, top):
         enclosure=enclosure,
         rows=lambda t: (np.zeros((t.shape[0], 1, 1)), top - 4 * t * (1 - t)),
     )
+
+
+def test_cells_that_differ_in_time_only_are_bounded_together_under_a_limit_and_prove_the_same():
+    """Batches are small there, and what such cells share is done once a batch."""
+    nodes = np.linspace(0.0, 1.0, 41)
+    begin, beside = (one.ravel() for one in np.meshgrid(nodes[:-1], [0.0, 1.0, 2.0], indexing="ij"))
+    cells = np.stack([begin, beside], axis=1), np.stack([begin + 1 / 40, beside + 1.0], axis=1)
+    asked = []
+
+    def enclosure(x, lower, upper):
+        asked.append(lower)
+        return Enclosure(upper[:, 0] * upper[:, 1] - x[0], np.zeros(len(lower), dtype=int))
+
+    def rows(at):
+        return -np.ones((len(at), 1, 1)), -at.prod(axis=1, keepdims=True)
+
+    family = sr.ConstraintFamily(
+        name="shared", index_set=sr.Box([0.0, 0.0], [1.0, 3.0]), rows=rows, enclosure=enclosure, cells=cells
+    )
+    proofs = [prove_family(family, np.array([3.01]), deadline=Deadline(seconds)) for seconds in (None, 600.0)]
+    assert [np.unique(one[:, 1]).tolist() for one in asked[1:]] == [[0.0], [1.0], [2.0]]
+    for one, other in zip(proofs[0].leaves, proofs[1].leaves, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_an_enclosure_that_returns_nan_proves_nothing():
