@@ -303,7 +303,7 @@ def test_where_nothing_is_as_far_away_as_large_cells_ask_for_smaller_ones_prove(
 ) -> None:
     """A proof whose large cells exclude nothing below the size of the wall, as in four dimensions."""
     monkeypatch.setattr(run_module, "Deadline", Clock)
-    monkeypatch.setattr(Clock, "looks", 14)
+    monkeypatch.setattr(Clock, "looks", 20)
 
     def coarse(program: Any, tools: Any) -> Any:
         proving = prover_of(program, tools)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import worst_of
@@ -37,9 +38,9 @@ SECURED = 10
 # ridden; ten times as much is a bound that nobody is content with.
 SPARED = 1e-3
 # Of the cost, up to which a violation that can be imposed is kept away from besides, and what is paid where cells are
-# too many nearer by. With a tenth of it a wall between two imposed times takes two rounds more, and a wall in four
-# dimensions with a parameter more than twice the cells; with all of the cost, what is far from feasible leaves nothing to
-# choose.
+# too many nearer by. With a tenth of it a wall between two imposed times takes two rounds more, and one in four
+# dimensions with a parameter more than twice the cells; with all of the cost, what is far from feasible leaves nothing
+# to choose.
 DEAR = 0.1
 # Share of what is spared that is tried next where nothing is that far away, as long as it is more than the tolerated
 # gap. With a tenth of it there is no second one; with ten times as much four programs are solved in vain where nothing
@@ -126,7 +127,8 @@ def _secure(
     """
     program, margin, spared, imposed = ledger.program, working.margin, SPARED, 0
     near: tuple[Answer, Found] | None = None  # of which a glance left cells open, and no search finds a violation
-    cells, dear = GLANCE, DEAR * abs(program.cost(answer.solution.x)) / max(working.priced(answer), np.finfo(float).tiny)
+    tiny = np.finfo(float).tiny
+    cells, dear = GLANCE, DEAR * abs(program.cost(answer.solution.x)) / max(working.priced(answer), tiny)
     for _ in range(SECURED):
         cost, price = abs(program.cost(answer.solution.x)), working.priced(answer)
         fresh = working.impose(violated)
@@ -135,18 +137,12 @@ def _secure(
         margin = max(margin, working.margin + (spared * cost / price if price > 0.0 else 0.0))
         margin += 0.0 if fresh else more
         more = more if fresh and more * price < DEAR * cost else 0.0
-        if not np.isfinite(PAID * float(margin + more) * working.longest):  # in Python's numbers, which overflow
-            break
-        farther = working.tightened(ledger, answer, margin + more)
-        if farther is None and more:  # nothing is that far away, but what was imposed may do
-            farther = working.tightened(ledger, answer, margin)
+        farther = _farther(working, ledger, answer, margin, more)
         if farther is None and near is not None:  # nor as far as large cells ask for: smaller ones, as far as is borne
-            if dear * price > PAID * spared * cost:
-                cells, margin, missed, dear = CLOSER * GLANCE, working.margin + dear, (), NEARER * dear
-                continue
-            kept, looked = near
-            ledger.prove(kept, looked, prover(kept.solution.x, CLOSER * GLANCE))
-            break
+            if dear * price <= PAID * spared * cost:
+                break
+            cells, margin, missed, dear = CLOSER * GLANCE, working.margin + dear, (), NEARER * dear
+            continue
         if farther is None:  # nor that far, as where two walls are close to each other
             margin, spared, missed = working.margin, THINNER * spared, ()
             if price > 0.0 and spared >= ledger.tolerance:
@@ -154,21 +150,36 @@ def _secure(
             break
         answer = farther
         x = farther.solution.x
-        looked = separate(program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
-        found = [
-            (family, one) for family, one in looked if not family.defines and one.violations.max(initial=0.0) > ALLOWED
-        ]
-        missed, violated = [Missed.most(*one) for one in found], [above(*one) for one in found]
+        looked, missed, violated = _looked(ledger, x)
         if missed:
             continue
         proofs = prover(x, cells)
-        if ledger.prove(farther, looked, proofs) or not proofs:
-            break
         missed, violated = left_open(program, proofs), witnesses(program, proofs)
-        if not missed:
-            break
-        near = None if any(rows.size for _, rows, _ in violated) else (farther, looked)
+        if ledger.prove(farther, looked, proofs) or not missed:
+            return imposed > 0
+        if cells == GLANCE:
+            near = None if any(rows.size for _, rows, _ in violated) else (farther, looked)
+    if near is not None:
+        ledger.prove(*near, prover(near[0].solution.x, CLOSER * GLANCE))
     return imposed > 0
+
+
+def _farther(working: Working, ledger: Ledger, answer: Answer, margin: float, more: float) -> Answer | None:
+    """The optimum of the imposed rows, tightened by a margin and by ``more``, or by the margin alone where nothing is
+    that far away: what was imposed may do. ``None`` where nothing keeps away, or by more than numbers can say."""
+    for distance in (margin + more, margin) if more else (margin,):
+        if np.isfinite(PAID * float(distance) * working.longest):  # in Python's numbers, which overflow
+            farther = working.tightened(ledger, answer, distance)
+            if farther is not None:
+                return farther
+    return None
+
+
+def _looked(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Missed], Violated]:
+    """What a search finds at ``x (n,)``, and what of it is violated and can be imposed."""
+    looked = separate(ledger.program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
+    found = [one for one in looked if not one[0].defines and one[1].violations.max(initial=0.0) > ALLOWED]
+    return looked, [Missed.most(*one) for one in found], [above(*one) for one in found]
 
 
 def _is_near(working: Working, program: SemiInfiniteProgram, answer: Answer, missed: Sequence[Missed]) -> bool:

@@ -96,7 +96,9 @@ def hidden_program(upper):
     return sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=upper, families=[family])
 
 
-@pytest.mark.parametrize(("upper", "least", "seconds"), [(9.0, 1.0022, 600.0), (1.0018, 1.0014, 600.0), (9.0, 1.0022, None)])
+@pytest.mark.parametrize(
+    ("upper", "least", "seconds"), [(9.0, 1.0022, 600.0), (1.0018, 1.0014, 600.0), (9.0, 1.0022, None)]
+)
 def test_what_little_would_pay_for_is_proven_at_once(upper, least, seconds):
     """A thousandth away, and twice what was missed where there is room for that; with a limit and without one."""
     result = sr.solve(hidden_program(upper), method="exchange", solver="piqp", seconds=seconds)
