@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import resource
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from tests.support.places import ROOT
 from tests.support.recordings import read, slowness, texts
 
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
@@ -166,6 +168,26 @@ def test_a_disk_that_is_full_in_mid_run_leaves_no_recording_that_anybody_claims(
     assert f"{file} is not a complete recording" in ours.recv()
     run.join()
     assert broken(file)
+
+
+@pytest.mark.slow
+def test_a_command_tells_of_a_full_disk_in_one_line(tmp_path: Path) -> None:
+    """In a process of its own, where the viewer's library was not imported before the recorder began."""
+    limited = (
+        "import resource; from sparserob_core.experiment.cli.main import main;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, resource.RLIM_INFINITY)); main()"
+    )
+    config = str(ROOT / "configs" / "double_integrator.yaml")
+    arguments = ["watch", config, "--save", "x.rrd", "--out", "run", "--no-figures"]
+    done = subprocess.run(
+        [sys.executable, "-c", limited, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "x.rrd is not complete: it could not be written to its end" in done.stdout
+    told = done.stderr.splitlines()
+    assert [line for line in told if "rrd" in line or "ERROR" in line] == [
+        f"rerun: {tmp_path / 'x.rrd'} is not a complete recording: it could not be written to its end"
+    ]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")

@@ -25,6 +25,8 @@ from sparserob_rerun.recording.sinks import Destinations, Started, servers, sink
 from sparserob_rerun.study.recorder import StudyOpening, StudyRecorder
 from sparserob_rerun.study.recorder import layout as study_layout
 
+QUIET = "info,re_perf_telemetry=off,re_log_encoding=off,re_sdk::recording_stream=off"
+"""What the viewer's library logs: not what happens to a file, which `broken` tells in one line."""
 IDLE = 0.5  # seconds between two looks at whether the run is still alive
 
 
@@ -99,6 +101,7 @@ def _recorded(
     guard: Guard,
 ) -> Account:
     sys.meta_path.insert(0, _WithoutPandas())
+    os.environ.setdefault("RUST_LOG", QUIET)
     import rerun as rr
 
     stream = rr.RecordingStream("sparserob", recording_id=name)

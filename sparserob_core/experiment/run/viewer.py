@@ -45,7 +45,8 @@ def recorded(observer: Observer, save: str | Path | None) -> tuple[str, ...]:
     """What the file holds that was to be recorded into, in words; nothing where there was to be none."""
     if save is None:
         return ()
-    return (f"{save} is not complete: {observer.incomplete}" if observer.incomplete else f"recorded into {save}",)
+    why = observer.incomplete.partition(" is not a complete recording: ")[2] or observer.incomplete
+    return (f"{save} is not complete: {why}" if why else f"recorded into {save}",)
 
 
 def _writable(file: Path) -> Path:
