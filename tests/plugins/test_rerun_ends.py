@@ -150,6 +150,7 @@ def test_a_recorder_that_is_killed_leaves_a_file_that_is_said_not_to_be_whole(tm
 
 def fills(file: Path, told: Connection) -> None:
     """A run whose recorder may write 80 000 bytes, and has more to write."""
+    sys.dont_write_bytecode = True  # it would be cut off like the recording
     resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, resource.RLIM_INFINITY))
     outlet, random = opened(file), np.random.default_rng(0)
     for number in range(40):
@@ -172,7 +173,8 @@ def test_a_disk_that_is_full_in_mid_run_leaves_no_recording_that_anybody_claims(
 
 @pytest.mark.slow
 def test_a_command_tells_of_a_full_disk_in_one_line(tmp_path: Path) -> None:
-    """In a process of its own, where the viewer's library was not imported before the recorder began."""
+    """In a process of its own, where the viewer's library was not imported before the recorder began; without bytecode,
+    which the limit would cut off in the folders of everybody."""
     limited = (
         "import resource; from sparserob_core.experiment.cli.main import main;"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, resource.RLIM_INFINITY)); main()"
@@ -180,7 +182,7 @@ def test_a_command_tells_of_a_full_disk_in_one_line(tmp_path: Path) -> None:
     config = str(ROOT / "configs" / "double_integrator.yaml")
     arguments = ["watch", config, "--save", "x.rrd", "--out", "run", "--no-figures"]
     done = subprocess.run(
-        [sys.executable, "-c", limited, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, "-B", "-c", limited, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     assert "x.rrd is not complete: it could not be written to its end" in done.stdout
