@@ -82,9 +82,11 @@ def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Ans
         x = candidate.solution.x
         ledger.prove(candidate, separate(ledger.program, x, ledger.tools, ALLOWED), prover(x, GLANCE))
     missed, violated = [Missed.most(*one) for one in found], [above(*one) for one in found]
-    near = working.secured == 0 and _is_near(working, ledger.program, answer, missed)
+    near = working.secured == 0
     if deadline.left is None:  # where nothing is left to impose, the proof of this decision comes at once
         near = near and (ledger.open(answer.solution.x) or any(rows.size for _, rows, _ in violated))
+    near = near and _is_near(working, ledger.program, answer, missed)
+    if deadline.left is None:
         working.secured += near
         due = near or (number >= PATIENT and number & (number - 1) == 0)
     else:
@@ -185,7 +187,8 @@ def _looked(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Missed], Violated
 def _is_near(working: Working, program: SemiInfiniteProgram, answer: Answer, missed: Sequence[Missed]) -> bool:
     """Whether to keep away from the constraints by more than an answer ``missed`` costs no more than what a decision is
     secured for in any case. A round may take longer than all before it, so such an answer is not let go."""
-    distance, price = max((working.distance(one) for one in missed), default=0.0), working.priced(answer)
+    distance = max((working.distance(one) for one in missed if one.violation > 0.0), default=0.0)
+    price = working.priced(answer)
     if distance > 0.0 and not price > 0.0:  # no row has a multiplier, which says nothing of those that are missed
         return False
     return PAID * distance * price <= SPARED * abs(program.cost(answer.solution.x))
