@@ -13,8 +13,8 @@ from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.way import Stage
 
 WIDTH, HEIGHT, GAP = 1150.0, 240.0, 110.0
-EXTENT = (-120.0, WIDTH + 50.0, -120.0, HEIGHT + 166.0)
-LINE = 48.0  # units between two lines of words
+EXTENT = (-120.0, WIDTH + 50.0, -120.0, HEIGHT + 186.0)
+LINE = 56.0  # units between two lines of words
 CORNERS, POINTS = 500, 300  # of a curve, and of a cloud, in one panel
 MOST = 4  # panels beside one another; of more stages the last ones
 LEAST = 5e-4

@@ -17,7 +17,7 @@ from sparserob_rerun.search.way import Shadow, Stage, shadow
 
 PIXELS, SIDE = 128, 384.0
 TRIED, LEG, LAST = 300, 400, 20  # points that stay visible, corners of the walk, and its last ones
-ROWS = {True: 37.0, False: 45.0}
+ROWS = {True: 50.0, False: 52.0}
 """Units between two lines of words: of a search the panel is larger, and has more lines. A line is 22 pixels high."""
 BESIDE = 745.0  # where the words are: at the right of the map
 LETTERS = 46  # in a line; a word more does not fit there
