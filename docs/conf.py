@@ -31,6 +31,7 @@ nb_execution_cache_path = str(Path(__file__).resolve().parents[1] / ".docs_cache
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+nb_output_stderr = "warn"  # a cell that complains, such as an observer that is detached, fails the build
 
 smartquotes = False  # `--option` and its quotes in the help of a command are pasted as they are read
 
