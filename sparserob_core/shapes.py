@@ -58,7 +58,7 @@ elif CHECKED:
 
         return undrawn
 
-    FIRST, MORE = 50, 20  # calls that are checked one by one; then each that is a twentieth later, as a check is slow
+    FIRST, MORE = 20, 5  # calls that are checked one by one; then each that is a fifth later, as a check is slow
 
     def shaped(function: Any) -> Any:
         """Check the shapes in the annotations of a function at its first calls, and ever more rarely afterwards; at

@@ -6,6 +6,7 @@ import gc
 import os
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,20 @@ def pytest_collection_finish() -> None:
     """What modules and thousands of collected tests hold need not be searched for cycles again and again."""
     if not MEASURES:
         gc.freeze()
+
+
+@pytest.hookimpl(tryfirst=True)  # before the tests of the other stage are left out
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Make every set of parameters after the first ``n`` of a test that is marked ``first(n)`` one of the second
+    stage."""
+    met = Counter[str]()
+    for item in items:
+        first = item.get_closest_marker("first")
+        if first is not None and item.get_closest_marker("slow") is None:
+            name = item.nodeid.partition("[")[0]
+            met[name] += 1
+            if met[name] > first.args[0]:
+                item.add_marker(pytest.mark.slow)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

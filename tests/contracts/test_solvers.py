@@ -283,6 +283,7 @@ def test_the_contract_catches_a_solver_that_is_bad_on_purpose(flawed, test):
     fails(SolverContract, flawed, test)
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("flawed", [Optimist, Pessimist, Inflated, NoDuals, Diagonal])
 def test_behind_the_check_too_a_bad_solver_fails_on_programs_that_need_a_solver(flawed):
     """Separable programs are put right by the check itself, and say nothing of a solver."""

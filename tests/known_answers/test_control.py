@@ -294,6 +294,7 @@ def test_the_papers_system_has_the_value_of_its_linear_program(run, row):
     assert_cost(run(config, overrides), value, accuracy)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "solver", [pytest.param(name, marks=pytest.mark.slow if name == "proxqp" else ()) for name in SOLVERS]
 )
@@ -350,6 +351,7 @@ def test_the_largest_disturbance_that_experiment_1_survives(run, bound, feasible
 # Random instances against linear programs that enclose the value.
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 24))])
 def test_a_random_instance_lies_between_two_independent_linear_programs(run, seed):
     problem = random_problem(seed)

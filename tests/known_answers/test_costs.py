@@ -63,6 +63,7 @@ def certified(outcome: Any) -> float:
     return float(outcome.result.cost)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(("cost", "value"), [(EVERYTHING, 0.983009), (TRACKING, 1.234490)])
 @pytest.mark.parametrize("solver", ["piqp", "clarabel", pytest.param("proxqp", marks=pytest.mark.slow)])
 def test_known_costs_are_reached_with_every_solver(cost, value, solver, tmp_path):
@@ -333,6 +334,7 @@ def honest(tmp_path_factory):
     return run({**SPRING, "cost": TRACKING}, 20, tmp_path_factory.mktemp("costs") / "honest").directory
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", FORGERIES)
 def test_what_a_certificate_says_of_a_cost_is_derived_anew(name, honest, tmp_path):
     change, claim = FORGERIES[name]

@@ -32,6 +32,7 @@ def ran(place, *given, **more):
     return sr.run(config(*given, **more), out=place, quiet=True, figures=False)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("kind", "policy"),
     [

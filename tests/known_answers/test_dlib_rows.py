@@ -34,6 +34,7 @@ def evaluations_to(landscape, budget, seed):
     return [int(np.argmax(regret <= epsilon)) + 1 for epsilon in EPSILONS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seeds"), [("holder2", FEW), *(pytest.param(name, SEEDS, marks=pytest.mark.slow) for name in ROWS)]
 )

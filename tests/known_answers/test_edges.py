@@ -61,6 +61,7 @@ def test_nothing_is_certified_that_misses_a_tiny_set(unit):
         assert (np.abs(final) <= np.array([0.5, 0.3]) * unit * (1 + 1e-5)).all()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("p", [1.5, 3.0])
 def test_a_disturbance_in_any_norm_under_a_curved_set_is_certified(p):
     """For ``x' = u + w`` the worst disturbance moves the state by ``T`` times the ball, whatever its norm: J is what

@@ -182,6 +182,7 @@ def test_worst_lies_between_nominal_and_peak_and_no_disturbance_costs_more(tmp_p
     assert costs["worst"] <= costs["peak"] * (1.0 + 1e-9)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "changed",
     [
@@ -208,6 +209,7 @@ def test_draws_and_the_adversary_never_cost_more_than_the_largest_effort(tmp_pat
     assert effort_at(outcome, draws).max() <= outcome.result.cost
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("pressed", [False, True])
 def test_a_search_that_is_ended_leaves_an_honest_gap(
     pressed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -69,6 +69,7 @@ def proven(outcome: sr.Outcome) -> None:
     assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("problem", "pieces", "cost", "value"),
     [
@@ -93,6 +94,7 @@ def test_known_values_are_met_and_certified(
     assert outcome.result.cost == pytest.approx(value, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("problem", "pieces", "cost", "value", "within"),
     [
@@ -196,6 +198,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", VARIANTS)
 @pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 def test_grids_and_memory_keep_every_guarantee(name: str, cost: str, tmp_path: Path) -> None:
@@ -211,6 +214,7 @@ SETS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name == "an ellipsoid" else ()) for name in SETS]
 )
@@ -294,6 +298,7 @@ FORGERIES: dict[str, Any] = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forged_policy_is_found(name: str, tmp_path: Path, policies: Path) -> None:
     copy = tmp_path / "copy"
@@ -421,6 +426,7 @@ def test_the_bound_against_causal_policies_depends_on_no_clock_and_says_so_where
     assert stopped["causal_ended"] == "seconds" and stopped["status"] == "certified"
 
 
+@pytest.mark.slow
 def test_the_bound_against_causal_policies_is_pickled_with_its_result(tmp_path: Path) -> None:
     outcome = run(springs(0.2, 0.5), 10, tmp_path / "run")
     for copy in (pickle.loads(pickle.dumps(outcome)).result, pickle.loads(pickle.dumps(outcome.result))):
@@ -450,7 +456,7 @@ def test_no_bound_against_causal_policies_is_sought_with_no_signals(tmp_path: Pa
 
 
 def test_a_forged_bound_against_causal_policies_is_refused(tmp_path: Path) -> None:
-    outcome = run(springs(0.2, 0.5), 10, tmp_path / "run")
+    outcome = run(springs(0.2, 0.5), 8, tmp_path / "run")
     certificate = json.loads((outcome.directory / "certificate.json").read_text())
     causal = certificate["causal"]
 
@@ -484,6 +490,7 @@ def test_a_result_that_says_another_causal_bound_than_the_certificate_is_noticed
     assert {claim.name: claim.verdict for claim in check(outcome.directory).claims}["result.json"] == "fails"
 
 
+@pytest.mark.slow
 def test_the_margin_of_a_policy_says_above_which_factor_no_causal_policy_exists(tmp_path: Path) -> None:
     """Experiment 1 with the path from 0.3, a breakpoint: u = 1 until then is the best for x1(0.3) whatever happens."""
     A, c, x0 = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([1.0, 0.0]), np.array([-1.0, 1.0])

@@ -42,6 +42,7 @@ def mixed_rows(independent: PolicyProgram, within: int) -> None:
                 independent.below(sign * both, 1.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 def test_bounds_of_state_and_control_together_cost_what_a_linear_program_says(cost: str, tmp_path: Path) -> None:
     outcome = run({**SPRING, "path": [*SPRING["path"], MIXED]}, tmp_path / "run", cost)
@@ -56,6 +57,7 @@ def test_bounds_of_state_and_control_together_cost_what_a_linear_program_says(co
     bracketed(outcome.result.cost, programs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 def test_a_path_that_moves_costs_what_a_linear_program_says(cost: str, tmp_path: Path) -> None:
     outcome = run({**SPRING, "path": [MOVING]}, tmp_path / "run", cost)
@@ -245,6 +247,7 @@ REFUTED: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", REFUTED)
 def test_a_witness_drives_the_loop_out_of_what_stands_beside_the_state(name: str, tmp_path: Path) -> None:
     """What one round leaves violated is named with a disturbance that the checker drives the loop by."""
@@ -296,6 +299,7 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Callable[[dict[str, Any]
     return directory
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", FORGERIES)
 def test_what_is_forged_beside_the_state_is_found(
     name: str, honest: Callable[[dict[str, Any]], Path], tmp_path: Path

@@ -48,6 +48,7 @@ def test_an_elliptic_final_set_costs_what_its_tangents_say(cost: str, tmp_path: 
     assert outcome.result.cost == pytest.approx(found, rel=5e-3)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
 def test_a_round_set_of_controls_costs_what_its_tangents_say(cost: str, tmp_path: Path) -> None:
     outcome = run(THRUSTERS, tmp_path / "run", cost, pieces=6)
@@ -87,6 +88,7 @@ SETS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if " an" in name else name for name in SETS]
 )
@@ -153,6 +155,7 @@ def curved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return outcome.directory
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forged_curved_set_is_found(name: str, tmp_path: Path, curved: Path) -> None:
     assert forged(curved, tmp_path / "copy", FORGERIES[name]) == "refuted"

@@ -138,6 +138,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_a_controller_keeps_an_integrated_plant_in_its_sets(finished: Path) -> None:
     """The worst cases are near what some corners of the sets do, and no corner that is drawn does more."""
     rng, ends, highest = np.random.default_rng(1), [], -np.inf
@@ -159,6 +160,7 @@ def test_a_controller_keeps_an_integrated_plant_in_its_sets(finished: Path) -> N
     assert highest <= 1.2 and max(ends) <= 0.4 + 1e-7
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "change",
     [

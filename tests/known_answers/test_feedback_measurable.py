@@ -197,6 +197,7 @@ def test_without_gains_the_tube_is_that_of_the_open_loop() -> None:
         np.testing.assert_allclose(values, open_loop, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_bounds_over_cells_hold_and_become_exact() -> None:
     answer = sr.solve(_problem(), control={"name": "piecewise_constant", "pieces": PIECES}, policy=POLICY)
     assert answer.model.feedback is not None
@@ -262,6 +263,7 @@ FORGERIES: dict[str, Callable[[dict[str, Any]], Any]] = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=pytest.mark.slow if "outside of its set" in name else ()) for name in FORGERIES],

@@ -83,6 +83,7 @@ def test_the_largest_disturbances_are_those_that_were_found_elsewhere(measured, 
     assert low <= 0.1 * found.lower <= 0.1 * found.upper <= high
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("C", "noise", "late"),
     [([[1, 0]], 0.02, 0), ([[1, 0]], 0.01, 1), ([[1, 0], [0, 1]], 0.03, 1), ([[1, 0.5]], 0.0, 0)],
@@ -137,6 +138,7 @@ def test_a_loop_that_is_stepped_by_hand_keeps_every_wall_and_meets_its_worst_cas
     assert (most > 0.1).any()  # the walls are not far from what happens
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
 def test_no_causal_policy_is_cheaper_than_what_its_signals_prove(cost: str, tmp_path: Path) -> None:
     quick = run(SHORT, POSITION, tmp_path / "quick", cost=cost, causal_signals=20)
@@ -317,7 +319,7 @@ def test_a_problem_with_outputs_is_a_config_and_back(tmp_path: Path) -> None:
     result = sr.solve(
         problem, control={"name": "piecewise_constant", "pieces": 4}, policy=sr.AffinePolicy(causal_signals=0)
     )
-    result.save(tmp_path / "run")
+    result.save(tmp_path / "run", figures=False)
     assert sr.check(tmp_path / "run").status == "verified"
     told = run({**SHORT, "path": []}, {**POSITION, "latency": 0.5}, tmp_path / "told")
     assert told.result.cost == pytest.approx(result.cost, rel=1e-9)

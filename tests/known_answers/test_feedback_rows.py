@@ -76,6 +76,7 @@ def bracketed(cost: float, programs: Callable[[int], float], within: float = 2e-
     assert cost == pytest.approx(fine, rel=within)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 @pytest.mark.parametrize(
     "begun",
@@ -104,6 +105,7 @@ STATES: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("disturbed", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name == "an ellipsoid" else ()) for name in STATES]
@@ -184,6 +186,7 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return outcome.directory
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
 @pytest.mark.parametrize("fixed", [pytest.param([0.0, 0.0], marks=pytest.mark.slow), [None, 0.1]])
 def test_final_states_are_fixed_from_every_initial_state(cost: str, fixed: list[float | None], tmp_path: Path) -> None:
@@ -204,6 +207,7 @@ def test_final_states_are_fixed_from_every_initial_state(cost: str, fixed: list[
     bracketed(outcome.result.cost, programs)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", STATES)
 def test_final_states_are_fixed_from_sets_of_every_kind(name: str, tmp_path: Path) -> None:
     start = {"centre": [-1, 1], **STATES[name]}
@@ -334,6 +338,7 @@ def test_a_forged_final_state_is_found(name: str, tmp_path: Path, fixed: Path) -
     assert forged(fixed, tmp_path / "copy", FIXED[name]) == "refuted"
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forged_initial_state_is_found(name: str, tmp_path: Path, begun: Path) -> None:
     assert forged(begun, tmp_path / "copy", FORGERIES[name]) == "refuted"

@@ -99,6 +99,7 @@ def least(system: dict[str, Any], more: dict[str, Any]) -> float:
     return float(found.fun)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", CASES)
 def test_the_cost_is_that_of_a_program_over_every_corner_and_check_derives_it(name: str, tmp_path: Path) -> None:
     system, more = CASES[name]
@@ -138,6 +139,7 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
     return sr.run(data, out=tmp_path_factory.mktemp("late") / "run", quiet=True, figures=False)
 
 
+@pytest.mark.slow
 def test_a_late_control_of_systems_that_take_turns_keeps_every_wall_in_a_loop_that_others_integrate(
     late: sr.Outcome,
 ) -> None:

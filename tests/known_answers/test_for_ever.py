@@ -97,6 +97,7 @@ def test_what_is_left_of_a_period_steps_to_the_control_that_begins_the_next(tmp_
     assert (np.asarray(seam.G) @ [0.19] > np.asarray(seam.h)).any()
 
 
+@pytest.mark.slow
 def test_twelve_masses_return_though_the_box_of_their_states_is_left_in_between(tmp_path) -> None:
     """24 states: without control the box grows to 4.4 times its size before it shrinks, and no control that is fixed
     beforehand brings it back under this disturbance."""
@@ -203,6 +204,7 @@ def loops(tmp_path_factory) -> sr.Outcome:
     return found
 
 
+@pytest.mark.slow
 def test_loops_run_through_many_periods(loops) -> None:
     found = sr.loop(loops, periods=20, trajectories=1)
     assert not found.contradicts
@@ -364,6 +366,6 @@ def test_a_problem_that_repeats_is_said_and_solved_from_python(tmp_path) -> None
     indicators = sr.Dictionary([0.0, 1.0], [[1.0]])
     program = sr.transcribe(problem, control=indicators, policy=sr.AffinePolicy(cost="peak"))
     found = sr.solve(program, method="exchange", solver="piqp")
-    found.save(tmp_path / "run")
+    found.save(tmp_path / "run", figures=False)
     assert found.cost == pytest.approx(0.25, rel=1e-6)
     assert _verdicts(tmp_path / "run")["repeat"] == "holds"

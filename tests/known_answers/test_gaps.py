@@ -130,6 +130,7 @@ def test_dust_in_coefficients_of_waves_is_put_to_exactly_zero(number):
     assert not result.decision.any()
 
 
+@pytest.mark.first(11)
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("tolerance", [1e-7, 1e-9])
 def test_a_policy_of_one_state_is_certified_at_the_tolerance_that_is_asked_for(seed, tolerance):

@@ -88,6 +88,7 @@ def test_the_spring_can_be_at_rest_at_some_horizons_only(tmp_path: Path) -> None
     assert "10 pieces at every horizon" in found.remarks[0]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("change", "exact"),
     [

@@ -63,6 +63,7 @@ def test_the_farthest_initial_state_decides_at_an_uncertain_rate(tmp_path: Path)
     assert known - 1e-9 <= summary["cost"] <= known + 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("deviations", "end"),
     [
@@ -268,6 +269,7 @@ def _deviation(value: Any) -> Callable[[Forgery], None]:
     return lambda files: files.certificate["witness"].update(deviation=value)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("run", "change"),
     [

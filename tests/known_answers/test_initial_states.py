@@ -63,6 +63,7 @@ def test_every_half_plane_is_the_support_function_of_the_null_controllable_set(c
     np.testing.assert_allclose(cart.reached, exact, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_the_piecewise_constant_set_approaches_the_integral_from_within(cart: sr.InitialStates) -> None:
     integral = np.array([support(direction, 200_000) for direction in cart.directions])
     assert (cart.reached <= integral + 1e-8).all()

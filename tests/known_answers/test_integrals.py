@@ -232,7 +232,7 @@ def test_every_signal_moves_an_integral_within_its_worst_case_and_one_attains_it
 def test_check_derives_the_integrals_on_its_own(name: str, tmp_path: Path) -> None:
     plan = spring(path=[], **BOUND[name])
     result = sr.solve(plan.problem(), control={"name": "piecewise_constant", "pieces": plan.pieces})
-    result.save(tmp_path / "run")
+    result.save(tmp_path / "run", figures=False)
     assert check(tmp_path / "run").status == "verified"
 
 

@@ -162,6 +162,7 @@ EXPECTED = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name == "deb5" else ()) for name in EXPECTED]
 )
@@ -181,6 +182,7 @@ def test_random_search_needs_as_many_evaluations_as_is_expected_exactly(name):
 DLIB_RANDOM = {("holder2", 0.1): (3043, 2901), ("sphere4", 0.1): (1929, 2034), ("deb5", 0.1): (3933, 3869)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "accuracy"),
     [pytest.param(*key, marks=() if key[0] == "sphere4" else pytest.mark.slow) for key in DLIB_RANDOM],
@@ -207,6 +209,7 @@ PUBLISHED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["sphere4", *(pytest.param(name, marks=pytest.mark.slow) for name in ("holder2", "deb5"))]
 )

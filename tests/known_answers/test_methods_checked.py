@@ -65,6 +65,7 @@ def sizes() -> list[Any]:
     return [pytest.param(*pair, marks=pytest.mark.slow if pair in large else ()) for pair in every]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(("method", "parameters"), sizes())
 def test_no_honest_claim_fails_and_every_cut_says_what_its_index_is(
     method: str, parameters: int, tmp_path: Path

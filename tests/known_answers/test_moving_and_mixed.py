@@ -307,6 +307,7 @@ def drop(files: Forgery) -> None:
         files.proof("path[1]")[name] = files.proof("path[1]")[name][1:]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("run_of", "claim", "change"),
     [

@@ -30,6 +30,7 @@ def cost(rate: dict[str, Any], policy: str, where: Path) -> float:
     return float(outcome.result.cost)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("policy", ["open_loop", "affine"])
 def test_a_ball_of_rates_on_a_line_is_the_interval(policy: str, tmp_path: Path) -> None:
     interval = cost({"box": 1.5}, policy, tmp_path / "interval")

@@ -84,6 +84,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("n", [2, 5, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4, 6))])
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -200,6 +201,7 @@ def ellipse_tangents(half_axes):
     return family("tangents", [0.0], [2 * np.pi], rows)
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("half_axes", [(1.0, 1.0), (2.0, 0.5), (0.3, 3.0)])
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (-0.6, 0.8), (1.3, 2.1)])
@@ -372,6 +374,7 @@ ANSWERED = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ANSWERED)
 def test_any_convex_program_is_answered(name):
     program, truth = ANSWERED[name]
@@ -398,6 +401,7 @@ UNBOUNDED = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", UNBOUNDED)
 def test_an_unbounded_program_is_told_with_a_ray(name):
     program, ray, status = UNBOUNDED[name]
@@ -423,6 +427,7 @@ INFEASIBLE = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", INFEASIBLE)
 def test_a_program_that_leaves_nothing_is_infeasible_whatever_else_is_free(name):
     result = sr.solve(INFEASIBLE[name])

@@ -159,6 +159,7 @@ def norm_is_lower(certificate: dict[str, Any]) -> None:
     certificate["J"] *= 0.9
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "change",
     [part_is_left_out, leaf_is_called_infeasible, piece_is_outside, bound_is_higher, norm_is_lower],
@@ -191,6 +192,7 @@ def test_units_change_nothing(tmp_path: Path) -> None:
     assert other.summary["J"] == 1024.0 * one.summary["J"]
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("penalty", ["logarithm", "capped"])
 def test_another_penalty_never_acts_more_than_l1_and_claims_what_it_proves(penalty: str, tmp_path: Path) -> None:
     plain, before = solved(SPRING, 40, tmp_path / "exchange")

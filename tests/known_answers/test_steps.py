@@ -46,6 +46,7 @@ def run(problem: dict[str, Any], pieces: int, out: Path, **more: Any) -> sr.Outc
     return sr.run(config(problem, pieces, **more), out=out, quiet=True, figures=False)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "step",
     [
@@ -109,6 +110,7 @@ def test_the_cost_is_that_of_an_independent_linear_program(step, before, tmp_pat
     assert check(outcome.directory).status == "verified", check(outcome.directory).claims
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("step", [{"norm": {"p": 2, "radius": 0.3}}, {"box": [0.2, 0.3]}])
 @pytest.mark.parametrize(
     "control",
@@ -173,6 +175,7 @@ def _jump(files: Forgery) -> None:
     files.decision[0][20] += 0.3
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("claim", "change"),
     [

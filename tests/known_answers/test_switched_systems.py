@@ -140,6 +140,7 @@ def _random(seed: int, uncertain: bool) -> tuple[sr.OptimalControlProblem, sr.Di
     )
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("uncertain", [False, True])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_bounds_of_cells_are_above_every_violation_and_close(seed: int, uncertain: bool) -> None:
@@ -251,6 +252,7 @@ def _piece(number: int, **changes: Any) -> tampering.Change:
     return lambda files: files.system["pieces"][number].update(changes)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "change",
     [
@@ -335,6 +337,7 @@ SETS = [
 ]
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("parameters", SETS)
 def test_pieces_share_a_set_of_parameters_of_any_kind(parameters: dict[str, Any], tmp_path: Path) -> None:
     plain = {"A": [["-0.5 + p1"]], "B": [["1 + p2"]]}

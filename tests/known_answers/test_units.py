@@ -42,6 +42,7 @@ def run(name: str, out: Path) -> sr.Result:
     return sr.run(FILES / f"{name}.yaml", {"observers": []}, out=out, quiet=True, figures=False).result
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("name", sorted(path.stem for path in FILES.glob("*.yaml") if path.stem[:2] in INFEASIBLE))
 def test_what_is_outside_in_its_own_unit_is_infeasible(name, tmp_path):
     result = run(name, tmp_path / "run")
@@ -54,6 +55,7 @@ def feasible() -> list[object]:
     return [pytest.param(name, marks=pytest.mark.slow if name in HEAVY else ()) for name in names]
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("name", feasible())
 def test_what_is_feasible_in_its_own_unit_is_certified(name, tmp_path):
     result = run(name, tmp_path / "run")
@@ -143,6 +145,7 @@ def plain(request) -> tuple[str, sr.Result]:
     return request.param, solved(oscillator(request.param, Factors()))
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("seed", range(2))
 def test_units_that_are_powers_of_two_change_no_bit(plain, seed):
     kind, one = plain
@@ -156,6 +159,7 @@ def test_units_that_are_powers_of_two_change_no_bit(plain, seed):
         assert theirs.index[0] * f.time == mine.index[0]
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("seed", range(2))
 def test_any_units_leave_the_status_the_cost_and_the_active_constraints(plain, seed):
     kind, one = plain

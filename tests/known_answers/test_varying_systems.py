@@ -216,6 +216,7 @@ def uncertain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "change",
     [

@@ -100,6 +100,7 @@ def ridden(wall: str, pieces: int, uncertain: bool = False, feedback: bool = Fal
     }
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("wall", "uncertain", "feedback", "most"),
     [
@@ -121,6 +122,7 @@ def test_a_wall_that_moves_takes_no_more_rounds_the_longer_it_is_ridden(
         assert result.counts["rounds"] <= most
 
 
+@pytest.mark.slow
 def test_a_curved_wall_that_is_ridden_takes_few_rounds_with_parameters_too() -> None:
     result = sr.run(ridden("curved", 8, uncertain=True), quiet=True, figures=False).result
     assert result.status == "certified"
@@ -167,6 +169,7 @@ def test_under_a_limit_what_little_would_pay_for_is_proven_at_once(
     assert near + 1 < len(result.history)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("wall", "uncertain", "feedback", "method", "looks"),
     [
@@ -203,6 +206,7 @@ def test_a_limit_leaves_a_proven_control_between_walls_that_are_closer_than_is_s
     assert result.status == "verified"
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("feedback", "looks"), [(False, 36), (True, 8)])
 def test_a_relaxed_program_that_is_not_solved_leaves_the_control_that_is_proven(
     feedback: bool, looks: int, monkeypatch: pytest.MonkeyPatch

@@ -67,6 +67,7 @@ def test_the_estimated_constant_is_the_next_on_the_grid_above_the_steepest_slope
         assert power == pytest.approx(round(power), abs=1e-9)
 
 
+@pytest.mark.first(10)
 @pytest.mark.parametrize("seed", range(20))
 def test_with_the_right_constant_lipo_is_never_worse_than_its_own_uniform_candidates(seed, monkeypatch):
     """Every evaluation draws a uniform candidate first: with these alone, the search would be pure random search."""

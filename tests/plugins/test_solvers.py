@@ -23,6 +23,7 @@ SOLVERS = [Piqp(), ProxQp(), Clarabel()]
 EPSILONS = (1.0, 1e-2, 1e-4, 1e-6, 0.0)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("pieces", [50, 250])
 def test_all_solvers_agree_on_the_paper_s_instance_whatever_epsilon(pieces):
     plain = experiment_one(PiecewiseConstant(pieces=pieces))

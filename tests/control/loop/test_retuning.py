@@ -76,6 +76,7 @@ def rows(outcome, first):
     return G, h, F, 1.0 - radius * np.abs(effects).sum(axis=1)
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("first", [0, 3, 7, 11])
 def test_it_finds_and_proves_the_best_nominal_control_for_the_gains(outcome, first) -> None:
     controller, rng = sr.controller(outcome), np.random.default_rng(first)

@@ -80,6 +80,7 @@ HEAVY = [
 ]
 
 
+@pytest.mark.first(9)
 @pytest.mark.parametrize(
     ("name", "parameters"),
     [

@@ -17,6 +17,7 @@ from sparserob_core.sip.search.search import Target
 from tests.support.places import CONFIGS
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("landscape", list(standard()), ids=lambda one: one.name)
 def test_no_point_of_a_standard_function_exceeds_its_maximum_and_a_search_comes_near(landscape):
     report = sr.maximise(landscape.target.function, landscape.target.domain, "simulated_annealing", 3000, 0, 0.3)

@@ -201,6 +201,7 @@ FORGED = {
 }
 
 
+@pytest.mark.first(7)
 @pytest.mark.parametrize("fault", FORGED)
 def test_a_forged_worst_case_is_refuted(written: Path, tmp_path: Path, fault: str) -> None:
     data = json.loads((written / "bound.json").read_text())

@@ -106,7 +106,6 @@ def test_no_command_that_reads_a_directory_executes_what_its_config_names(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("drafts")
 def test_a_plugin_that_the_user_names_himself_is_loaded(foreign: tuple[Path, Path, Path], command: Command) -> None:
     directory, file, marker = foreign
     marker.unlink(missing_ok=True)
@@ -150,7 +149,6 @@ def test_what_is_no_run_directory_is_said_to_be_none(tmp_path: Path, read: Calla
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("drafts")
 def test_a_column_that_a_later_version_added_is_passed_over_by_every_reader(copy: Path) -> None:
     trace = read_arrays(copy / "trace.npz")
     np.savez(copy / "trace.npz", later=np.arange(len(trace["round"])), matrix=np.eye(3), **trace)
@@ -323,7 +321,6 @@ def test_whatever_is_wrong_with_an_array_is_an_error_of_the_input_or_none(
         (directory / name).write_bytes(content)
 
 
-@pytest.mark.usefixtures("drafts")
 def test_a_run_that_was_interrupted_before_its_first_round_was_over_can_be_drawn(copy: Path) -> None:
     empty = {name: np.array([]) for name in read_arrays(copy / "trace.npz")}
     np.savez(copy / "trace.npz", **empty)

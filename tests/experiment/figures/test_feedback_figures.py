@@ -135,7 +135,6 @@ def test_the_pictures_of_a_round_draw_nothing_at_random(outcome: sr.Outcome) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("drafts")
 def test_a_policy_with_two_channels_can_be_drawn(tmp_path: Path) -> None:
     given = {"dictionaries.control.pieces": 6, "method.rounds": 1}
     out = sr.run(CONFIGS / "coupled_masses_feedback.yaml", given, out=tmp_path / "run", quiet=True)

@@ -16,6 +16,7 @@ from sparserob_core.experiment.figures.figure_data import FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
 from sparserob_core.experiment.figures.style import _letters_told, held
 from sparserob_core.sip.events import RoundFinished
+from tests.support.drafts import whole
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +47,8 @@ def data() -> FigureData:
 
 @pytest.fixture(scope="module")
 def files(data: FigureData, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return write_figures(tmp_path_factory.mktemp("figures"), data)
+    with whole():
+        return write_figures(tmp_path_factory.mktemp("figures"), data)
 
 
 @pytest.mark.slow
@@ -58,7 +60,8 @@ def test_every_figure_is_written_as_a_vector_and_as_a_picture(files: list[Path])
 
 @pytest.mark.slow
 def test_the_same_data_gives_the_same_bytes(files: list[Path], data: FigureData, tmp_path: Path) -> None:
-    again = write_figures(tmp_path, data)
+    with whole():
+        again = write_figures(tmp_path, data)
     assert [file.read_bytes() for file in files] == [file.read_bytes() for file in again]
 
 
@@ -159,19 +162,16 @@ def test_bounds_that_are_not_known_yet_are_not_drawn(data: FigureData) -> None:
     assert drawn["upper bound"] == 2
 
 
-@pytest.mark.usefixtures("drafts")
 def test_a_run_that_ended_in_its_first_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
     only = replace(data, history=data.history[:1], tolerance=None, active_times=np.empty(0), walls=())
     assert len(write_figures(tmp_path, only)) == 6
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("drafts")
 def test_a_closed_gap_in_the_only_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
     assert len(write_figures(tmp_path, replace(data, history=data.history[-1:]))) == 6
 
 
-@pytest.mark.usefixtures("drafts")
 def test_a_run_without_rounds_has_no_convergence_figure(data: FigureData, tmp_path: Path) -> None:
     assert {file.stem for file in write_figures(tmp_path, replace(data, history=()))} == {"control", "states"}
 

@@ -102,7 +102,6 @@ def test_re_solves_are_asked_of_the_solver_that_the_config_names(tmp_path, monke
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("drafts")
 def test_the_command_runs_a_config_and_closes_the_loop(config, tmp_path, capsys) -> None:
     out = tmp_path / "run"
     assert status("loop", config, "problem.disturbance.box=[0.1,0.1]", "--out", out, "--trajectories", 1) == 0

@@ -203,6 +203,7 @@ def test_an_equality_stays_imposed_while_the_rest_is_varied():
     assert_encloses(sr.margin(config(terminal=[{"equals": [0, 0]}]), of="initial_state"), 1.0)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "kind",
     [
@@ -289,6 +290,7 @@ class Heard(sr.Observer):
         self.events.append(event)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("of", ["disturbance", "terminal.0", "horizon"])
 def test_an_observer_hears_every_run_of_a_margin_as_a_point_of_a_study(of: str, tmp_path: Path) -> None:
     heard = Heard()

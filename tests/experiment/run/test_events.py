@@ -88,6 +88,7 @@ def test_a_run_begins_and_ends_once_and_everything_is_in_between(
     assert len(listener.heard) >= 3
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("method", METHODS)
 def test_the_run_is_the_same_with_and_without_observers(method: str, watched: Callable[..., sr.Outcome]) -> None:
     listener = Listener()

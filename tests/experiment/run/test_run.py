@@ -78,7 +78,6 @@ def test_an_infeasible_run_has_no_control_and_says_why(config: Path, tmp_path: P
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("drafts")
 def test_figures_are_drawn_and_can_be_drawn_again(config: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     from sparserob_core.experiment.run.drawing import draw_run

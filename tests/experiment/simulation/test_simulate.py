@@ -112,6 +112,7 @@ CLASSES = {
 }
 
 
+@pytest.mark.first(16)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", CLASSES)
 def test_every_law_draws_admissible_signals_that_differ(name, law):

@@ -51,6 +51,7 @@ def test_the_bound_before_is_the_root_of_the_printed_sum(scenarios, variables, b
     assert float(tail) == pytest.approx(beta, rel=1e-6)
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize(("scenarios", "support"), [(20, 0), (20, 3), (100, 10), (300, 40), (7, 6), (500, 2)])
 @pytest.mark.parametrize("beta", [0.1, 1e-6])
 def test_the_bound_after_is_the_root_of_the_printed_polynomial(scenarios, support, beta):

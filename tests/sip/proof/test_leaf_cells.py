@@ -69,6 +69,7 @@ CASES = {"flat": (flat, 0.3), "end": (flat, 2.0), "curved": (curved, 0.3), "curv
 SETS = {"box": Box([-0.6, -0.6], [0.6, 0.6]), "triangle": TRIANGLE}
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("case", sorted(CASES))
 @pytest.mark.parametrize("parameters", sorted(SETS))
 def test_the_leaves_of_a_proof_partition_its_cells(case, parameters):

@@ -171,6 +171,7 @@ def test_a_single_point_is_told_with_a_number():
         assert (search.best_value, search.best_point.tolist()) == (2.5, point.tolist())
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ["simulated_annealing", "maxlipo", "direct", "random_search"])
 def test_workers_are_given_different_points_and_the_search_stays_the_same(name):
     alone = sr.ask_tell(BOX, name, budget=30, seed=5)

@@ -62,6 +62,7 @@ def polished(function, box, found=200, budget=200, seed=0, gradient=None, block=
     return objective.report("")
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(
     ("function", "box", "regret"),
     [
