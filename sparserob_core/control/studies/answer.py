@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, final
 
@@ -140,12 +140,13 @@ def _read(
     return ControlResult.of(result, prepare(problem, control, disturbance, form, policy), causal)
 
 
-def tube(model: Transcription, theta: Array, times: Array) -> Tube:
-    """The tube at a decision ``theta (m N,)``, or the whole one under feedback, and at ``times (T,)``."""
-    axes = np.eye(model.problem.system.states)
+def tube(model: Transcription, theta: Array, times: Array, states: Sequence[int] | None = None) -> Tube:
+    """The tube at a decision ``theta (m N,)``, or the whole one under feedback, and at ``times (T,)``; where ``states``
+    are named, of these alone, in rows of their own order."""
+    axes = np.eye(model.problem.system.states)[slice(None) if states is None else [*states]]
     upper, lower = supports(model, theta, times, axes), -supports(model, theta, times, -axes)
     if model.feedback is not None:
-        return Tube(times, model.feedback.loop.states(theta, times)[:, :, 0].T, lower, upper)
+        return Tube(times, axes @ model.feedback.loop.states(theta, times)[:, :, 0].T, lower, upper)
     bound = model.problem.system.parameters
     middle = np.tile(np.zeros(0) if bound is None else nominal_point(bound), (times.size, 1))
     known = model.functionals.central()

@@ -15,19 +15,30 @@ from sparserob_core.control.problem.problem import OptimalControlProblem, PathCo
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.adversary import find_adversary
-from sparserob_core.control.studies.answer import supports, tube
+from sparserob_core.control.studies.answer import Tube, supports, tube
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import path_names
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
-from sparserob_core.experiment.figures.figure_data import FigureData, Limit, Outputs, Plane, Wall, plain
+from sparserob_core.experiment.figures.figure_data import (
+    MOST_STATES,
+    FigureData,
+    Limit,
+    Outputs,
+    Plane,
+    Wall,
+    plain,
+    telling,
+)
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
 
 TIMES = 400  # drawn at most
 SMOOTH = 200  # drawn at least, about
+ROUGH = 6  # times at which it is told which states move far: with 2 a state that comes back seems to rest; with 60 the
+# figures of 270 states take longer than their control
 NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
 DRAWS = 2000  # of which the quantiles of the control are drawn
 CORNERS = 48  # of the polygon around every place, which reaches 0.2 % beyond a disc, and 3 % of its length beside a
@@ -56,7 +67,8 @@ def draw_experiment(
     from sparserob_core.experiment.figures.adversary_figure import write_adversary
     from sparserob_core.experiment.figures.run_figures import write_figures
 
-    data = figure_data(experiment, theta, active_times, history, cost, draws=DRAWS, status=status)
+    shown = _shown(experiment, theta)
+    data = figure_data(experiment, theta, active_times, history, cost, draws=DRAWS, status=status, states=shown)
     data = replace(data, push=push)
     files = write_figures(directory / "figures", data)
     if worst:
@@ -72,13 +84,14 @@ def figure_data(
     cost: float | None,
     draws: int = 0,
     status: str = "",
+    states: Sequence[int] | None = None,
 ) -> FigureData:
-    """What figures of a decision (``theta (m, N)``, or whole) show; under feedback also what so many random
-    disturbances and the worst one make of the control. The title says so where a ``status`` claims no proof. Raises
-    `InputError` when the program is no control problem."""
+    """What figures of a decision (``theta (m, N)``, or whole) show, of all ``states`` or of those that are named; under
+    feedback also what so many random disturbances and the worst one make of the control. The title says so where a
+    ``status`` claims no proof. Raises `InputError` when the program is no control problem."""
     if not isinstance(experiment, ControlExperiment):
         raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
-    data = _data(experiment, theta, active_times, history, cost, draws)
+    data = _data(experiment, theta, active_times, history, cost, draws, states)
     unproven = f"{data.title}: {status}, not proven" if status not in ("", "certified", "verified") else data.title
     return replace(data, title=unproven)
 
@@ -98,14 +111,15 @@ def _data(
     history: Sequence[RoundFinished],
     cost: float | None,
     draws: int,
+    states: Sequence[int] | None,
 ) -> FigureData:
     problem, model, program = experiment.problem, experiment.transcription, experiment.program
     control, dictionary = model.pieces(theta), model.control
     axes = np.eye(problem.system.controls)
     tolerance = experiment.loaded.config.method.options.get("tolerance")
     decision, times = np.ravel(theta), _times(model.response.grid.breakpoints)
-    around = tube(model, decision, times)
-    answered = {} if model.feedback is None else _answered(model, decision, times, draws)
+    around = _tube(model, decision, times, states)
+    answered = {} if model.feedback is None else _answered(model, decision, times, draws, states)
     longest = 0.0 if program.activity is None else float(program.activity.sum())
     counts = counting(experiment.loaded)[0] and longest > 0.0
     return FigureData(
@@ -134,12 +148,35 @@ def _data(
     )
 
 
-def _answered(model: Transcription, decision: Array, times: Array, draws: int) -> dict[str, Any]:
+def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
+    """The states that figures show of a system of very many, whose tubes would take longer than the control: of all of
+    them the reach is told at a few times. ``None``: all."""
+    if not isinstance(experiment, ControlExperiment) or experiment.problem.system.states <= MOST_STATES:
+        return None
+    problem = experiment.problem
+    rough = tube(experiment.transcription, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH))
+    reach = rough.upper.max(axis=1) - rough.lower.min(axis=1)
+    return sorted({*telling(reach, [*_walls(problem)])[:MOST_STATES], *(problem.names.in_plane or ())})
+
+
+def _tube(model: Transcription, decision: Array, times: Array, states: Sequence[int] | None) -> Tube:
+    """The tube of the ``states`` that are named, in rows of all of them; NaN stands in the others."""
+    found = tube(model, decision, times, states)
+    if states is None:
+        return found
+    rows = np.full((3, model.problem.system.states, times.size), np.nan)
+    rows[:, states] = found.nominal, found.lower, found.upper
+    return Tube(times, *rows)
+
+
+def _answered(
+    model: Transcription, decision: Array, times: Array, draws: int, states: Sequence[int] | None
+) -> dict[str, Any]:
     """What feedback adds to the figures: the tube that the nominal control alone has, how far the disturbance moves the
     control, and the gains; with ``draws`` the effort under so many of them, and what moves the control in the worst
     case."""
     assert model.feedback is not None
-    loop, alone = model.feedback.loop, tube(replace(model, feedback=None), model.nominal(decision), times)
+    loop, alone = model.feedback.loop, _tube(replace(model, feedback=None), model.nominal(decision), times, states)
     nominal, effects = loop.nominal(decision), loop.effects(decision)
     held = model.problem.disturbance_class == "piecewise_constant"  # of all measurable functions none is drawn evenly
     return {

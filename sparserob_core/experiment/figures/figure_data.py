@@ -102,13 +102,13 @@ class FigureData:
 
     ``breakpoints (K+1,)`` with the control ``(m, K)`` on the pieces and its bounds ``(m,)`` (infinite: none);
     ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
-    every disturbance and parameter; ``walls`` the path and terminal constraints on single components; ``active_times``
-    the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
-    the relative gap that was asked for, ``cost_scale`` what is added up to the cost, ``cost_of`` what is
-    added up to it, where that is not the L1 norm alone, ``cost_unit`` what it is measured in, where that is known,
-    ``counts`` whether cost means the time that the control acts, ``names`` what everything is called, ``plane``
-    where the system moves, if the problem says that it does so in one, ``push (m, K)`` the switching function, how
-    hard the constraints push the control, where that is known.
+    every disturbance and parameter, rows of NaN for states that nobody asked for; ``walls`` the path and terminal
+    constraints on single components; ``active_times`` the times of the imposed constraints that carry a multiplier;
+    ``history`` the rounds of the method. ``tolerance`` is the relative gap that was asked for, ``cost_scale`` what is
+    added up to the cost, ``cost_of`` what is added up to it, where that is not the L1 norm alone, ``cost_unit``
+    what it is measured in, where that is known, ``counts`` whether cost means the time that the control acts, ``names``
+    what everything is called, ``plane`` where the system moves, if the problem says that it does so in one, ``push (m,
+    K)`` the switching function, how hard the constraints push the control, where that is known.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and
@@ -162,12 +162,9 @@ class FigureData:
 
     @cached_property
     def drawn_states(self) -> tuple[int, ...]:
-        """The states that figures show, in their order: all, or `MOST_STATES` of them, first those that constraints
-        are about, then those that move the farthest in their units."""
+        """The states that figures show, in their order: all that are known, or `MOST_STATES` of them, `telling`."""
         reach = self.tube_upper.max(axis=1) - self.tube_lower.min(axis=1)
-        walled = {wall.state for wall in self.walls}
-        first = sorted(range(reach.size), key=lambda state: (state not in walled, -reach[state]))
-        return tuple(sorted(first[:MOST_STATES]))
+        return tuple(sorted(one for one in telling(reach, self.walls)[:MOST_STATES] if not np.isnan(reach[one])))
 
     @property
     def of_states(self) -> str:
@@ -204,6 +201,13 @@ class FigureData:
     def time_label(self) -> str:
         """The label of the time axis."""
         return measured("time $t$", self.names.time)
+
+
+def telling(reach: Array, walls: Sequence[Wall]) -> list[int]:
+    """All states, first those that ``walls`` are about, then those that move the farthest in their units, by ``reach
+    (d,)``; last those of which it is not known."""
+    walled = {wall.state for wall in walls}
+    return sorted(range(reach.size), key=lambda one: (np.isnan(reach[one]), one not in walled, -reach[one]))
 
 
 def label(names: Sequence[str], units: Sequence[str], letter: str, index: int, count: int, at: str = "t") -> str:

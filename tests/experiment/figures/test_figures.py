@@ -6,13 +6,15 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import sparserob_core as sr
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.figures.figure_data import FigureData, Wall
+from sparserob_core.experiment.figures import drawing
+from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
 from sparserob_core.experiment.figures.style import _letters_told, held
 from sparserob_core.sip.events import RoundFinished
@@ -139,6 +141,39 @@ def test_of_many_states_those_with_constraints_are_drawn_and_those_that_move_the
     assert panels[0].get_title() == "Rotation, 12 of 40 states"
     assert [axes.get_ylabel() for axes in panels] == [many.state_label(one) for one in many.drawn_states]
     assert (data.drawn_states, data.of_states) == ((0, 1), "")
+
+
+@pytest.mark.parametrize("policy", ["open_loop", "affine"])
+def test_of_very_many_states_no_more_is_computed_than_is_drawn(policy: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fourteen tanks of which the first is walled and those behind it move ever less."""
+    n = MOST_STATES + 2
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(np.diag(np.full(n, -1.0)) + np.eye(n, k=-1), np.eye(n)[:, :1], 0.1 * np.eye(n)[:, :1]),
+        horizon=1.0,
+        initial_state=np.zeros(n),
+        control=sr.Box([-9.0], [9.0]),
+        disturbance=sr.Box([-1.0], [1.0]),
+        terminal=[sr.Box([0.5, *[-9.0] * (n - 1)], [1.5, *[9.0] * (n - 1)])],
+    )
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 2}, policy=policy)
+    asked: list[int] = []
+    whole = drawing.tube
+
+    def counted(model: Any, theta: Any, times: Any, states: Any = None) -> Any:
+        asked.append(np.size(times) * (n if states is None else len(states)))
+        return whole(model, theta, times, states)
+
+    monkeypatch.setattr(drawing, "tube", counted)
+    experiment, decision = result.experiment, np.asarray(result.decision)
+    shown = drawing._shown(experiment, decision)
+    assert shown is not None and set(shown) == {*range(MOST_STATES)}
+    data = drawing.figure_data(experiment, decision, np.empty(0), (), None, states=shown)
+    assert data.drawn_states == tuple(shown) and data.of_states == f", {MOST_STATES} of {n} states"
+    assert np.isnan(data.tube_lower[MOST_STATES:]).all()
+    assert asked[0] == drawing.ROUGH * n and max(asked[1:]) == MOST_STATES * data.times.size
+    known = result.tube(data.times)
+    np.testing.assert_allclose(data.tube_upper[list(shown)], known.upper[list(shown)], rtol=1e-12)
+    np.testing.assert_allclose(data.state[list(shown)], known.nominal[list(shown)], rtol=1e-12)
 
 
 def test_the_view_contains_the_whole_tube_and_every_wall(data: FigureData) -> None:
