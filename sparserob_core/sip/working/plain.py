@@ -143,7 +143,8 @@ class PlainRows(Working):
 
     def impose(self, violated: Violated) -> int:
         fresh = self._unknown(violated)
-        self.rows, self.guess = self.rows.joined(fresh), None if fresh.h.size else self.guess
+        self.rows = self.rows.joined(fresh)
+        self.guess = None if self.guess is None else _with_more(self.guess, fresh.h.size)
         self.idle = np.concatenate([self.idle, np.zeros(fresh.h.size, dtype=int)])
         return int(fresh.h.size)
 
@@ -178,7 +179,8 @@ class PlainRows(Working):
         return missed.violation / max(float(np.linalg.norm(row.G)), np.finfo(float).tiny)
 
     def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
-        solution = ledger.relaxed.solve(self.rows, self.epsilon, margin)
+        guess = _with_more(answer.solution, self.rows.h.size - answer.rows.h.size)
+        solution = ledger.relaxed.solve(self.rows, self.epsilon, margin, guess)
         if not usable(solution):
             return None
         ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))
@@ -227,6 +229,11 @@ def _fits(ledger: Ledger, x: Array) -> bool:
     """Whether a decision closes the gap and keeps everything that is no family."""
     base = ledger.program.finite
     return not ledger.open(x) and base.missed(x) <= EQUALITY and base.residual(x) <= ALLOWED
+
+
+def _with_more(solution: FiniteSolution, rows: int) -> FiniteSolution:
+    """A solution as a guess where so many rows stand behind those that it knows."""
+    return replace(solution, y=np.concatenate([solution.y, np.zeros(rows)]))
 
 
 def usable(solution: FiniteSolution) -> bool:
