@@ -50,6 +50,7 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_the_input(address):
     assert set(left) <= {"closed"}, "the garbage collector would close it, and wait for locks of whatever it interrupts"
 
 
+@pytest.mark.slow
 def test_what_is_waited_for_is_told_once_it_lasts(monkeypatch, capfd):
     pytest.importorskip("distributed")
     from sparserob_dask import cluster

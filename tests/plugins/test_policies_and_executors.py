@@ -182,6 +182,7 @@ def test_a_policy_of_somebody_else_that_answers_the_last_measurement_is_solved_p
     assert "not loaded" not in next(claim.text for claim in loaded.claims if claim.name == "policy")
 
 
+@pytest.mark.slow
 def test_more_measurements_cost_no_more_and_none_cost_what_an_open_loop_does(tmp_path, plugin):
     policies = [{"name": "recent", "recent": count} for count in (0, 1, 2, 6)] + ["open_loop", "affine"]
     chosen = [one if isinstance(one, str) else {**one, "cost": "nominal"} for one in policies]
@@ -194,6 +195,7 @@ def test_more_measurements_cost_no_more_and_none_cost_what_an_open_loop_does(tmp
     assert sr.check(runs[0].directory).status == "verified"
 
 
+@pytest.mark.slow
 def test_answers_that_are_written_must_be_those_of_the_config_and_of_the_gains(tmp_path, plugin):
     """Fewer answers would prove a higher bound, and more of them allow gains that nobody asked for."""
     theirs = ran(tmp_path / "theirs", {"name": "recent", "recent": 2}, plugin).directory

@@ -198,6 +198,7 @@ def test_plain_lines_say_everything_that_is_known(monkeypatch: pytest.MonkeyPatc
     assert "\x1b" not in stream.getvalue()
 
 
+@pytest.mark.slow
 def test_on_a_terminal_the_bounds_are_live_and_disappear(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = Terminal()
     watching = observer(stream, monkeypatch, patience=0.0)
@@ -299,6 +300,7 @@ def test_on_a_real_terminal_it_shows_and_clears_its_lines_and_quiet_and_json_sil
     assert (shown["--quiet",], shown["--json",]) == ("", "")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_without_a_terminal_quiet_and_json_leave_the_error_stream_empty(command: Command) -> None:
     plain = command("run", "small.yaml", "--no-figures").stderr

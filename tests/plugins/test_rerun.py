@@ -547,6 +547,7 @@ def test_an_outcome_can_be_shown_with_all_that_it_knows(searched: sr.Outcome, tm
     assert sum(chunk.num_rows for chunk in found["/physics/plots/curve"]) == len(searched.result.history) + 1
 
 
+@pytest.mark.slow
 def test_replay_and_watch_refuse_what_they_cannot_do(
     answered: sr.Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -101,6 +101,7 @@ def ended(recorder: int) -> float:
     return time.monotonic() - began
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [0.0, 1.5])
 def test_of_a_run_that_is_killed_everything_that_was_sent_a_second_before_is_in_a_whole_file(
     after: float, tmp_path: Path
@@ -123,6 +124,7 @@ def test_of_a_run_that_is_killed_everything_that_was_sent_a_second_before_is_in_
     assert before or not after
 
 
+@pytest.mark.slow
 def test_half_a_message_and_a_pipe_that_others_hold_open_do_not_keep_a_recorder_alive(tmp_path: Path) -> None:
     file = tmp_path / "x.rrd"
     run, told, recorder = started(half, file)
@@ -160,6 +162,7 @@ def fills(file: Path, told: Connection) -> None:
     told.send(outlet.incomplete)
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_in_mid_run_leaves_no_recording_that_anybody_claims(tmp_path: Path) -> None:
     file = tmp_path / "x.rrd"
     ours, theirs = FORK.Pipe(duplex=False)

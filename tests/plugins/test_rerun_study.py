@@ -174,6 +174,7 @@ def test_the_map_has_every_status_with_its_colour_and_the_words_count_them(confi
     assert "9 of 9 points" in pages(file)[-1]
 
 
+@pytest.mark.slow
 def test_the_picture_grows_and_tells_what_runs_with_its_bounds(config: Path, tmp_path: Path) -> None:
     from sparserob_core.experiment.run.viewer import recorder
 

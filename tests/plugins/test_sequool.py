@@ -51,6 +51,7 @@ def test_the_points_are_those_of_the_rule_written_cell_by_cell(box, budget, hmax
     np.testing.assert_allclose(report.trace.points, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(budget=st.integers(1, 3000))
 def test_the_budget_is_filled_with_the_largest_depth_that_fits(budget):

@@ -403,6 +403,7 @@ def test_weights_that_allow_no_move_are_refused():
         SimulatedAnnealing(one=0.0, few=0.0, full=0.0)
 
 
+@pytest.mark.slow
 def test_the_basin_of_a_shifted_rastrigin_function_is_found_within_800_evaluations_in_most_runs():
     box = sr.Box(np.full(3, -5.12), np.full(3, 5.12))
     found = [search(rastrigin, box, 800, seed).best_value > -0.5 for seed in range(20)]

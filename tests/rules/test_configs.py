@@ -190,6 +190,7 @@ def test_an_infeasible_config_says_which_constraint_is_at_fault_and_when(name: s
     assert re.search(r"x\d\(\d", message), message
 
 
+@pytest.mark.slow
 def test_the_schema_in_the_folder_is_the_schema_of_the_program() -> None:
     import jsonschema
     from ruamel.yaml import YAML

@@ -93,6 +93,7 @@ EXECUTED = [page for page in PAGES if any(block.language in {"bash", "python"} f
 LIGHT = {"README.md"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(LIGHT))
 def test_what_most_readers_try_first_works(page: str, tmp_path: Path, command: Command, monkeypatch) -> None:
     shutil.copytree(ROOT / "configs", tmp_path / "configs")

@@ -103,6 +103,7 @@ def test_a_window_is_bounded_over_time_and_its_envelope_holds_the_truth(tmp_path
     assert {file.name for file in (tmp_path / "out").iterdir()} >= {"bound.json", "bound.png", "config.yaml"}
 
 
+@pytest.mark.slow
 def test_without_walls_the_outputs_are_bounded_and_without_outputs_the_states() -> None:
     states = sr.bound(config())
     assert [(row.constraint, row.sense, row.quantity) for row in states.rows] == [

@@ -147,6 +147,7 @@ def test_a_broken_plugin_is_told_beside_the_list(command: Command) -> None:
     assert " piqp " not in done.stdout
 
 
+@pytest.mark.slow
 def test_the_schema_describes_what_is_installed(command: Command) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     done = command("schema")
@@ -168,6 +169,7 @@ def test_the_schema_describes_what_is_installed(command: Command) -> None:
     assert not validator.is_valid({"problem": {**problem, "horizn": 1}})
 
 
+@pytest.mark.slow
 def test_every_config_of_the_repository_fits_the_schema_also_when_resolved(repository: Path, command: Command) -> None:
     jsonschema = pytest.importorskip("jsonschema")
     from sparserob_core.experiment.config.load import load_config
@@ -222,6 +224,7 @@ def test_the_check_of_a_small_run_imports_neither_sparse_matrices_nor_what_trans
     }
 
 
+@pytest.mark.slow
 def test_a_reader_that_stops_reading_is_no_error(tmp_path: Path) -> None:
     done = subprocess.run(
         f"{sys.executable} -m sparserob_core plugins | head -n 1; exit ${{PIPESTATUS[0]}}",

@@ -276,6 +276,7 @@ observers: []
 """
 
 
+@pytest.mark.slow
 def test_a_limit_ends_a_transcription_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sparserob_core.sip.method.GRACE", 0.0)
     (tmp_path / "large.yaml").write_text(LARGE)
@@ -306,6 +307,7 @@ def test_interrupted_initial_states_leave_true_polygons(tmp_path: Path) -> None:
             assert found.where(vertex) != "outside"
 
 
+@pytest.mark.slow
 def test_of_two_runs_into_one_directory_the_second_ends_at_once(config: Path, tmp_path: Path, command: Command) -> None:
     out = tmp_path / "out"
     with started("run", config, "method.wait=0.2", "method.rounds=500", "--out", out, cwd=tmp_path) as process:

@@ -161,6 +161,7 @@ def test_a_study_is_compared_over_its_problems_and_seeds(study, tmp_path):
     assert (tmp_path / "profiles.png").is_file()
 
 
+@pytest.mark.slow
 def test_the_command_prints_both_tables_and_json(study, tmp_path, command):
     done = command("compare", study, "--measure", "evaluations", "--out", tmp_path / "a.png")
     assert done.returncode == 0, done.stderr

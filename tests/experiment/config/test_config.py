@@ -149,6 +149,7 @@ def test_the_missing_problem_is_the_only_key_without_a_default(config: Path) -> 
     assert refusal(config) == f"{config}:1:1: problem: missing, and it has no default"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "said"),
     [

@@ -321,6 +321,7 @@ def test_whatever_is_wrong_with_an_array_is_an_error_of_the_input_or_none(
         (directory / name).write_bytes(content)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_interrupted_before_its_first_round_was_over_can_be_drawn(copy: Path) -> None:
     empty = {name: np.array([]) for name in read_arrays(copy / "trace.npz")}
     np.savez(copy / "trace.npz", **empty)

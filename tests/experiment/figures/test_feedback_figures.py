@@ -41,6 +41,7 @@ def test_a_run_with_feedback_draws_gains_effort_and_answers(outcome: sr.Outcome)
     assert {f"{name}.{kind}" for name in ("gains", "effort", "answers") for kind in ("png", "pdf")} <= drawn
 
 
+@pytest.mark.slow
 def test_the_tube_of_few_pieces_is_drawn_between_their_ends_too(data: FigureData) -> None:
     assert set(np.round(data.breakpoints, 9)) < set(np.round(data.times, 9))
     assert data.times.size >= 100

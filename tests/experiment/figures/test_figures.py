@@ -197,6 +197,7 @@ def test_bounds_that_are_not_known_yet_are_not_drawn(data: FigureData) -> None:
     assert drawn["upper bound"] == 2
 
 
+@pytest.mark.slow
 def test_a_run_that_ended_in_its_first_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
     only = replace(data, history=data.history[:1], tolerance=None, active_times=np.empty(0), walls=())
     assert len(write_figures(tmp_path, only)) == 6
@@ -230,6 +231,7 @@ def test_equal_steps_are_drawn_as_one() -> None:
     np.testing.assert_array_equal(ends, [0.0, 2.0, 3.0, 6.0])
 
 
+@pytest.mark.slow
 def test_letters_that_no_font_has_are_told_once_and_other_warnings_are_kept(tmp_path, caplog, data):
     pytest.importorskip("matplotlib")
     odd = replace(data, title="Zug \uf8ff Ω")  # a letter of nobody's

@@ -47,6 +47,7 @@ def status(*arguments: object) -> int:
     return int(ended.value.code)
 
 
+@pytest.mark.slow
 def test_a_study_counts_its_loops_and_pays_no_more_than_the_peaks(outcome) -> None:
     found = sr.loop(outcome, trajectories=3)
     assert found.laws == {"adversary": 2, "iid": 3, "vertices": 3, "slow": 3, "neighbours": 3}

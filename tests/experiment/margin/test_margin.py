@@ -129,6 +129,7 @@ def test_the_cost_grows_with_the_uncertainty_and_is_bounded_from_both_sides_at_e
     assert (np.diff(costs, 2) >= -1e-6).all()  # convex in the factor
 
 
+@pytest.mark.slow
 def test_wider_terminal_sets_bear_larger_disturbances():
     found = [
         sr.margin(config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [0.3, width]}]))

@@ -69,6 +69,7 @@ def test_the_figures_that_a_run_leaves_are_those_that_are_drawn_again(tmp_path: 
     assert {file.name: file.read_bytes() for file in draw_run(outcome.directory)} == left
 
 
+@pytest.mark.slow
 def test_a_figure_that_cannot_be_drawn_is_a_remark_and_costs_no_other(
     searched: sr.Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -114,6 +114,7 @@ def test_the_batches_of_a_run_are_its_trace(watched: Callable[..., sr.Outcome]) 
         assert set(event.notes) >= {"temperature", "accepted", "scale", "stands", "cycle", "move"} or event.total < 20
 
 
+@pytest.mark.slow
 def test_a_round_tells_the_decision_its_violations_and_the_cuts_that_came_and_went(
     watched: Callable[..., sr.Outcome],
 ) -> None:

@@ -117,6 +117,7 @@ def test_a_result_under_feedback_is_saved_with_its_gains(tmp_path: Path) -> None
     assert len(result.plot("gains").axes) > 1
 
 
+@pytest.mark.slow
 def test_an_infeasible_result_is_saved_with_its_reason(tmp_path: Path) -> None:
     result = sr.solve(cart(initial_state=[5.0, 0.0], path=[]), control=PIECES)
     assert result.status == "infeasible"

@@ -217,6 +217,7 @@ def test_what_is_finished_is_not_run_again(counting: Path, tmp_path: Path) -> No
     assert costs(study) == {1: cost_of(1), 2: cost_of(2)}
 
 
+@pytest.mark.slow
 def test_a_further_value_runs_only_what_is_new(counting: Path, tmp_path: Path) -> None:
     sr.sweep(counting, {"method.number": [1, 3]}, out=tmp_path / "out")
     study = sr.sweep(counting, {"method.number": [1, 2, 3], "seed": [0]}, out=tmp_path / "out")
@@ -392,6 +393,7 @@ def test_a_point_that_cannot_be_built_fails_alone(counting: Path, tmp_path: Path
         study.outcomes[1]
 
 
+@pytest.mark.slow
 def test_a_point_at_a_time_limit_is_run_again_and_a_finished_one_is_not(counting: Path, tmp_path: Path) -> None:
     axes = {"method.number": [1, 2], "method.wait": [0.4]}
     first = sr.sweep(counting, axes, {"limits.seconds": 0.1}, out=tmp_path / "out")
@@ -403,6 +405,7 @@ def test_a_point_at_a_time_limit_is_run_again_and_a_finished_one_is_not(counting
     assert calls(counting) == {1: 2, 2: 2}
 
 
+@pytest.mark.slow
 def test_an_answer_at_a_time_limit_is_a_row_and_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sparserob_core.sip.method.GRACE", 60.0)  # the transcription is let finish
     file = tmp_path / "real.yaml"

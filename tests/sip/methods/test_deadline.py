@@ -262,6 +262,7 @@ def test_a_limit_before_a_control_is_in_its_set_is_no_failure(monkeypatch):
     assert np.isfinite(result.cost) and result.upper_bound == np.inf
 
 
+@pytest.mark.slow
 def test_a_single_step_that_takes_long_is_ended_too():
     def worst(x):
         time.sleep(30.0)
@@ -307,6 +308,7 @@ def test_an_interrupt_in_a_round_returns_the_decision_of_the_round_before(rounds
     assert result.counts["rounds"] == rounds
 
 
+@pytest.mark.slow
 def test_the_search_over_tuples_keeps_its_best_tuple_at_the_limit(tmp_path):
     overrides = {
         "observers": [],
