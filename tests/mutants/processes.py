@@ -25,6 +25,7 @@ from tests.mutants.sites import Mutant
 
 PATIENCE, AT_LEAST = 3.0, 30  # times the processor time of the unchanged tests, and seconds: only loops that never end
 FIRST_STAGE = 3000  # seconds of the processor: four times what all of the first stage takes
+MEMORY = 4 * 2**30  # bytes, which no test of a folder comes near: a mutant may make arrays without end
 IDLE = 10.0  # times the seconds of the processor that a process may take of the clock: a busy machine, not a dead one
 STAMPS = iter(range(1_000_000_000, 2_000_000_000, 2))  # of changed files, so that no compiled one is taken for it
 
@@ -154,6 +155,7 @@ def _moved(copy: Path, limit: int) -> None:
     os.dup2(output, 1)
     os.dup2(output, 2)
     resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5))
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     here = [str(copy), str(copy / "plugins")]
     sys.path[:] = [*here, *(path for path in sys.path if path not in ("", str(Path.cwd())))]
     os.environ["PYTHONPATH"] = os.pathsep.join(here)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -221,10 +221,12 @@ class Duality:
         price: Price | None,
         touched: Sequence[arb_mat] | None = None,
         lengths: bool = True,
+        norms: Array | None = None,
     ) -> arb:
         """The bound that multipliers ``y`` of ``rows`` give; with the ``price``, or without as a proof of
         infeasibility. Quadratic terms, and norms, are replaced by their tangents at the control ``touched (m, 1)`` on
-        every piece. ``lengths``: whether absolute values of this control are charged, or of another one."""
+        every piece, norms also by the vectors ``norms (m, K)``. ``lengths``: whether absolute values of this control
+        are charged, or of another one."""
         tangent = None if price is None or touched is None or not price.is_quadratic else price.tangent(touched)
         constant, slopes = self.summed(rows, pieces, tangent)
         charges = price if lengths else None
@@ -233,34 +235,45 @@ class Duality:
         charged = self.charged(rows, free if charges is None else charges.costs)
         for k, (costs, slope) in enumerate(zip(charged, slopes, strict=True)):
             if groups and touched is not None:
-                constant = constant + self._least_of_groups(costs, slope, groups, touched[k].entries())
+                offered = None if norms is None else [_exact(v) for v in norms[:, k]]
+                constant = constant + self._least_of_groups(costs, slope, groups, touched[k].entries(), offered)
             else:
                 constant = constant + known(self.problem.control).least(costs, costs, slope)
         return constant
 
     def _least_of_groups(
-        self, weights: list[arb], slope: list[arb], groups: Sequence[Sequence[int]], at: Sequence[arb]
+        self,
+        weights: list[arb],
+        slope: list[arb],
+        groups: Sequence[Sequence[int]],
+        at: Sequence[arb],
+        offered: Sequence[arb] | None,
     ) -> arb:
         """At most the least cost with norms of groups: ``weight |s| >= d's`` for any ``|d| <= weight``, that which the
-        slope asks for or that of the tangent; each group the better one, for a set that is a box, else all the same."""
+        slope asks for, that of the tangent or one that is ``offered``; each group the best one, for a set that is a
+        box, else all the same.
+
+        In a corner of slanted sides the one that bounds most is between these two: the multipliers of the sides take a
+        part of what the slope asks for, and a tangent at a control that is off by a little tilts the corner.
+        """
+        asked = [_exact(-float(s.mid())) for s in slope]
         offers = []
-        for chosen in (_against, _along):
+        for chosen, wanted in ((_within, asked), (_lengthened, at), *([] if offered is None else [(_within, offered)])):
             tilted, left = list(slope), list(weights)
             for block in groups:
-                d = chosen([slope[c] for c in block], [at[c] for c in block], weights[block[0]])
+                d = chosen([wanted[c] for c in block], weights[block[0]])
                 for c, push in zip(block, d, strict=True):
                     tilted[c], left[c] = slope[c] + push, _exact(0.0)
             offers.append((left, tilted))
         shape = known(self.problem.control)
         if not isinstance(shape, Boxed):
-            values = [shape.least(left, left, tilted) for left, tilted in offers]
-            return values[0].max(values[1])
+            return _most([shape.least(left, left, tilted) for left, tilted in offers])
         alone = [[c] for c in range(len(slope)) if not any(c in block for block in groups)]
         parts = [shape.shares_of_least(left, left, tilted) for left, tilted in offers]
         found = _exact(0.0)
         for block in (*groups, *alone):
             values = [sum((part[c] for c in block), _exact(0.0)) for part in parts]
-            found = found + values[0].max(values[1])
+            found = found + _most(values)
         return found
 
     def summed(
@@ -362,18 +375,19 @@ def _differences(integrals: Sequence[list[arb] | None], width: int) -> list[list
     ]
 
 
-def _against(slope: Sequence[arb], at: Sequence[arb], weight: arb) -> list[arb]:
-    """The vector no longer than the weight that is nearest to ``-slope``; of its middle, which is exact."""
-    wanted = [_exact(-float(s.mid())) for s in slope]
-    return wanted if _squares(wanted) <= weight * weight else _lengthened(wanted, weight)
+def _most(values: Sequence[arb]) -> arb:
+    """The largest of what is proven in several ways."""
+    return reduce(lambda one, other: one.max(other), values)
 
 
-def _along(slope: Sequence[arb], at: Sequence[arb], weight: arb) -> list[arb]:
-    """The vector as long as the weight in the direction of a control; 0 where that is 0."""
-    return _lengthened([_exact(float(u.mid())) for u in at], weight)
+def _within(vector: Sequence[arb], length: arb) -> Sequence[arb]:
+    """A vector of exact numbers, or where it is longer one in its direction that is as long as that."""
+    return vector if _squares(vector) <= length * length else _lengthened(vector, length)
 
 
 def _lengthened(vector: Sequence[arb], length: arb) -> list[arb]:
+    """The vector in a direction, of its middle, that is as long as that; 0 where the direction is 0."""
+    vector = [_exact(float(v.mid())) for v in vector]
     size = _squares(vector)
     return [length * v / size.sqrt() for v in vector] if size > 0 else [_exact(0.0) for _ in vector]
 

@@ -30,8 +30,8 @@ def multiplied(case: Case, priced: bool) -> arb:
     data = case.certificate.get("multipliers")
     rows, pieces = weighted(case, data)
     price, touched = (case.price, touched_by(case, data)) if priced else (None, None)
-    lengths = case.charge not in (PEAK, WORST)
-    return case.duality.bound(rows, pieces, price, touched, lengths) + answers_of(case).least(rows, priced)
+    lengths, norms = case.charge not in (PEAK, WORST), norms_of(case, data) if priced else None
+    return case.duality.bound(rows, pieces, price, touched, lengths, norms) + answers_of(case).least(rows, priced)
 
 
 def weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
@@ -73,6 +73,17 @@ def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
         raise Broken(f"the tangent's control has shape {at.shape}, expected {expected}")
     case.price.convex()
     return case.on_pieces(at)
+
+
+def norms_of(case: Case, data: object) -> Array | None:
+    """The vectors ``(m, K)`` that the certificate offers in the place of norms of the control, if it does."""
+    said = data.get("norms") if isinstance(data, Mapping) else None
+    if said is None:
+        return None
+    offered, expected = numbers(said, "norms"), (case.problem.system.controls, case.control.pieces)
+    if offered.shape != expected:
+        raise Broken(f"the vectors for norms have shape {offered.shape}, expected {expected}")
+    return offered
 
 
 def rows_of(case: Case, entry: object) -> list[tuple[float, Row]]:

@@ -80,7 +80,8 @@ def _added(model: Transcription, result: Result) -> float:
 
 
 def _quadratic(model: Transcription, result: Result) -> float:
-    """The numbers that are added up to the tangent of the quadratic terms, at its largest."""
+    """The numbers that are added up to the tangent of the quadratic terms, at its largest: where the slope ``P at`` is
+    small because they cancel, as along a flat direction of ``P``, their rounding is not."""
     finite, at = model.program.finite, result.dual.at
     if finite.P is None or at is None:
         return 0.0
@@ -88,7 +89,7 @@ def _quadratic(model: Transcription, result: Result) -> float:
     pieces = np.repeat(reach, model.control.pieces)
     far = pieces if finite.S is None else np.abs(np.linalg.pinv(model.control.values.T)).sum(axis=1)
     far = far if finite.S is None else np.kron(reach, far)
-    bent, at, q = (np.abs(model.nominal(each)) for each in (np.asarray(finite.P @ at), at, finite.q))
+    bent, at, q = (np.abs(model.nominal(each)) for each in (np.asarray(abs(finite.P) @ np.abs(at)), at, finite.q))
     return float(abs(finite.constant) + 0.5 * at @ bent + (q + bent) @ far)
 
 

@@ -101,6 +101,7 @@ def _unread(case: Case) -> set[str]:
         touched = touched or multipliers.get("tangent") is None
         unused = case.control.functions >= case.control.pieces and multipliers.get("pieces") is not None
         told = {"constraints", "equalities", *(() if unused else ("pieces",)), *(("tangent",) if touched else ())}
+        told |= {"norms"} if multipliers is not of_activity and case.problem.cost.group is not None else set()
         left |= _besides("multipliers", multipliers, told)
         entries = multipliers.get("constraints")
         for entry in entries if isinstance(entries, list) else []:

@@ -36,7 +36,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a
     normal direction (of the state, or of the control and its steps), of equalities, and of the control's pieces where
     the dictionary is not that of their indicators;
-    ``tangent``: the control at which the bound replaces quadratic terms and norms of the cost by their tangents.
+    ``tangent``: the control at which the bound replaces quadratic terms and norms of the cost by their tangents;
+    ``norms``: vectors that it may put in the place of norms, on every piece, where the control's set has slanted sides.
     ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown, to
     ``tolerance`` in each row's own unit (decision 0016); a direction ``z`` of a curved set stands for ``z normals``.
     ``fewest_active``: between what the least share of time lies that any admissible control must act, with the
@@ -195,6 +196,11 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
         "pieces": _on_pieces(problem, z, experiment.control.pieces),
         **(
             {}
+            if z is None or problem.cost.group is None
+            else {"norms": _of_norms(problem, z, experiment.control.pieces)}
+        ),
+        **(
+            {}
             if dual.at is None
             else {"tangent": experiment.transcription.nominal(dual.at).reshape(problem.system.controls, -1)}
         ),
@@ -216,6 +222,13 @@ def _on_pieces(problem: OptimalControlProblem, z: Array | None, pieces: int) -> 
     m, (sides, _) = problem.system.controls, slanted(problem.control)
     rows = z[: (m + sides.shape[0]) * pieces].reshape(-1, pieces)
     answer: Array = rows[:m] + sides.T @ rows[m:]
+    return answer
+
+
+def _of_norms(problem: OptimalControlProblem, z: Array, pieces: int) -> Array:
+    """The multipliers of the control ``(m, K)`` on its ``pieces`` without those of its set's slanted sides: what the
+    bound puts in the place of the norms, which neither the slopes nor the tangent tell closely."""
+    answer: Array = z[: problem.system.controls * pieces].reshape(-1, pieces)
     return answer
 
 

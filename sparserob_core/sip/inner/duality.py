@@ -223,9 +223,10 @@ def _terms(
     if curvature is None and program.P is not None:
         at = np.zeros(program.n) if at is None else at
         bent = np.asarray(program.P @ at)
+        added = np.asarray(abs(program.P) @ np.abs(at))  # what may cancel in the slope and in the square, and rounds
         constant -= 0.5 * float(at @ bent)
-        magnitude += 0.5 * abs(float(at @ bent))
-        slope, noise = slope + bent, noise + abs(program.P) @ np.abs(at)
+        magnitude += 0.5 * float(np.abs(at) @ added)
+        slope, noise = slope + bent, noise + added
     if program.P is None:
         curvature = None
     if program.S is None:

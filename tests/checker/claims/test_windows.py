@@ -34,6 +34,7 @@ from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.polytope import Polytope
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
 
 TOO_MUCH, NOTHING = 5e-9, 3e-10
@@ -615,6 +616,33 @@ def test_a_bound_with_groups_uses_the_length_of_the_slope():
         found = float(multipliers.multiplied(case_of(certificate=said, control=control, **plane), priced=True).mid())
         assert found <= 1.1 - 2 * 0.1 * 1.0 + 1e-12
         assert found >= 1.1 - 2 * 0.1 * 1.5
+
+
+def test_a_vector_that_is_offered_for_a_norm_closes_the_bound_in_a_corner_and_never_passes_the_least_cost():
+    """Slopes that drive a control of two channels into slanted sides, from where its length is worth the corner."""
+    rng, corners = np.random.default_rng(3), np.array([[1.0, 0.2], [0.1, 0.9], [-1.0, 0.3], [-0.4, -0.8], [0.7, -0.9]])
+    sides = np.roll(corners, -1, axis=0) - corners
+    normals = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
+    plane = {"system": LinearSystem(np.zeros((2, 2)), np.eye(2)), "initial_state": [0.6, 0.8], "disturbance": None}
+    case = case_of(
+        decision=((0.0, 0.0), (0.0, 0.0)), control=Polytope(normals, (normals * corners).sum(axis=1)),
+        cost=sr.Cost(group="all"), **plane,
+    )  # fmt: skip
+    shares = np.linspace(0.0, 1.0, 401)[:, None]
+    ends = np.roll(corners, -1, axis=0)
+    edges = np.concatenate([(1.0 - shares) * a + shares * b for a, b in zip(corners, ends, strict=True)])
+    for _ in range(20):
+        slope, weight = rng.normal(size=2) * 3.0, rng.uniform(0.2, 1.5)
+        values = weight * np.linalg.norm(edges, axis=1) + edges @ slope
+        least, best = min(0.0, float(values.min())), edges[values.argmin()]
+        told = [arb(float(v)) for v in slope]
+        given = ([arb(weight)] * 2, told, [[0, 1]], [arb(0.3), arb(0.1)])
+        bounds = [
+            float(case.duality._least_of_groups(*given, None if one is None else [arb(float(v)) for v in one]).mid())
+            for one in (None, weight * best / np.linalg.norm(best), 9.0 * rng.normal(size=2), -slope)
+        ]
+        assert all(bound <= least + 1e-12 for bound in bounds)
+        assert bounds[1] == max(bounds) and (least == 0.0 or bounds[1] >= least - 1e-3 * weight)
 
 
 def test_numbers_that_are_far_apart_are_computed_with_more_bits():

@@ -95,3 +95,19 @@ def test_what_errors_of_execution_bring_to_a_row_is_added_up_too() -> None:
     result = SimpleNamespace(dual=SimpleNamespace(cuts=[Cut("terminal", np.array([2.0]), 1, 1.0)], mu=np.zeros(0)))
     # the beginning, 1, and what a command of 3 and 5 % of it bring in 2 units of time
     assert rounding._added(model, result) == pytest.approx(1.0 + 6.0 + 0.3)  # type: ignore[arg-type]
+
+
+def test_what_cancels_in_the_slope_of_a_quadratic_cost_is_added_up_too() -> None:
+    dictionary = sr.Dictionary.indicators([0.0, 1.0])
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0.0]], [[1.0, 1.0]]),
+        horizon=1.0,
+        initial_state=[-1.0],
+        control=sr.Box([-3.0, -2.0], [3.0, 2.0]),
+        terminal=[sr.Box([-0.1], [0.1])],
+        cost=sr.Cost(l1=0.0, control={"R": [[1.0, 1.0], [1.0, 1.0]]}),
+    )
+    model = prepare(problem, dictionary, dictionary)
+    result = SimpleNamespace(dual=SimpleNamespace(at=np.array([1.0, -1.0])))
+    # u'Ru has the slope 2 R u, which is (2 - 2, 2 - 2): four numbers of 2, at controls of 3 and 2, and of 1 in u'Ru
+    assert rounding._quadratic(model, result) == pytest.approx(4.0 * 3.0 + 4.0 * 2.0 + 4.0)  # type: ignore[arg-type]

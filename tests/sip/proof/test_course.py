@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Enclosure, Separation
 from sparserob_core.sip.proof import branch_and_bound
-from sparserob_core.sip.proof.branch_and_bound import Course, _at_rest, _halved, _towards, prove_family
+from sparserob_core.sip.proof.branch_and_bound import Course, _at_rest, _halved, _towards, prove_family, supremum
 
 
 def family(bounds, violation=-1.0, **more):
@@ -155,3 +156,57 @@ def test_cells_that_are_cut_towards_a_peak_fill_what_they_were_and_are_short_whe
     # far from every peak, or without any bend, halves are enough: those are for others to make
     far = Separation(np.array([[3.1]]), np.array([0]), np.array([-1.0]), np.inf)
     assert _towards(far, lower[:1], upper[:1], bend[:1], 1e-30 * bend[:1]) is None
+
+
+@pytest.mark.parametrize("ratio", [4.0, 9.0, 64.0])
+def test_every_part_towards_a_smooth_peak_is_closed_by_its_bound_and_there_are_few(ratio):
+    """The violation is ``top - c (s - a)^2 / 2``; a cell is bounded by the larger of its ends and its length squared
+    times an eighth of ``ratio c``, as chords and bounds of second derivatives do."""
+    rng, most = np.random.default_rng(int(ratio)), 0
+    for _ in range(60):
+        low, width, c = rng.uniform(-2.0, 2.0), 2.0 ** rng.uniform(-3.0, 3.0), 10.0 ** rng.uniform(-2.0, 2.0)
+        high = low + width
+        place = rng.uniform(0.2, 0.8) if ratio > 10.0 else rng.choice([rng.uniform(), 0.01, 0.99])
+        at, top = low + width * place, float(rng.choice([TOLERANCE, 0.0, -1e-7]))
+
+        def bounds(a, b, at=at, top=top, c=c):
+            ends = np.maximum(*(top - c * (s - at) ** 2 / 2.0 for s in (a, b)))
+            return ends + ratio * c * (b - a) ** 2 / 8.0
+
+        bend = np.array([ratio * c * width**2 / 8.0])
+        peaks = Separation(np.array([[at]]), np.array([0]), np.array([top]), np.inf)
+        parts = _towards(peaks, np.array([[low]]), np.array([[high]]), bounds(np.array([low]), np.array([high])), bend)
+        assert parts is not None
+        a, b = (ends.ravel() for ends in parts)
+        allowed = max(
+            TOLERANCE, top + TOLERANCE / 16.0
+        )  # a peak as high as is allowed is cut down to a sixteenth of it
+        assert (bounds(a, b) <= allowed * (1.0 + 1e-9)).all()
+        grow = 0.5 if min(at - low, high - at) <= width / 8 else 2.0 * 0.8 / np.sqrt(ratio)
+        short = 0.8 / 2.0 * width * np.sqrt(max(TOLERANCE - top, TOLERANCE / 16.0) / bend[0])
+        sides = [np.log(max(side / short, 1.0)) / np.log1p(grow) for side in (at - low, high - at)]
+        most = max(most, a.size - sum(sides))
+    assert most <= 4.0
+
+
+def test_a_family_without_an_enclosure_has_no_supremum():
+    made = replace(family(lambda a, b: a), enclosure=None)
+    with pytest.raises(NotEnclosable, match="wall offers no enclosure"):
+        supremum(made, np.zeros(1), 0.1)
+
+
+def test_batches_that_take_long_are_told_of_every_second(monkeypatch):
+    """A bound takes 0.7 s: the first batch is told of with the second one, and so on."""
+    clock, told = [0.0], []
+    monkeypatch.setattr(branch_and_bound.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(branch_and_bound, "BATCH", 2)
+
+    def slow(a, b):
+        clock[0] += 0.7
+        return -a
+
+    course = Course(family(slow), told.append, 1000, Deadline(), started=0.0, told=0.0)
+    lower, upper = cells(*np.linspace(0.0, 8.0, 11))
+    bounds, _, bend = branch_and_bound._bounded(course, np.zeros(1), lower, upper)
+    assert bounds.tolist() == (-lower.ravel()).tolist() and bend is None
+    assert [(one.examined, one.bound, one.cells) for one in told] == [(4, 0.0, 10), (8, 0.0, 10)]
