@@ -204,7 +204,6 @@ def test_minimum_attention_takes_a_list(tmp_path):
         ([{"set": {"box": 0.1}, "from": 1.5, "to": 1.0}], "disturbance.0"),
         ([{"set": {"box": 0.1}, "to": 3.0}], "disturbance.0"),
         ([{"set": {"box": 0.1}, "from": -1.0}], "disturbance.0.from"),
-        ([{"set": {"box": 0.1}, "to": 1.0, "class": "measurable"}], "disturbance.0"),
         ("all", "disturbance"),
     ],
 )

@@ -309,14 +309,6 @@ def test_wrong_pieces_are_named_with_their_key(system: dict[str, Any], said: str
         sr.run({**config, "observers": []}, figures=False)
 
 
-def test_measurable_disturbances_of_a_switched_system_are_refused_at_once() -> None:
-    config = {"problem": {**SWITCHED, "disturbance_class": "measurable"}, "dictionaries": {"control": pieces(5)}}
-    with pytest.raises(
-        sr.InputError, match=r"disturbance_class: expected piecewise_constant where the system has pieces"
-    ):
-        sr.run({**config, "observers": []}, figures=False)
-
-
 def test_a_known_piece_may_follow_an_uncertain_one() -> None:
     uncertain = sr.LinearSystem(lambda p: np.array([[p[0]]]), [[1.0]], parameters=sr.Box([-1.0], [1.0]))
     system = sr.SwitchedSystem([(1.0, sr.LinearSystem([[0.0]], [[1.0]], c=[0.5])), (2.0, uncertain)])

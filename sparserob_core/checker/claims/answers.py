@@ -23,7 +23,6 @@ from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along
-from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -84,18 +83,15 @@ class Answers:
     @cached_property
     def loop(self) -> ClosedLoop:
         """The system under the nominal control and the gains."""
-        return self._loop(self.case.theta, self.gains)
+        return self._loop(self.case.pieces, self.gains)
 
-    def _loop(self, nominal: Array, gains: Array, changes: list[float] | None = None) -> ClosedLoop:
+    def _loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> ClosedLoop:
         """The loop; where ``changes`` are given, under disturbances that jump there only."""
         case = self.case
-        system, answers = case.problem.system, case.answering and not case.measurable
-        if system.parameter_count or not (answers or isinstance(system, LinearSystem)):
+        if case.problem.system.parameter_count:
             raise Unchecked("the checker knows feedback and measurable disturbances of known systems only")
-        if not answers and not (case.control.is_indicators and system.delay == 0.0):
-            raise Unchecked(
-                "of measurable disturbances the checker knows controls of their own on every piece, undelayed"
-            )
+        if case.answering and case.measurable and (case.problem.system.delay or case.problem.system.switches):
+            raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
         held = (changes or []) if case.measurable else (case.changes or [])
         measured = case.problem.measurements if case.answering else None
         if measured is not None and case.measurable:
@@ -214,8 +210,7 @@ class Answers:
     @cached_property
     def at_rest(self) -> ClosedLoop:
         """The system without any control, under the disturbances of the problem."""
-        K, m = self.case.control.pieces, self.case.problem.system.controls
-        return self._loop(np.zeros((m, K)), self._none)
+        return self._loop(self._still, self._none)
 
     def least(self, rows: Sequence[tuple[float, Row]], priced: bool) -> arb:
         """At most what gains, and peaks or an effort that are charged, add to the sum of ``rows`` times their
@@ -347,8 +342,13 @@ class Answers:
         return self._resting([float(t) for a, b in ends for t in a + parts * (b - a)])
 
     def _resting(self, changes: list[float] | None) -> ClosedLoop:
-        K, m = self.case.control.pieces, self.case.problem.system.controls
-        return self._loop(np.zeros((m, K)), self._none, changes)
+        return self._loop(self._still, self._none, changes)
+
+    @property
+    def _still(self) -> list[arb_mat]:
+        """No control on every piece."""
+        none = stacked([balls([0.0])] * self.case.problem.system.controls)
+        return [none] * self.case.control.pieces
 
     def named(self, entry: Mapping[str, Any], name: str) -> Named:
         """The deviations that an entry of a certificate names, under measurable disturbances of one that jumps where it

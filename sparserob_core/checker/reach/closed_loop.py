@@ -54,15 +54,15 @@ def middle(shape: ConvexSet) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """A known system from ``initial_state`` under the nominal control ``(m, K)`` and ``gains (K, K, m, d)``; ``grid``:
-    every breakpoint; ``breakpoints``: those of the control; ``changes``: where the disturbance may jump; ``initial``:
-    the set of deviations of the initial state; ``before (m,)``: what acts until a delay of the control is over;
-    ``measured``: what is seen of the state at every breakpoint, with the ``observer (K, d, p)`` that makes innovations
-    of it, of all of the state where there is none."""
+    """A known system from ``initial_state`` under the ``nominal`` control, ``(m, 1)`` on each of its ``K`` pieces, and
+    ``gains (K, K, m, d)``; ``grid``: every breakpoint; ``breakpoints``: those of the control; ``changes``: where the
+    disturbance may jump; ``initial``: the set of deviations of the initial state; ``before (m,)``: what acts until a
+    delay of the control is over; ``measured``: what is seen of the state at every breakpoint, with the ``observer (K,
+    d, p)`` that makes innovations of it, of all of the state where there is none."""
 
     system: System
     initial_state: list[float]
-    nominal: Array
+    nominal: Sequence[arb_mat]
     gains: Array
     grid: list[float]
     breakpoints: list[float]
@@ -343,8 +343,9 @@ class ClosedLoop:
         from flint import arb
 
         none = [arb(0)] * self.starts[-1]
-        given = (self.before, [none] * len(self.before)) if k < 0 else (self.nominal[:, k], self.effects[k])
-        return stacked([[arb(float(v)), *row] for v, row in zip(*given, strict=True)])
+        if k < 0:
+            return stacked([[arb(float(v)), *none] for v in self.before])
+        return stacked([[v, *row] for v, row in zip(self.nominal[k].entries(), self.effects[k], strict=True)])
 
     def answers(self, k: int) -> arb_mat:
         """The answers on a piece of the control without what is nominal, ``(m, 1 + Q)``, the first column 0."""

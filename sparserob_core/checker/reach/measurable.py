@@ -227,7 +227,7 @@ class MeasurableLoop(ClosedLoop):
     """`ClosedLoop` under measurable disturbances. Its deviations are what they make of the state by the end of every
     piece of the grid, ``(d,)`` each, and that of the initial state."""
 
-    _kernels: dict[tuple[float, bool], Kernel] = field(default_factory=dict, repr=False)
+    _kernels: dict[tuple[int, float, bool], Kernel] = field(default_factory=dict, repr=False)
 
     @property
     def blocks(self) -> int:
@@ -256,17 +256,18 @@ class MeasurableLoop(ClosedLoop):
         assert self.shape is not None
         nominal = np.max([np.abs(middles(drive)[:, 0]) for drive in self.drives], axis=0)
         far = np.array(known(self.shape).radius) + np.abs(self.middle)
-        return np.asarray(nominal + np.abs(middles(self.parts["E"])) @ far)
+        return np.asarray(nominal + np.max([np.abs(middles(mode["E"])) @ far for mode in self.modes], axis=0))
 
     def kernel(self, piece: int) -> Kernel:
         """That of a piece."""
         from flint import arb
 
         start, stop = self.grid[piece], self.grid[piece + 1]
-        exact = self._exact(start, stop, stop - start)
-        key = (stop - start, True) if exact else (float(piece), False)
+        exact, mode = self._exact(start, stop, stop - start), self.mode(start)
+        key = (mode, stop - start, True) if exact else (mode, float(piece), False)
         if key not in self._kernels:
-            self._kernels[key] = Kernel.of(self.parts["A"], self.parts["E"], arb(stop) - arb(start), self.own)
+            A, E = self.modes[mode]["A"], self.modes[mode]["E"]
+            self._kernels[key] = Kernel.of(A, E, arb(stop) - arb(start), self.owns[mode])
         return self._kernels[key]
 
     @cached_property
@@ -275,10 +276,13 @@ class MeasurableLoop(ClosedLoop):
         found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
             found[0][self.blocks] = self._identity
-        for piece in range(self.blocks):
-            k, _ = self._places(piece)
+        later: tuple[int, arb_mat] = (K, self._identity)  # the piece of the control, and what is left of it
+        for piece in reversed(range(self.blocks)):
+            k = self.on(piece)
+            left = later[1] if later[0] == k else self._identity
             if k + 1 < K:
-                found[k + 1][piece] = self._held(self.grid[piece + 1], self.breakpoints[k + 1])[0]
+                found[k + 1][piece] = left
+            later = k, left * self._held(self.grid[piece], self.grid[piece + 1])[0]
         return found
 
     def _entered(self, rows: list[list[arb]], block: int, E: arb_mat) -> None:

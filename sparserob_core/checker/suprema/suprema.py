@@ -21,6 +21,7 @@ from sparserob_core.checker.reach.adjoint import Worst
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.sides import Bounded, Sides
+from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array
@@ -186,7 +187,7 @@ def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Wor
     if followed is not None:
         value = followed.along(time, deviation, changes, signal)
         return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
-    state = reached(case, time, parameter, entry.get("disturbance"), entry.get("deviation"))
+    state = reached(*_following(case, changes, signal), time, parameter, deviation=entry.get("deviation"))
     direction = window.split(asked.direction)[0]
     total = sum((a * x for a, x in zip(balls(direction), state, strict=True)), balls([0.0])[0])
     return below(total + low), above(total + high)
@@ -218,10 +219,20 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
     return changes, signal
 
 
+def _following(case: Case, changes: Array, signal: Array | None) -> tuple[Case, object]:
+    """The case whose grid has the ``changes`` of a signal, and the signal on the pieces of that grid: a measurable one
+    that is constant between them is one of a dictionary with these pieces."""
+    if signal is None:
+        return case, None
+    if case.measurable:
+        problem = replace(case.problem, disturbance_class="piecewise_constant")
+        case = replace(case, problem=problem, disturbance=Dictionary.indicators(changes))
+    starts = np.array(case.grid[:-1])
+    return case, signal[:, np.searchsorted(changes, starts, side="right") - 1].tolist()
+
+
 def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
     """As `_proven`, over the parameters and pieces of the system, in cells of times and parameters."""
-    if case.measurable:
-        raise Unchecked("measurable disturbances of a system with parameters or pieces are not followed")
     window = asked.window
     alone = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))
     found = alone.seen.basis

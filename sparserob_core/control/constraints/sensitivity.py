@@ -14,6 +14,7 @@ import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.functional import CHUNK
+from sparserob_core.control.response.measurable import STEP
 from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.control.response.sensitivity_system import tangent
 from sparserob_core.control.response.varying.expansion import Expansion
@@ -108,8 +109,9 @@ class Sensitivity:
     less the support point of ``c``, across ``z``; 0 at ``z = 0``. Where the worst disturbance (or the support point) is
     not unique there is a kink too, and the derivative is that of one of them.
 
-    Measurable disturbances: the derivative in time is in closed form, ``h_W(E'e^{A't} c)`` for the support function;
-    those in parameters and directions are differences of the support function, two tables of integrals for each.
+    Measurable disturbances: the derivative in time is in closed form, ``h_W(E'e^{A't} c)`` for the support function,
+    where the system stays the same; elsewhere, and in parameters and directions, derivatives are differences of the
+    support function.
     Coordinates that cannot move, as the time of a terminal constraint, have derivative 0.
     """
 
@@ -242,8 +244,14 @@ class Sensitivity:
 
     def _sigma_slopes(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:
         """What measurable disturbances add to the derivatives in time, parameters and directions."""
-        support = self.constraint.functionals.measurable
-        in_time = support.bound.support((at.free[:, :1] @ at.W[:, 0])[:, 0])[:, None]
+        support, grid = self.constraint.functionals.measurable, self._response.grid
+        if grid.mode is None:
+            in_time = support.bound.support((at.free[:, :1] @ at.W[:, 0])[:, 0])[:, None]
+        else:  # of what earlier systems did there is no closed form
+            ends, step = grid.breakpoints[[at.now, at.now + 1]], STEP * float(grid.breakpoints[-1])
+            low, high = np.clip([times - step, times + step], *ends)
+            moved = support(high, at.direction, parameters) - support(low, at.direction, parameters)
+            in_time = (moved / (high - low))[:, None]
         in_parameters, in_shares = np.zeros((times.size, self._nu)), np.zeros(at.shares.shape)
         if self._nu:
             box = self.constraint.parameters.box

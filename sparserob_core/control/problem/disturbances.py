@@ -69,14 +69,6 @@ def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tupl
                 got=one.kind,
             )
     windows = [_window(f"disturbance.{i}", one, horizon) for i, one in enumerate(every)]
-    for i, window in enumerate(windows):
-        if kind == "measurable" and window != (0.0, horizon):
-            raise InputError(
-                path=f"disturbance.{i}",
-                expected="a measurable disturbance that acts all the time: in a window only piecewise constant ones are"
-                " proven",
-                got=f"from {window[0]:g} to {window[1]:g}",
-            )
     sets = [
         _checked(f"disturbance.{i}.set", one.set, one.entering(f"disturbance.{i}", system.modes[0]))
         for i, one in enumerate(every)

@@ -206,11 +206,11 @@ class OptimalControlProblem:
             self._check_pieces(self.system)
         self._join_disturbances()
         measurable = self.disturbance is not None and self.disturbance_class == "measurable"
-        if measurable and isinstance(self.system, SwitchedSystem | VaryingSystem):
-            which = "has pieces" if isinstance(self.system, SwitchedSystem) else "changes with time"
+        if measurable and isinstance(self.system, VaryingSystem):
             raise InputError(
                 path="disturbance_class",
-                expected=f"piecewise_constant where the system {which}, of which measurable ones are not proven",
+                expected="piecewise_constant where the system changes with time, of which measurable ones are not"
+                " proven",
                 got="measurable",
             )
         self._set("initial_state", self._state())
@@ -479,17 +479,6 @@ class OptimalControlProblem:
                 expected=f"at most {self.horizon - delay:g}, the horizon less the delay, where G is not 0: a control"
                 " that is commanded later never acts",
                 got=f"{stop:g}",
-            )
-        if (
-            self.disturbance is not None
-            and self.disturbance_class == "measurable"
-            and (start > 0.0 or (delay > 0.0 and G.any()))
-        ):
-            raise InputError(
-                path=f"{where}.from",
-                expected="0, and a control that acts at once, where disturbances are measurable: a window that begins"
-                " later makes pieces of the system, of which measurable ones are not proven",
-                got=f"from {start:g} with a delay of {delay:g}",
             )
         return replace(entry, H=H, G=G, lower=lower, upper=upper, start=start, stop=stop)
 

@@ -116,6 +116,11 @@ class LiftedSystem:
         return 0 if self.past is None else self.past.lifted.first + self.past.lifted.grid.pieces
 
     @property
+    def turn(self) -> int:
+        """How many systems took their turns before this leg."""
+        return 0 if self.past is None else self.past.lifted.turn + 1
+
+    @property
     def transform(self) -> Array:
         """``T (d, d)``, with ``x = T z``."""
         return self.decoupling.transform

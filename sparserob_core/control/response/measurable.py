@@ -1,6 +1,8 @@
 """Support of the reachable set when the disturbance may be any measurable function with values in a set.
 
-``sigma(t) = int_0^t h_W(E' e^{A' s} c) ds``: the integral and the maximum commute (Aumann 1965).
+``sigma(t) = int_0^t h_W(E' e^{A' s} c) ds``: the integral and the maximum commute (Aumann 1965). Of systems that take
+turns it is that of the one that acts, from where it begins to act, and ``sigma`` at that time of the row ``e^{A' s} c``
+that the way from there to ``t`` makes of ``c``: the support function of a set of states in which its turn begins.
 
 Errors of execution are such disturbances: what is delivered of a control differs from the command by at most a share of
 it, any function of time. What the worst of them adds to ``c'x(t)`` is ``sum_jk share_j |u_jk| int |c'e^{A(t-s)} B_j|
@@ -27,9 +29,10 @@ from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.flows import Leaps, products
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response.initial_support import Support
+from sparserob_core.control.response.disturbance_support import Carried, carried
+from sparserob_core.control.response.initial_support import InitialSupport, Support
 from sparserob_core.control.response.lifted import LiftedSystem
-from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.response.varying_motion import OUTWARD, VaryingMotion
 from sparserob_core.shapes import Float, Int, shaped
@@ -75,11 +78,11 @@ class _Table:
 @dataclass(frozen=True, eq=False)
 class MeasurableSupport:
     """The support ``sigma`` for one set ``bound``; integrals up to the grid's breakpoints are remembered per direction
-    and parameter."""
+    and parameter, of the system that acts last."""
 
     response: Response
     bound: ConvexSet
-    _tables: dict[bytes, _Table] = field(default_factory=dict, repr=False)
+    _tables: dict[tuple[bytes, bytes, bool, int], _Table] = field(default_factory=dict, repr=False)
 
     @shaped
     def __call__(
@@ -99,11 +102,20 @@ class MeasurableSupport:
         return self.bound.halfspaces() is not None
 
     @shaped
-    def enclosed(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k 2"]:
-        """What ``sigma`` of a known system is at least and at most, ``(k, 2)``."""
-        bounds = self._at(times, directions, np.zeros(0), enclosed=True)
+    def enclosed(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], leg: int | None = None
+    ) -> Float[Array, "k 2"]:
+        """What ``sigma`` of a known system is at least and at most, ``(k, 2)``; ``times`` in a ``leg`` of systems that
+        take turns, where one is given, are counted from where it begins."""
+        bounds = self._at(times, directions, np.zeros(0), enclosed=True, leg=leg)
         lost = rounding(self.response.grid.pieces) * np.abs(bounds).max(axis=1, initial=0.0)
         return np.asarray(bounds + lost[:, None] * [-1.0, 1.0])
+
+    @cached_property
+    def _legs(self) -> list[TimeGrid]:
+        """The pieces of every system that takes its turn, in times from where it begins."""
+        grid = self.response.grid
+        return [grid] if grid.mode is None else [grid.leg(number) for number in range(len(grid.turns))]
 
     @shaped
     def _at(
@@ -112,17 +124,47 @@ class MeasurableSupport:
         directions: Float[Array, "k d"],
         parameter: Float[Array, " nu"],
         enclosed: bool = False,
+        leg: int | None = None,
     ) -> Float[Array, "k n"]:
-        """The integrals, or with ``enclosed`` their lower and upper bounds, as columns."""
+        """The integrals, or with ``enclosed`` their lower and upper bounds, as columns: those of the last system from
+        where it begins, and what each before it adds for the rows that the way from its end makes of the directions."""
+        begins = np.array([one.elapsed for one in self._legs])
+        if leg is None:
+            legs = np.maximum(np.searchsorted(begins, times) - 1, 0)
+            times = times - begins[legs]
+        else:
+            legs = np.full(times.size, leg)
+        total, rows = np.zeros((times.size, 2 if enclosed else 1)), directions
+        for number in range(int(legs.max(initial=0)), -1, -1):
+            A, E = (part[0] for part in self.response.system.modes[number].matrices(parameter[None])[::2])
+            ages, length = self._legs[number].breakpoints, float(self._legs[number].breakpoints[-1])
+            last, through = np.flatnonzero(legs == number), np.flatnonzero(legs > number)
+            key = (parameter.tobytes(), enclosed, number)
+            total[last] += self._until(A, E, ages, times[last], rows[last], key)
+            if through.size:
+                total[through] += self._through(A, E, length, rows[through], enclosed)
+            if number:
+                mine = np.flatnonzero(legs >= number)
+                spent = np.where(legs[mine] == number, times[mine], length)
+                rows = rows.copy()
+                rows[mine] = _moved(A, rows[mine], spent[:, None])[:, 0]
+        return total
+
+    def _until(
+        self, A: Array, E: Array, ages: Array, times: Array, directions: Array, key: tuple[bytes, bool, int]
+    ) -> Array:
+        """What one system adds until ``times (k,)`` from where it begins, ``(k, 1)`` or ``(k, 2)``; integrals up to
+        ``ages (L + 1,)`` are remembered, of the parameter and the system that the ``key`` names."""
+        if not times.size:
+            return np.zeros((0, 1))
         unique, which = np.unique(directions, axis=0, return_inverse=True)
         which = which.reshape(-1)
-        A, _, E = self.response.system.modes[0].matrices(parameter[None])
-        tables = self._known(A[0], E[0], unique, parameter, enclosed)
+        tables = self._known(A, E, ages, unique, key)
         starts = tables[0].starts
         parts = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
         within = np.clip(times - starts[parts], 0.0, None)
         before, found = np.array([tables[one].sums[part] for one, part in zip(which, parts, strict=True)]), None
-        if enclosed:
+        if key[1]:
             terms = np.array([tables[one].terms[part] for one, part in zip(which, parts, strict=True)])
             lost = np.array([tables[one].lost[part] for one, part in zip(which, parts, strict=True)])
             accuracy = np.array([table.accuracy for table in tables])[which]
@@ -132,36 +174,48 @@ class MeasurableSupport:
             found = integrated(self.bound, terms, within, accuracy) + (shares * lost + late)[:, None] * [-1.0, 1.0]
         else:
             rows = np.stack([tables[one].rows[part] for one, part in zip(which, parts, strict=True)])
-            found = self._integrals(A[0], E[0], rows, within, which)[:, None]
+            found = self._integrals(A, E, rows, within, which)[:, None]
         return np.asarray(before + found)
 
-    @shaped
-    def _known(
-        self,
-        A: Float[Array, "d d"],
-        E: Float[Array, "d mw"],
-        directions: Float[Array, "k d"],
-        parameter: Float[Array, " nu"],
-        enclosed: bool,
-    ) -> list[_Table]:
+    def _through(self, A: Array, E: Array, length: float, directions: Array, enclosed: bool) -> Array:
+        """What one system adds over all of its turn of this ``length`` for rows ``directions (k, d)`` at its end, which
+        are others at every time: nothing is remembered of them."""
+        if not enclosed:
+            lengths, alone = np.full(len(directions), length), np.arange(len(directions))
+            return self._integrals(A, E, directions, lengths, alone)[:, None]
+        starts = self._short(A, np.array([0.0, length]))
+        lengths, found = np.diff(starts), np.empty((len(directions), 2))
+        several = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
+        for first in range(0, len(directions), several):
+            part = slice(first, first + several)
+            terms, lost, tallest = self._expanded(A, E, directions[part], starts)
+            accuracy = ACCURACY * np.maximum(tallest * length, TINY)
+            every = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
+            bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *every)
+            size = rounding(lengths.size) * np.abs(bounds).max(axis=1).reshape(lost.shape).sum(axis=1)
+            lost = lost.sum(axis=1) * (1.0 + rounding(lengths.size)) + size
+            late = rounding(8) * float(self.response.grid.breakpoints[-1]) * tallest
+            found[part] = bounds.reshape(*lost.shape, -1, 2).sum(axis=1) + (lost + late)[:, None] * [-1.0, 1.0]
+        return found
+
+    def _known(self, A: Array, E: Array, ages: Array, directions: Array, key: tuple[bytes, bool, int]) -> list[_Table]:
         """What is remembered of each of ``directions (k, d)``."""
-        keys = [direction.tobytes() + parameter.tobytes() + bytes([enclosed]) for direction in directions]
-        found = {key: self._tables[key] for key in keys if key in self._tables}
-        for key, direction in zip(keys, directions, strict=True):
-            if key not in found:
-                make = self._enclosing if enclosed else self._measuring
-                found[key] = remember(self._tables, key, make(A, E, direction), TABLES_KEPT)
-        return [found[key] for key in keys]
+        keys = [(direction.tobytes(), *key) for direction in directions]
+        found = {one: self._tables[one] for one in keys if one in self._tables}
+        for one, direction in zip(keys, directions, strict=True):
+            if one not in found:
+                make = self._enclosing if key[1] else self._measuring
+                found[one] = remember(self._tables, one, make(A, E, ages, direction), TABLES_KEPT)
+        return [found[one] for one in keys]
 
-    def _measuring(self, A: Array, E: Array, direction: Array) -> _Table:
-        """By quadrature, from breakpoint to breakpoint."""
-        breakpoints = self.response.grid.breakpoints
-        rows = _moved(A, direction[None], breakpoints[None])[0]
-        lengths, alike = np.diff(breakpoints), np.zeros(breakpoints.size - 1, dtype=int)
+    def _measuring(self, A: Array, E: Array, ages: Array, direction: Array) -> _Table:
+        """By quadrature, from one of ``ages (L + 1,)`` to the next."""
+        rows = _moved(A, direction[None], ages[None])[0]
+        lengths, alike = np.diff(ages), np.zeros(ages.size - 1, dtype=int)
         sums = np.append(0.0, np.cumsum(self._integrals(A, E, rows[:-1], lengths, alike)))
-        return _Table(breakpoints, sums[:, None], rows=rows)
+        return _Table(ages, sums[:, None], rows=rows)
 
-    def _enclosing(self, A: Array, E: Array, direction: Array) -> _Table:
+    def _enclosing(self, A: Array, E: Array, ages: Array, direction: Array) -> _Table:
         """Lower and upper bounds, from the end of one short interval to that of the next.
 
         On short intervals a row is a polynomial ``f`` with a rest. In Bernstein's form ``f`` is a convex combination of
@@ -169,21 +223,35 @@ class MeasurableSupport:
         length times the mean of ``h(b_k)``, and at least that of ``w'b_k`` for any point ``w`` of the set. Both are
         equal where one corner of the set is best for all; an interval where another takes over is halved.
         """
-        from scipy.linalg import matrix_balance
+        starts = self._short(A, ages)
+        terms, lost, tallest = (part[0] for part in self._expanded(A, E, direction[None], starts))
+        lengths, horizon = np.diff(starts), float(self.response.grid.breakpoints[-1])
+        accuracy = ACCURACY * max(float(tallest) * horizon, TINY)
+        found = integrated(self.bound, terms, lengths, np.full(lengths.size, accuracy)) + lost[:, None] * [-1.0, 1.0]
+        sums = np.vstack([np.zeros(2), np.cumsum(found, axis=0)])
+        late = rounding(8) * horizon * float(tallest)
+        return _Table(starts, sums, terms=terms, lost=lost, accuracy=accuracy, late=late)
 
-        # In units of the states in which the matrix is small, powers of two: what is left is bounded by its norm.
-        A, (units, _) = matrix_balance(A, permute=False, separate=True)
-        E, breakpoints = E / units[:, None], self.response.grid.breakpoints
-        speed, pieces = float(np.linalg.norm(A, 2)), np.diff(breakpoints)
+    def _short(self, A: Array, ages: Array) -> Array:
+        """The ends ``(n + 1,)`` of short intervals, as many between all neighbours of ``ages (L + 1,)``."""
+        A, pieces = balanced(A)[0], np.diff(ages)
+        speed = float(np.linalg.norm(A, 2))
         # not by the norm alone, which of a matrix far from normal is much larger than what its flow does
         fastest = min(speed, max(4.0 * float(np.abs(np.linalg.eigvals(A)).max()), speed / 16.0))
         count = int(np.clip(np.ceil(fastest * pieces.max() / SHORT), 1, MOST_SHORT))
-        starts = np.append(
-            (breakpoints[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), breakpoints[-1]
-        )
-        lengths, far = np.diff(starts), self.bound.radius_bound
+        return np.append((ages[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), ages[-1])
+
+    def _expanded(self, A: Array, E: Array, directions: Array, starts: Array) -> tuple[Array, Array, Array]:
+        """Of every row ``directions (k, d)`` on every interval between ``starts (n + 1,)``: polynomials ``(k, n,
+        ORDER + 1, mw)`` in the share of it that has passed, what the integral over it may be off by with them, ``(k,
+        n)``, and the largest integrand, ``(k,)``."""
+        # In units of the states in which the matrix is small, powers of two: what is left is bounded by its norm.
+        A, units = balanced(A)
+        E, speed = E / units[:, None], float(np.linalg.norm(A, 2))
+        lengths, far, count = np.tile(np.diff(starts), len(directions)), self.bound.radius_bound, len(directions)
         once, sized = products(A), products(np.abs(A))
-        row = Leaps(A).rows(np.tile(direction * units, (lengths.size, 1)), starts[:-1])[0]
+        every = np.repeat(directions * units, starts.size - 1, axis=0)
+        row = Leaps(A).rows(every, np.tile(starts[:-1], count))[0]
         terms, sizes, size = [row @ E], np.abs(row) @ np.abs(E), np.abs(row)
         for order in range(1, ORDER + 1):
             step = (lengths / order)[:, None]
@@ -195,12 +263,8 @@ class MeasurableSupport:
         operations = ORDER * (A.shape[0] + 4) + A.shape[0] + 4 * E.shape[1] + HALVINGS
         lost = far * (np.linalg.norm(np.asarray(row @ once), axis=1) * growth * np.linalg.norm(E, 2))
         lost = lengths * (lost + far * rounding(operations) * np.linalg.norm(sizes, axis=1)) * (1.0 + rounding(8))
-        tallest, horizon = far * float(np.linalg.norm(sizes, axis=1).max(initial=0.0)), float(breakpoints[-1])
-        accuracy = ACCURACY * max(tallest * horizon, TINY)
-        points = np.array(terms).swapaxes(0, 1)
-        found = integrated(self.bound, points, lengths, np.full(lengths.size, accuracy)) + lost[:, None] * [-1.0, 1.0]
-        sums = np.vstack([np.zeros(2), np.cumsum(found, axis=0)])
-        return _Table(starts, sums, terms=points, lost=lost, accuracy=accuracy, late=rounding(8) * horizon * tallest)
+        tallest = far * np.linalg.norm(sizes, axis=1).reshape(count, -1).max(axis=1, initial=0.0)
+        return np.stack(terms, axis=1).reshape(count, -1, ORDER + 1, E.shape[1]), lost.reshape(count, -1), tallest
 
     @shaped
     def _integrals(
@@ -268,6 +332,14 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
     return total
 
 
+def balanced(A: Array) -> tuple[Array, Array]:
+    """The matrix in units of the states in which it is small, and these units ``(d,)``, powers of two."""
+    from scipy.linalg import matrix_balance
+
+    A, (units, _) = matrix_balance(A, permute=False, separate=True)
+    return A, units
+
+
 @cache
 def bezier(order: int) -> Array:
     """From powers on ``[0, 1]`` to the coefficients of Bernstein's form, ``(order + 1, order + 1)``."""
@@ -313,10 +385,11 @@ class KnownCellSupport:
 @dataclass(frozen=True, eq=False)
 class MeasurableCellSupport(KnownCellSupport):
     """The support function of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form
-    of `DisturbanceSupport`; ``lifted`` is that system.
+    of `DisturbanceSupport`; ``lifted`` is that system, or one of those that take turns.
 
     ``sigma`` is an integral with a Lipschitz integrand, so its second derivative is bounded by that of the integrand's
-    argument.
+    argument. What earlier systems did is the support function of a set in which the turn of this one begins: it bends,
+    and is rounded, no more than that of a box around this set.
     """
 
     support: MeasurableSupport
@@ -328,10 +401,11 @@ class MeasurableCellSupport(KnownCellSupport):
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
         """The support function ``(k, r, 1)`` and how far it may be from that, ``(k, r)``; ``ends (k, r, 0)``."""
+        every = self.repeated(times)
         if self.support.is_enclosed:
-            return self.between(self.support.enclosed(*self.repeated(times)))
+            return self.between(self.support.enclosed(*every, leg=self.lifted.turn))
         k, r = times.size, self.rows.shape[0]
-        sigma = self.support(*self.repeated(times), np.zeros((k * r, 0))).reshape(k, r)
+        sigma = self.support(every[0] + self.lifted.grid.elapsed, every[1], np.zeros((k * r, 0))).reshape(k, r)
         return sigma[..., None], MISSED * np.abs(sigma)
 
     @shaped
@@ -351,21 +425,50 @@ class MeasurableCellSupport(KnownCellSupport):
             square * product(reach.peak.on(now), comparison.sizes.T),
             2.0 * reach.integral.on(now),
         )
-        return np.asarray(np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T))
+        found = np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T)
+        return np.asarray(found if self._earlier is None else found + self._earlier.deviation(start, widths))
 
-    @property
+    @cached_property
     def neglected(self) -> Array:
         """What rounding may change of ``e^{A' s} c``, times the disturbance, at most, ``(r, L)``."""
+        found = self._rounded(self.rows @ self.lifted.transform)
+        return found if self._earlier is None else found + self._earlier.neglected
+
+    def _rounded(self, rows: Array) -> Array:
+        """The same of ``rows (r, d)`` in the coordinates of the lifted system, without what was before its turn."""
         lifted = self.lifted
-        _, remainder = lifted.row_bounds(self.rows @ lifted.transform)
+        _, remainder = lifted.row_bounds(rows)
         pushed = np.cumsum((remainder @ self._drive)[:, lifted.span] * lifted.fine.lengths, axis=1)
         return np.asarray(pushed[:, lifted.ends[1:] - 1])
 
-    @property
+    @cached_property
     def reached(self) -> Array:
         """As in `DisturbanceSupport`, ``(L, q)``."""
         reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
-        return reach.integral.on(np.broadcast_to(self._drive, (self.lifted.grid.pieces, self._drive.size)))
+        found = reach.integral.on(np.broadcast_to(self._drive, (self.lifted.grid.pieces, self._drive.size)))
+        return found if self._earlier is None else found + self._earlier.reached
+
+    @cached_property
+    def _earlier(self) -> InitialSupport | None:
+        """What disturbances made of the state before the turn of this system begins, as a box of states around it; of
+        the first ``None``."""
+        past = self.lifted.past
+        if past is None:
+            return None
+        known = past.carried.get(id(self.support))
+        if not isinstance(known, Carried):
+            axes = np.eye(past.lifted.states)
+            ended = MeasurableCellSupport(self.support, self.rows, past.lifted)
+            left_out = ended._rounded(axes)[:, -1]
+            if ended._earlier is not None:
+                left_out = left_out + replace(ended._earlier, rows=axes).neglected[:, -1]
+            far = np.repeat(ended.reached[-1], np.diff(past.lifted.starts, append=past.lifted.states))
+            around = Box(-far, far)
+            known = carried(past, (self.support, around), axes[:, None], far[:, None], ended.reached[-1], left_out)
+            past.carried.update({id(self.support): known, id(around): known})
+        assert isinstance(known.of, tuple)
+        _, around = known.of
+        return InitialSupport(self.lifted, around, self.rows @ self.lifted.transform)
 
     @property
     def _drive(self) -> Array:

@@ -3,6 +3,7 @@ replayed."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.flows import Leaps
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.response import Response
 from sparserob_core.control.transcription.record import Feedback
 from sparserob_core.sip.convex_set import Array
 
@@ -119,7 +121,7 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     grid, model = functionals.response.grid, functionals.disturbance
     if model is None or model.kind != "measurable":
         return grid.breakpoints, functionals.worst_disturbance(time, direction, parameter)
-    A, _, W = (matrix[0] for matrix in functionals.response.system.modes[0].matrices(parameter[None]))
+    flow = _Way.of(functionals.response, parameter, time, direction)
     starts = np.concatenate(
         [
             left + (right - left) * np.arange(PARTS) / PARTS
@@ -128,23 +130,73 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     )
     ends = np.append(starts[1:], grid.breakpoints[-1])
     past = starts < time
-    flow = (Leaps(A), W)
-    starts, ends = _halved(model, flow, (starts[past], np.minimum(ends[past], time)), (time, direction))
-    values = model.bound.support_point(_gains(flow, starts, ends, time, direction))
+    starts, ends = _halved(model, flow, (starts[past], np.minimum(ends[past], time)))
+    values = model.bound.support_point(flow.gains(starts, ends))
     if time < grid.breakpoints[-1]:  # afterwards nothing matters
         starts, values = np.append(starts, time), np.vstack([values, model.bound.interior_point()])
     return _merged(starts, values, grid.breakpoints)
 
 
-def _halved(
-    model: DisturbanceModel, flow: tuple[Leaps, Array], parts: tuple[Array, Array], at: tuple[float, Array]
-) -> tuple[Array, Array]:
+def pushed_by(
+    functionals: WorstCase, time: float, direction: Array, parameter: Array, signal: tuple[Array, Array]
+) -> float:
+    """What a disturbance ``(mw, L)`` between breakpoints ``(L + 1,)``, among which are those of the grid, adds to
+    ``direction'x(time)``."""
+    ends, values = signal
+    past = ends[:-1] < time
+    flow = _Way.of(functionals.response, parameter, time, direction)
+    return float((flow.gains(ends[:-1][past], np.minimum(ends[1:][past], time)) * values.T[past]).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """What the systems that take turns make of a functional at a time, read backwards: of each where its turn ends,
+    ``ends (J,)``, or where the functional is, the ``rows (J, d)`` there, its `Leaps` and its ``E``."""
+
+    ends: Array
+    rows: Array
+    leaps: list[Leaps]
+    E: list[Array]
+
+    @staticmethod
+    def of(response: Response, parameter: Array, time: float, direction: Array) -> _Way:
+        """That of a functional at a ``time`` with a ``direction (d,)``."""
+        every = [[part[0] for part in mode.matrices(parameter[None])] for mode in response.system.modes]
+        leaps, begins = [Leaps(A) for A, _, _ in every], np.array([0.0, *response.system.switches])
+        ends = np.minimum(np.append(begins[1:], response.grid.breakpoints[-1]), time)
+        rows = np.tile(direction, (ends.size, 1))
+        for mode in range(ends.size - 1, 0, -1):
+            rows[mode - 1] = leaps[mode].rows(rows[[mode]], ends[[mode]] - ends[[mode - 1]])[0][0]
+        return _Way(ends, rows, leaps, [E for _, _, E in every])
+
+    def at(self, times: Array, inside: Array) -> Array:
+        """``E' Phi(time, s)' direction`` at ``times (k,)``, with the system that acts ``inside (k,)``: ``(k, mw)``."""
+        return self._over(times, inside, lambda leaps, rows, spent, which: leaps.rows(rows, spent)[0])
+
+    def gains(self, starts: Array, ends: Array) -> Array:
+        """Its integrals from ``starts (k,)`` to ``ends (k,)``, of which each is within one turn, ``(k, mw)``."""
+
+        def integrated(leaps: Leaps, rows: Array, spent: Array, which: np.ndarray) -> Array:
+            return leaps.rows(leaps.rows(rows, spent)[0], (ends - starts)[which])[1]
+
+        return self._over(ends, (starts + ends) / 2, integrated)
+
+    def _over(self, times: Array, inside: Array, made: Callable[[Leaps, Array, Array, np.ndarray], Array]) -> Array:
+        found, modes = np.zeros((times.size, self.E[0].shape[1])), np.searchsorted(self.ends[:-1], inside)
+        for mode in np.unique(modes):
+            which = np.flatnonzero(modes == mode)
+            rows = np.tile(self.rows[mode], (which.size, 1))
+            found[which] = made(self.leaps[mode], rows, self.ends[mode] - times[which], which) @ self.E[mode]
+        return found
+
+
+def _halved(model: DisturbanceModel, flow: _Way, parts: tuple[Array, Array]) -> tuple[Array, Array]:
     """The parts, halved wherever the best constant on one is not the best at both of its ends; the most lossy of them
     when they are too many."""
     starts, ends = parts
     here = np.arange(starts.size)
     for _ in range(HALVINGS):
-        lost, allowed = _lost(model, flow, starts[here], ends[here], at)
+        lost, allowed = _lost(model, flow, starts[here], ends[here])
         middles = (starts[here] + ends[here]) / 2
         open_ = np.flatnonzero((lost > allowed) & (middles > starts[here]) & (middles < ends[here]))
         open_ = open_[np.argsort(-lost[open_], kind="stable")][: max(0, SIGNAL - starts.size)]
@@ -158,28 +210,17 @@ def _halved(
     return starts[order], ends[order]
 
 
-def _lost(
-    model: DisturbanceModel, flow: tuple[Leaps, Array], starts: Array, ends: Array, at: tuple[float, Array]
-) -> tuple[Array, float]:
+def _lost(model: DisturbanceModel, flow: _Way, starts: Array, ends: Array) -> tuple[Array, float]:
     """What the best constant on each part misses at its two ends, times the part's length, ``(k,)``, and how much of
     that is rounding."""
-    leaps, W = flow
-    time, direction = at
-    best = model.bound.support_point(_gains(flow, starts, ends, time, direction))
+    best = model.bound.support_point(flow.gains(starts, ends))
     missed, largest = np.zeros(starts.size), 0.0
     for times in (starts, ends):
-        rows = leaps.rows(np.tile(direction, (times.size, 1)), time - times)[0] @ W
+        rows = flow.at(times, (starts + ends) / 2)
         height = model.bound.support(rows)
         missed += (ends - starts) * (height - (best * rows).sum(axis=1))
         largest = max(largest, float(np.abs(height).max(initial=0.0)))
     return missed, LOST * largest * float(model.grid.breakpoints[-1])
-
-
-def _gains(flow: tuple[Leaps, Array], starts: Array, ends: Array, time: float, direction: Array) -> Array:
-    """``int_start^end E' e^{A' (time - s)} direction ds`` for parts ``(k,)`` before ``time``, ``(k, mw)``."""
-    leaps, W = flow
-    rows, _ = leaps.rows(np.tile(direction, (ends.size, 1)), time - ends)
-    return np.asarray(leaps.rows(rows, ends - starts)[1] @ W)
 
 
 def _merged(starts: Array, values: Array, breakpoints: Array) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
+from sparserob_core.control.studies.adversary import pushed_by, worst_signal
 from sparserob_core.control.transcription.transcribe import prepare, windows_of
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import sealed
@@ -313,9 +314,14 @@ def _of_program(
     parameter = parameter if bound is None else within(bound, parameter)
     at = np.array([time]), row.direction[None, :d], parameter[None]
     deviation, begun = functionals.worst_deviations(*at)[0], problem.initial_set
-    disturbance = functionals.worst_disturbance(time, row.direction[:d], parameter)
+    of_state = time, row.direction[:d], parameter
+    changes, disturbance = worst_signal(functionals, *of_state)
+    missed = 0.0
     if disturbance is not None and problem.disturbance is not None:
         disturbance = within(problem.disturbance, disturbance.T).T
+        if problem.disturbance_class == "measurable":  # whose worst signal is found to rounding, or less
+            support = functionals.measurable(at[0], at[1], at[2])[0]
+            missed = max(0.0, float(support) - pushed_by(functionals, *of_state, (changes, disturbance)))
     edges, middles = _bins(row)
     low = np.full(middles.size, -np.inf)
     for p in (found.index[1:], middle[1:]):
@@ -325,12 +331,12 @@ def _of_program(
     own_edges = edges / units[0]
     return BoundedRow(
         row,
-        unit * (found.lower - lost),
+        unit * (found.lower - lost) - missed,
         unit * (found.upper + lost),
         time,
         parameter,
         deviation if begun is None else within(begun, deviation),
-        functionals.response.grid.breakpoints,
+        changes,
         disturbance,
         edges,
         unit * (low - lost),

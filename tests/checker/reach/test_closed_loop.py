@@ -39,7 +39,7 @@ def made(name):
     loop = kind(
         case.system,
         case.start.tolist(),
-        v,
+        [arb_mat(column[:, None].tolist()) for column in v.T],
         M,
         case.grid.tolist(),
         case.breakpoints.tolist(),
@@ -307,7 +307,15 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
             ([0.0], [{}, {0: 1.0}, {0: 1.0}]),
         ):
             loop = ClosedLoop(
-                plant, [0.0], np.zeros((1, 3)), np.zeros((3, 3, 1, 1)), grid, pieces, changes, Box([-1.0], [1.0]), None
+                plant,
+                [0.0],
+                [arb_mat(1, 1)] * 3,
+                np.zeros((3, 3, 1, 1)),
+                grid,
+                pieces,
+                changes,
+                Box([-1.0], [1.0]),
+                None,
             )
             found = [{b: float(push[0, 0].mid()) for b, push in one.items()} for one in loop.seen]
             assert found == seen

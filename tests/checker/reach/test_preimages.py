@@ -36,7 +36,7 @@ def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> Seen:
     loop = ClosedLoop(
         system,
         [0.0] * d,
-        np.zeros((1, 4)),
+        [arb_mat(1, 1)] * 4,
         np.zeros((4, 4, 1, d)),
         sorted({*ends, *changes}),
         ends,

@@ -85,11 +85,6 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
         {"system": sr.LinearSystem([[0]], [[1]], delay=0.5), "initial_state": [0]},
         "integral.0.to",
     ),
-    "measurable and later": (
-        {"H": [[1, 0]], "start": 1.0},
-        {"disturbance": sr.Box([-0.1] * 2, [0.1] * 2), "disturbance_class": "measurable"},
-        "integral.0.from",
-    ),
     "a plan that repeats": ({"G": [[1]]}, {"repeat": True}, "integral"),
     "a system in t": (
         {"G": [[1]], "start": 1.0},
