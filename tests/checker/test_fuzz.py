@@ -42,6 +42,20 @@ KINDS: dict[str, dict[str, Any]] = {
     "steps": on(6, {**DECAY, "control_step": {"box": 0.8}, "initial_control": [0.0]}),
     "mixed": on(4, {**DECAY, "path": [{"mixed": {"H": [[1.0]], "G": [[0.3]], "h": [1.9]}, "from": 0.2}]}),
     "quadratic": on(5, {**DECAY, "cost": {"l1": 1.0, "final": {"Q": [[0.3]]}}}),
+    "norms": on(
+        4,
+        {
+            "name": "linear",
+            "system": {"A": [[-0.3, 0.2], [0.1, -0.5]], "B": [[1.0, 0.2], [-0.3, 1.0]]},
+            "horizon": 2.0,
+            "initial_state": [1.0, 0.8],
+            "control": {
+                "polytope": {"H": [[1, 0], [-1, 0], [0, 1], [0, -1], [-1, -1]], "h": [0.8, 0.8, 0.8, 0.8, 0.7]}
+            },
+            "cost": {"group": "all"},
+            "terminal": [{"box": [0.3, 0.3]}],
+        },
+    ),
     "sparsest": on(5, DECAY, method={"name": "sparsest"}),
     "feedback": on(4, PUSHED, policy=AFFINE),
     "feedback, nominal cost": on(3, {**PUSHED, "control_step": {"box": 1.5}}, policy={"name": "affine"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise, product
@@ -19,6 +20,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
+LEAST = 2.0**-1000  # of an error: smaller ones have lost digits to underflow
 MOST_ENDS = 8  # dimension up to which a ball of a p-norm is looked at in all corners of a range
 
 
@@ -129,7 +131,8 @@ class Ball(Shape):
         """``h(f) - w'f`` is convex: on a range it is largest at one of the corners."""
         d, p = self.dimension, self.source.p
         if p == 2.0:
-            return _round_bound(self.centre, self.source.radius**2 * np.eye(d), value, spread)
+            size, power = math.frexp(self.source.radius)
+            return _round_bound(self.centre, size**2 * np.eye(d), value, spread, power)
         w = self.source.support_point(value)
         if d <= MOST_ENDS:
             ends = value[:, None] + spread[:, None] * np.array(list(product((-1.0, 1.0), repeat=d)))
@@ -222,16 +225,26 @@ def _power(value: arb, exponent: arb) -> arb:
     return size**exponent if size > 0 else arb(0).union(arb(size.upper()) ** exponent)
 
 
-def _round_bound(centre: Array, S: Array, value: Array, spread: Array) -> tuple[Array, Array]:
+def _round_bound(centre: Array, S: Array, value: Array, spread: Array, power: int = 0) -> tuple[Array, Array]:
     """What is lost is of second order in ``spread``: in the norm of the set,
-    ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``."""
+    ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``. The set is ``2^power`` times as large as ``S`` says.
+
+    In units, powers of two, in which the largest entry reaches from 1/2 to 1 on the set: the squares of what is smaller
+    than 1e-162 would be 0, and the set a point.
+    """
+    largest = (np.maximum(np.abs(value), spread) * np.sqrt(np.diag(S))).max(axis=1)
+    shift = np.frexp(np.where(np.isfinite(largest), largest, 1.0))[1][:, None]
+    value, spread = np.ldexp(value, -shift), np.ldexp(spread, -shift)
+    middle = np.ldexp(centre, -power)
     square = np.maximum(np.einsum("ki,ij,kj->k", value, S, value), 0.0)
     lost = ROUNDING * np.einsum("ki,ij,kj->k", np.abs(value), np.abs(S), np.abs(value))  # by cancellation
     size = np.sqrt(square)
     safe = np.where(size > 0, size, 1.0)
-    w = centre + np.where(size[:, None] > 0, value @ S / safe[:, None], 0.0)
+    w = centre + np.ldexp(np.where(size[:, None] > 0, value @ S / safe[:, None], 0.0), power)
     off = spread @ np.sqrt(np.diag(S)) * OUTWARD
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what overflows is lost altogether
         excess = np.where(off < 0.5 * size, off**2 / (2.0 * (size - off)), 2.0 * off + np.where(size > 0, 0.0, off))
     short = np.sqrt(square + lost) - size + lost / safe
-    return w, (excess + short) * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(centre))
+    lost = (excess + short) * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(middle))
+    lost = np.ldexp(lost, shift[:, 0] + power)
+    return w, np.where(lost < LEAST, np.nextafter(lost, np.inf), lost)

@@ -19,7 +19,7 @@ import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.claims import claims, constraints, multipliers, replay
-from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.case import Case, numbers
 from sparserob_core.checker.claims.causal import _shared, causal_bound
 from sparserob_core.checker.claims.cells import Place, _cut
 from sparserob_core.checker.cost.nominal import integrated
@@ -715,3 +715,48 @@ def test_cells_of_a_curved_wall_fill_every_face_for_all_times_and_parameters(unc
     for wrong in (lower[:, 1:], lower[:, :, None], lower[:1]):
         with pytest.raises(Broken, match="corners"):
             constraints.covered(case, window, wrong, upper[:, 1:] if wrong.shape[1] < lower.shape[1] else upper)
+
+
+@pytest.mark.parametrize(
+    ("said", "text"),
+    [
+        ([0.5, float("nan")], "expected finite numbers"),
+        ([[1.0], [float("-inf")]], "expected finite numbers"),
+        ([1.0, "2"], "expected numbers"),
+        ([True], "expected numbers"),
+        (None, "expected numbers"),
+        ([[1.0, 2.0], [3.0]], "expected numbers"),
+        ([1.0, [2.0]], "expected numbers"),
+        ({"a": 1.0}, "expected numbers"),
+    ],
+)
+def test_what_is_no_table_of_finite_numbers_is_refused_with_its_name(said, text):
+    with pytest.raises(Broken, match=f"^of it: {text}$"):
+        numbers(said, "of it")
+
+
+def test_numbers_are_looked_at_whatever_they_are_nested_in():
+    assert numbers([[1, 2.5], [3, 4]], "of it").tolist() == [[1.0, 2.5], [3.0, 4.0]]
+    assert numbers([], "of it").shape == (0,) and numbers(3, "of it") == 3.0
+
+
+def test_units_know_how_far_each_channel_of_the_decision_goes_at_any_time():
+    two = {"system": LinearSystem(np.zeros((1, 1)), np.ones((1, 2)), E=ONE), "control": Box([-9.0] * 2, [9.0] * 2)}
+    assert case_of(decision=((0.5, -2.0), (-3.0, 1.0)), **two)._acting.tolist() == [2.0, 3.0]
+    assert case_of(decision=((0.5, -2.0), (-3.0, 1.0)), certificate={"decision": None}, **two)._acting is None
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-150, 1e-200, 1e-250])
+@pytest.mark.parametrize("kind", ["ball", "ellipsoid"])
+def test_a_round_set_of_disturbances_takes_the_state_as_far_in_units_of_any_size(kind, size):
+    """Squares of such numbers are 0 in double precision, and the set would be a point."""
+    shape = NormBall(2.0, 0.25 * size, dimension=2) if kind == "ball" else Ellipsoid(np.zeros(2), 0.0625 * np.eye(2))
+    plane = {
+        "system": LinearSystem(np.zeros((2, 2)), size * np.eye(2), E=np.eye(2) * (1.0 if kind == "ball" else size)),
+        "initial_state": [size, 0.0], "control": Box([-1.0] * 2, [1.0] * 2), "disturbance": shape,
+        "decision": ((0.5, -0.5), (0.0, 0.0)),
+    }  # fmt: skip
+    # 1 after no time, 1.5 and 0.25 of the disturbance after 1, and 1 and twice that in the end
+    assert kept(case_of(Box([-9.0 * size] * 2, [1.7501 * size, 9.0 * size]), **plane))
+    with pytest.raises((Broken, Unchecked)):
+        kept(case_of(Box([-9.0 * size] * 2, [1.7499 * size, 9.0 * size]), **plane))

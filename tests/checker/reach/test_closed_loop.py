@@ -4,6 +4,7 @@ what a cell adds to its chord is what its curvature owes, in balls."""
 from __future__ import annotations
 
 from functools import cache, partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -321,3 +322,22 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
             assert found == seen
     for start, stop, key, exact in ((0.0, 1.0, 1.0, True), (0.25, 1.0, 0.75, True), (1e-20, 1.0, 1.0, False)):
         assert ClosedLoop._exact(start, stop, key) is exact
+
+
+def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_zero():
+    """Whatever the numbers are: what a graph of arrows from entry to state to state reaches."""
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        d, mw = (int(n) for n in rng.integers(1, 6, 2))
+        A, E = (rng.uniform(1.0, 2.0, size) * (rng.random(size) < 0.3) for size in ((d, d), (d, mw)))
+        entries = sorted(rng.choice(mw, int(rng.integers(1, mw + 1)), replace=False).tolist())
+        seen = np.zeros((d, len(entries)), dtype=bool)
+        for place, entry in enumerate(entries):
+            reached = set(np.flatnonzero(E[:, entry]).tolist())
+            while more := {i for j in reached for i in np.flatnonzero(A[:, j]).tolist()} - reached:
+                reached |= more
+            seen[list(reached), place] = True
+        flow = SimpleNamespace(links={"A": (arb_mat(A.tolist()),), "E": (arb_mat(E.tolist()),)})
+        found = VaryingLoop.pushed(SimpleNamespace(_flow=flow), entries)
+        assert found.pattern.tolist() == seen.tolist()
+        assert (found.states, found.entries) == (seen.any(axis=1).sum(), seen.any(axis=0).sum())

@@ -404,6 +404,21 @@ def test_a_linear_bound_holds_where_a_range_is_many_times_as_wide_as_its_middle_
     assert (excess <= 8.0 * far * spread.sum(axis=1)).all()
 
 
+@pytest.mark.parametrize("scale", [1e-200, 1.0, 1e200])
+@pytest.mark.parametrize("name", SETS)
+def test_a_linear_bound_holds_along_axes_and_at_numbers_of_any_size(name, scale):
+    """Entries that are exactly 0 beside others, in what is asked and in how far it may be off."""
+    shape, axes = SETS[name], np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [0.0, 0.0]])
+    spreads = np.array([[0.0, 0.0], [0.0, 0.3], [0.2, 0.0], [0.4, 0.1], [3.0, 0.0], [0.0, 1.0]])
+    for value, spread in ((scale * axes, scale * spreads), (scale * axes[::-1], scale * spreads)):
+        w, excess = known(shape).bound(value, spread)
+        for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0)):
+            f = value + spread * np.array(corner)
+            owed = scale * shape.support(f / scale) - np.einsum("kw,kw->k", w, f)
+            assert (owed <= excess + 1e-14 * scale).all()
+        assert (excess <= 8.0 * (spread.sum(axis=1) + 1e-13 * scale)).all()
+
+
 def exactly(shape, value, w):
     """``h(f) - w'f`` for rows of numbers, from below, beyond double precision."""
     with ctx.workprec(200):

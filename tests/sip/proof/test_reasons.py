@@ -110,3 +110,35 @@ def test_one_row_that_slanted_sides_forbid_is_told_by_what_a_linear_program_miss
             told, worst = infeasible_subsystem(made, rows, np.array([y]), 1e-9)
             assert len(told.reasons) == 1 and worst is not None
             assert worst.violation == pytest.approx(truth - limit, rel=1e-6)
+
+
+def test_of_many_reasons_those_that_are_not_named_are_counted():
+    """Nine rows that ask for more than the decision can give: six are named, three are others."""
+    rng = np.random.default_rng(1)
+    G, missing = np.tile(rng.uniform(0.5, 1.5, (9, 2)), (9, 1, 1)), rng.uniform(0.3, 0.9, 9)
+    h = np.tile(-G[0].sum(axis=1) - missing, (9, 1))
+    made = program(G, h)
+    rows = Rows(G[0], h[0], tuple(Cut("walls", np.zeros(1), row, 0.0) for row in range(9)))
+    told, worst = infeasible_subsystem(made, rows, np.full(9, 0.1), 0.01)
+    assert (len(told.reasons), told.others) == (6, 3) and len({*told.reasons}) == 6
+    assert worst is not None and worst.violation == pytest.approx(missing[0])
+
+
+@pytest.mark.parametrize(
+    ("factor", "demand"),
+    [
+        (1.0, "weighted by 1, 1 they ask the decision for 1, and it can give at most 0.9"),
+        (0.1, "weighted by 1, 0.1 they ask the decision for 0.1, and it can give at most 0.09"),
+    ],
+)
+def test_rows_that_clash_together_are_told_with_what_their_sum_asks_for(factor, demand):
+    """``x + y <= -0.6`` and ``-x <= -0.4``, the second one times a factor: the sum ``y <= -1`` is met by no ``y`` from
+    -0.9 on. The largest weight is told as 1."""
+    G = np.array([[1.0, 1.0], [-factor, 0.0], [0.0, 1.0]])
+    h = np.array([-0.6, -0.4 * factor, 5.0])
+    made = program(np.tile(G, (9, 1, 1)), np.tile(h, (9, 1)), lower=np.array([-9.0, -0.9]), upper=np.full(2, 9.0))
+    rows = Rows(G, h, tuple(Cut("walls", np.zeros(1), row, 0.0) for row in range(3)))
+    told, worst = infeasible_subsystem(made, rows, np.array([1.0, 1.0 / factor, 0.0]), 0.02)
+    assert len(told.members) == 2 and (told.others, told.amount, told.equalities) == (0, 0.02, False)
+    assert told.demand == demand
+    assert worst is not None and worst.violation == 0.02
