@@ -23,12 +23,41 @@ would be told by its shape only."""
 def brief(record: Any) -> str:
     """A dataclass in at most `LINES` lines, for its ``__repr__``: a line for every field that is shown, and the names
     of those for which no line is left."""
-    shown = [one.name for one in fields(record) if one.repr and not one.name.startswith("_")]
+    return _lines(type(record).__name__, _shown(record))
+
+
+def shortened(lines: Sequence[str]) -> str:
+    """Lines for a prompt: long ones cut, and of many the first and how many more there are."""
+    kept = lines if len(lines) <= LINES else [*lines[: LINES - 1], f"  and {len(lines) - LINES + 1} more"]
+    return "\n".join(f"{line[: len(line) - len(line.lstrip())]}{_cut(line)}" for line in kept)
+
+
+def _lines(heading: str, shown: Sequence[tuple[str, object]]) -> str:
     room = len(shown) if len(shown) < LINES else LINES - 2
-    lines = [type(record).__name__, *(f"  {name}: {_value(getattr(record, name))}" for name in shown[:room])]
+    lines = [heading, *(f"  {name}: {_value(value)}" for name, value in shown[:room])]
     if shown[room:]:
-        lines.append("  " + _cut(f"and {', '.join(shown[room:])}"))
+        lines.append("  " + _cut(f"and {', '.join(name for name, _ in shown[room:])}"))
     return "\n".join(lines)
+
+
+def _shown(record: Any) -> list[tuple[str, object]]:
+    names = [one.name for one in fields(record) if one.repr and not one.name.startswith("_")]
+    return [(name, getattr(record, name)) for name in names]
+
+
+def _given(record: Any) -> list[tuple[str, object]]:
+    return [(name, value) for name, value in _shown(record) if not (value is None or _is_empty(value))]
+
+
+def _is_empty(value: object) -> bool:
+    return isinstance(value, str | tuple | list | Mapping) and not value
+
+
+def noun(record: Any) -> str:
+    """A dataclass of what a problem is made of, for its ``__repr__``: one line where it fits into `WIDTH`, else as
+    `brief` says it. What was left out, ``None`` or nothing, is not said."""
+    line = f"{type(record).__name__}({', '.join(f'{name}={_value(value)}' for name, value in _given(record))})"
+    return line if len(line) <= WIDTH else _lines(type(record).__name__, _given(record))
 
 
 def _value(value: object) -> str:
@@ -40,7 +69,8 @@ def _value(value: object) -> str:
     if isinstance(value, Mapping | Sequence) and not isinstance(value, str) and len(value) > ENTRIES:
         return f"{len(value)} entries"
     if is_dataclass(value):
-        return type(value).__name__
+        line = repr(value) if type(value).__repr__ is noun else ""
+        return line if line and "\n" not in line else type(value).__name__
     if isinstance(value, Mapping):
         return _cut("{" + ", ".join(f"{key}: {_value(one)}" for key, one in value.items()) + "}")
     if isinstance(value, list | tuple):

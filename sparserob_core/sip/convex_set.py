@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Bool, Float, sealed, shaped
 
@@ -429,6 +430,8 @@ class Box(ConvexSet):
     if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
 
         def __init__(self, lower: npt.ArrayLike, upper: npt.ArrayLike) -> None: ...
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         lower, upper = as_bound("lower", self.lower), as_bound("upper", self.upper)

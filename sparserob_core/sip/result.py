@@ -202,12 +202,17 @@ class Result:
     def __repr__(self) -> str:
         lines = [
             f"{type(self).__name__}: {self.status}: {self.message}",
-            f"  cost: {self.cost:.9g}",
-            f"  bounds: {self.lower_bound:.9g} to {self.upper_bound:.9g}",
+            f"  cost: {self.cost:.9g}{self._unit}",
+            f"  bounds: {self.lower_bound:.9g} to {self.upper_bound:.9g}{self._unit}",
             f"  gap: {self.gap:.2e}",
             f"  seconds: {self.seconds:.3f}",
         ]
         return "\n".join(lines)
+
+    @property
+    def _unit(self) -> str:
+        """The unit of the cost after a blank, where it is known."""
+        return ""
 
     @property
     def gap(self) -> float:

@@ -11,8 +11,9 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.brief import LINES, WIDTH, brief
+from sparserob_core.checker.outcome import Finding
 
-OF_THEIR_OWN = {"Outcome", "Result", "ControlResult", "SolvedProblem", "Signal"}  # guarded beside them
+OF_THEIR_OWN = {"Check", "Outcome", "Result", "ControlResult", "SolvedProblem", "Signal"}  # guarded beside them
 
 
 def results() -> list[str]:
@@ -71,3 +72,82 @@ def test_fields_without_a_line_are_named_and_hidden_ones_are_not() -> None:
     assert repr(Many()).splitlines()[1] == "  a: 1"
     assert repr(Many()).splitlines()[-1] == "  and i, j"
     assert len(repr(Many()).splitlines()) == LINES
+
+
+def many_states() -> sr.OptimalControlProblem:
+    d = 60
+    return sr.OptimalControlProblem(
+        system=sr.LinearSystem(-np.eye(d), np.ones((d, 2)), names=()),
+        horizon=1.0,
+        initial_state=np.ones(d),
+        control=sr.Box(-np.ones(2), np.ones(2)),
+        disturbance=sr.Ellipsoid(np.zeros(d), np.eye(d)),
+        path=[sr.PathConstraint(sr.Box(-np.full(d, 2.0), np.full(d, 2.0)), name=f"wall {k}") for k in range(40)],
+        terminal=[sr.Polytope(np.eye(d), np.ones(d))],
+        names=sr.Names(states=[f"state {k}" for k in range(d)]),
+    )
+
+
+def test_what_a_problem_is_made_of_is_said_in_ten_lines_too() -> None:
+    problem = many_states()
+    nouns = [
+        problem,
+        problem.system,
+        problem.disturbance,
+        *problem.path,
+        *problem.terminal,
+        problem.names,
+        problem.cost,
+    ]
+    nouns += [sr.Dictionary.indicators(np.linspace(0, 1, 301)), sr.IntegralConstraint(G=np.ones((1, 2)), upper=1.0)]
+    for one in nouns:
+        lines = repr(one).splitlines()
+        assert lines[0].startswith(type(one).__name__)
+        assert len(lines) <= LINES
+        assert max(map(len, lines)) <= WIDTH + len("  disturbance_class: ")
+    assert "A=array (60, 60)" in repr(problem.system)
+
+
+def test_a_small_set_is_said_with_its_numbers_and_what_is_absent_is_not_said() -> None:
+    assert repr(sr.Box([-1.0], [1.0])) == "Box(lower=[-1.], upper=[1.])"
+    assert "parameters" not in repr(sr.LinearSystem([[0.0]], [[1.0]]))
+
+
+def test_a_check_says_its_verdict_first_and_which_claims_fail() -> None:
+    held = tuple(Finding(f"claim {k}", "holds", "as it is") for k in range(40))
+    assert repr(sr.Check("a title", held, 1.0)).splitlines()[0] == "Check: verified"
+    refuted = sr.Check("a title", (*held, Finding("cost", "fails", "J = 3, not 2")), 1.0)
+    assert repr(refuted).splitlines() == [
+        "Check: refuted",
+        "  title: a title",
+        "  40 claims hold",
+        "  cost fails: J = 3, not 2",
+        "  seconds: 1",
+    ]
+    many = sr.Check("t" * 500, tuple(Finding(f"claim {k}", "fails", "long " * 90) for k in range(40)), 1.0)
+    assert len(repr(many).splitlines()) == LINES
+    assert max(map(len, repr(many).splitlines())) <= WIDTH + 2
+
+
+def test_a_result_with_units_says_that_of_its_cost_and_a_controller_says_where_it_is() -> None:
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0.0]], [[1.0]]),
+        horizon=2.0,
+        initial_state=[1.0],
+        control=sr.Box([-1.0], [1.0]),
+        terminal=[sr.Box([-0.5], [0.5])],
+        names=sr.Names(control_units=["N"], time="s"),
+    )
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 2})
+    assert "  cost: 0.5 N s" in repr(result).splitlines()
+    controller = sr.controller(result)
+    controller.step(0.0, [1.0])
+    assert repr(controller) == "Controller of 2 pieces, 1 steps made: applies its plan; covered"
+
+
+def test_a_dictionary_that_is_none_is_refused_before_anything_is_written_down() -> None:
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0.0]], [[1.0]]), horizon=2.0, initial_state=[1.0], control=sr.Box([-1.0], [1.0])
+    )
+    with pytest.raises(sr.InputError, match=r"control: expected a Dictionary.*got dict"):
+        sr.transcribe(problem, control={"name": "piecewise_constant", "pieces": 2})  # type: ignore[arg-type]

@@ -70,6 +70,12 @@ class Controller:
             resolving.prepare(plan)
         self.reset()
 
+    def __repr__(self) -> str:
+        pieces = len(self._planned.model.control.breakpoints) - 1
+        state = "covered" if self._covered else "not covered by the proof"
+        kind = "applies its plan" if self._resolving is None else "solves anew at every step"
+        return f"Controller of {pieces} pieces, {len(self._steps)} steps made: {kind}; {state}"
+
     @property
     def breakpoints(self) -> Array:
         """When the pieces of the control begin, and the horizon at the end, ``(K + 1,)``, in the time of the

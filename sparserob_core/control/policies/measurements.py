@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense, sealed
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
@@ -26,6 +27,8 @@ class Measurements:
     C: npt.ArrayLike
     noise: ConvexSet | None = None
     latency: float = 0.0
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         sealed(self)

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.control.problem.prices import by_time
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense, sealed
@@ -26,6 +27,8 @@ class Quadratic:
 
     Q: Array
     reference: Array
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         sealed(self)
@@ -54,6 +57,8 @@ class Cost:
     state: Term | None = None
     control: Term | None = None
     final: Term | None = None
+
+    __repr__ = noun
 
     def checked(self, states: int, controls: int, weights: Array) -> Cost:
         """The same cost for that many states and controls, with `Quadratic` terms and tuples for groups; raises

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
@@ -35,6 +36,8 @@ class Dictionary:
     breakpoints: Array
     _owner: ClassVar[np.ndarray | None] = None  # of indicators: the function (K,) that is 1 on each piece
     _entries: ClassVar[csr_array | None] = None  # of a sparse array
+
+    __repr__ = noun
 
     def __init__(self, breakpoints: npt.ArrayLike, values: npt.ArrayLike | csr_array) -> None:
         times = _times(breakpoints)

@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias, final, get_args
 
 import numpy as np
 
+from sparserob_core.brief import noun
 from sparserob_core.control.problem.expression import Entries, beside
 from sparserob_core.control.problem.system import LinearSystem, Matrix, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import product
@@ -39,6 +40,8 @@ class Disturbance:
     kind: DisturbanceClass = "piecewise_constant"
     start: float = 0.0
     stop: float | None = None
+
+    __repr__ = noun
 
     def entering(self, where: str, mode: LinearSystem) -> LinearSystem:
         """One of the systems that take turns, under this disturbance alone; raises `InputError` where it does not

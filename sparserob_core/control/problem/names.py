@@ -10,6 +10,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 
 KINDS = {"states": "x", "controls": "u", "disturbances": "w"}
@@ -35,6 +36,8 @@ class Names:
     disturbance_units: Sequence[str] = ()
     time: str = ""
     plane: Sequence[str] = ()
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         seen: dict[str, str] = {}

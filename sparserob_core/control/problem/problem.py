@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, final, get_args
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass, joined
@@ -48,6 +49,8 @@ class PathConstraint:
     name: str | None = None
     relative_to: npt.ArrayLike | None = None
 
+    __repr__ = noun
+
     def __post_init__(self) -> None:
         sealed(self)
 
@@ -67,6 +70,8 @@ class MixedConstraint:
     start: float = 0.0
     stop: float | None = None
     name: str | None = None
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         sealed(self)
@@ -94,6 +99,8 @@ class IntegralConstraint:
     start: float = 0.0
     stop: float | None = None
     name: str | None = None
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         sealed(self)
@@ -188,6 +195,8 @@ class OptimalControlProblem:
     measurements: Measurements | None = None
     repeat: bool | Repeating = False
     execution: npt.ArrayLike | None = None
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem | SwitchedSystem | VaryingSystem):

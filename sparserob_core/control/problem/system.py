@@ -11,6 +11,7 @@ from typing import TypeAlias, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import (
     ExpressionMatrix,
@@ -52,6 +53,8 @@ class LinearSystem:
     names: Sequence[str] = ()
     c: Matrix | None = None
     delay: float = 0.0
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         self._check_parameters()
@@ -414,6 +417,8 @@ class SwitchedSystem:
     pieces: Sequence[tuple[float, LinearSystem]]
     delay: float = 0.0
 
+    __repr__ = noun
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "delay", _duration(self.delay))
         given = list(self.pieces)
@@ -518,6 +523,8 @@ class VaryingSystem:
     law: LinearSystem
     horizon: float
     delay: float = 0.0
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "delay", _duration(self.delay))

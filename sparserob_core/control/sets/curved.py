@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Bool, Float, dense, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, bisect, few_digits, ratios, vertex_excess
@@ -31,6 +32,8 @@ class Ellipsoid(ConvexSet):
     if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
 
         def __init__(self, centre: npt.ArrayLike, shape: npt.ArrayLike) -> None: ...
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         try:
@@ -162,6 +165,8 @@ class NormBall(ConvexSet):
     p: float
     radius: float
     centre: Array
+
+    __repr__ = noun
 
     def __init__(
         self, p: float, radius: float, centre: npt.ArrayLike | None = None, dimension: int | None = None

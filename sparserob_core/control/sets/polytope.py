@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, dense, sealed, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_excess
@@ -35,6 +36,8 @@ class Polytope(ConvexSet):
     if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
 
         def __init__(self, H: npt.ArrayLike, h: npt.ArrayLike) -> None: ...
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         try:

@@ -10,6 +10,7 @@ from typing import final
 
 import numpy as np
 
+from sparserob_core.brief import noun
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -28,6 +29,8 @@ class Zonotope(ConvexSet):
 
     centre: Array
     generators: Array
+
+    __repr__ = noun
 
     def __post_init__(self) -> None:
         sealed(self)

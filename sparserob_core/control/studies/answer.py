@@ -83,6 +83,11 @@ class ControlResult(Result):
         return ControlResult(**known, model=model, causal=causal)
 
     @property
+    def _unit(self) -> str:
+        unit = self.model.problem.cost_unit
+        return f" {unit}" if unit else ""
+
+    @property
     def plain(self) -> Result:
         """The same result without its problem."""
         return Result(**{one.name: getattr(self, one.name) for one in fields(Result)})

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.brief import noun
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -82,6 +83,8 @@ class Transcription:
     _explained: dict[tuple[str, Formulation, int, bytes], TimedExplanation | None] = field(
         default_factory=dict, init=False, repr=False
     )
+
+    __repr__ = noun
 
     def explained(self, cuts: Sequence[Cut]) -> list[TimedExplanation | None]:
         """The constraints of a result in numbers, one for each; ``None`` for one whose index does not say them, such as

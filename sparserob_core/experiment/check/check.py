@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from sparserob_core.brief import brief
+from sparserob_core.brief import shortened
 from sparserob_core.checker.outcome import Clock, Finding
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.check.files import compared
@@ -42,7 +42,12 @@ class Check:
     seconds: float
     not_compared: tuple[str, ...] = ()
 
-    __repr__ = brief
+    def __repr__(self) -> str:
+        """The verdict first, then the claims that do not hold; those that hold are counted."""
+        doubtful = [one for one in self.claims if one.verdict != "holds"]
+        lines = [f"Check: {self.status}", f"  title: {self.title}", f"  {len(self.claims) - len(doubtful)} claims hold"]
+        lines += [f"  {one.name} {one.verdict}: {one.text}" for one in doubtful]
+        return shortened([*lines, f"  seconds: {self.seconds:.3g}"])
 
     @property
     def status(self) -> str:
