@@ -17,8 +17,9 @@ from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.cost.price import Price
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.integrals import integrating
 from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
@@ -35,7 +36,6 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb_mat
 
-    from sparserob_core.checker.reach.adjoint import Adjoint
 
 RETURN, EQUALS, STEP = "return", "equals", "control_step"
 INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: ten times what counts as no violation, so
@@ -351,6 +351,15 @@ class Case:
     @cached_property
     def price(self) -> Price:
         return Price(self.problem, self.control, self.clock, self.changing)
+
+    @cached_property
+    def motion(self) -> Motion:
+        """What rows of a known system have in common, the inputs of the control before those of the disturbance."""
+        parts = flows(self.problem.system, [])[0].parts
+        A, B, E = (parts[name][0] for name in ("A", "B", "E"))
+        if self.problem.disturbance is not None:
+            B = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)])
+        return Motion.of(A, B, self.grid[-1], self.clock)
 
     @cached_property
     def adjoints(self) -> dict[bytes, Adjoint]:

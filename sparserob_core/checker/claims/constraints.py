@@ -88,10 +88,15 @@ def bounded(case: Case, window: Window) -> str:
 
 def is_followed(case: Case, window: Window) -> bool:
     """Whether a constraint is proven along the adjoints of its rows, on cells of the checker's own."""
-    system, flat = case.problem.system, window.seen.facets is not None
+    return follows(case) and window.seen.facets is not None
+
+
+def follows(case: Case) -> bool:
+    """Whether rows of the system, which is known and has many states, are followed by their adjoints."""
+    system = case.problem.system
     if not isinstance(system, LinearSystem) or system.parameter_count or system.states < FOLLOWED:
         return False
-    return flat and not case.answering and case.execution is None and len(case.grid) <= MANY
+    return not case.answering and case.execution is None and len(case.grid) <= MANY
 
 
 def _along_rows(case: Case, window: Window) -> Proven:
@@ -111,18 +116,12 @@ def _along_rows(case: Case, window: Window) -> Proven:
 def followed(case: Case, c: Array) -> Worst:
     """The worst of the row ``c (d,)`` of a known system, by its adjoint; one adjoint serves a row and its opposite."""
     problem, made = case.problem, case.adjoints
-    assert isinstance(problem.system, LinearSystem)
-    parts = flows(problem.system, [])[0].parts
-    A, B, E = (parts[name][0] for name in ("A", "B", "E"))
-    F = B
-    if problem.disturbance is not None:
-        F = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)])
+    c = c + 0.0  # no -0, of which the bytes of an opposite row would be others
+    opposite = (0.0 - c).tobytes()
     table = Enclosed.of(stacked([list(row) for row in zip(*(u.entries() for u in case.scene.control), strict=True)]))
     jumps = None if case.measurable else case.changes
-    if (-c).tobytes() in made:
-        made[c.tobytes()] = made[(-c).tobytes()].reversed()
-    elif c.tobytes() not in made:
-        made[c.tobytes()] = Adjoint.of(A, F, c, case.grid[-1], case.clock)
+    if c.tobytes() not in made:
+        made[c.tobytes()] = made[opposite].reversed() if opposite in made else Adjoint.of(case.motion, c)
     return Worst(
         made[c.tobytes()],
         np.asarray(problem.initial_state, dtype=float),

@@ -11,7 +11,8 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.answers import PEAK, WORST, Named, answers_of
-from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, before, listed, number, numbers
+from sparserob_core.checker.claims.constraints import followed, follows
 from sparserob_core.checker.claims.duality import EFFORT, Row
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -53,7 +54,10 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
     middle = [] if bound is None else bound.interior_point().tolist()
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
-        row = case.duality.row(direction, case.problem.horizon, middle, arb(value), disturbed=False)
+        if follows(case):
+            row = _along_adjoint(case, direction, case.problem.horizon, arb(value), disturbed=False)
+        else:
+            row = case.duality.row(direction, case.problem.horizon, middle, arb(value), disturbed=False)
         rows.append((multiplier, row))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
         return rows, None
@@ -147,14 +151,38 @@ def _undisturbed(
     _, direction, time, parameter = said
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
-    row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.looped)
-    if case.measurable and not case.answering:
-        row = replace(row, constant=answers_of(case).disturbed(c, time, limit))
+    if follows(case):
+        row = _along_adjoint(case, c, time, limit)
+    else:
+        row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.looped)
+        if case.measurable and not case.answering:
+            row = replace(row, constant=answers_of(case).disturbed(c, time, limit))
     row = replace(row, sizes=None if case.execution is None else case.execution.least(c, time))
     if window is not None and window.is_mixed:
         piece = piece_of(case, window, entry, time)
         row.slope[piece] = [a + b for a, b in zip(row.slope[piece], balls(gain), strict=True)]
     return row
+
+
+def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> Row:
+    """``c'x(t) <= limit`` of a system whose rows are followed, for the worst deviations or without any: no matrix is
+    made for a duration, which of hundreds of states takes a minute each."""
+    from flint import arb
+
+    worst, problem, delay = followed(case, c), case.problem, case.problem.system.delay
+    m, begins = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
+    state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
+    constant = sum((w * x for w, x in zip(state, balls(problem.initial_state), strict=True)), arb(0)) - limit
+    if problem.system.c is not None:  # a drift is an input that is 1
+        constant = constant + worst.weights(time, np.zeros(1), np.full(1, np.inf))[0][m]
+    if delay > 0.0:
+        (early,) = worst.weights(time, np.zeros(1), begins[:1])
+        constant = sum((w * u for w, u in zip(early[:m], balls(before(problem)), strict=True)), constant)
+    if disturbed and problem.initial_set is not None:
+        constant = constant + known(problem.initial_set).support(state)
+    if disturbed and problem.disturbance is not None:
+        constant = constant + worst.pushed_by(time)
+    return Row(constant, [every[:m] for every in slope])
 
 
 def _of_control(case: Case, name: str, direction: Array, time: float, named: Named | None) -> Row:

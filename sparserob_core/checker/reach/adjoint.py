@@ -25,7 +25,7 @@ from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed,
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
-    from flint import arb_mat
+    from flint import arb, arb_mat
 
 ORDER = 13  # of the polynomials
 SHORT = 0.5  # growth times length of a step, at most: what is left of them is then 1e-15 of a row's largest term
@@ -38,55 +38,116 @@ AT_ONCE = 2**22  # numbers of rows that are worked on at once
 
 @final
 @dataclass(frozen=True, eq=False)
-class Adjoint:
-    """``l`` at the ends of steps, ``nodes (N + 1, d)``; ``rows (p + 1, d, d)`` and ``inputs (p + 1, d, q)``: what makes
-    of a node the terms of the polynomials of ``l`` and of ``l'F`` on the step after it. ``growth``: a bound of how fast
-    ``l`` moves, in the states' own ``units``. ``step`` is a power of two, so that places within it are exact."""
+class Motion:
+    """What all rows of a system ``x' = A x + F u`` share: steps of a length, in which a row moves little in the states'
+    own ``units``; ``growth`` bounds how fast. The length is a power of two, so that places within a step are exact."""
 
     A: arb_mat
     F: arb_mat
-    nodes: Enclosed
-    rows: Enclosed
-    inputs: Enclosed
     units: Array
     growth: float
     step: float
+    count: int
+    clock: Clock
 
     @staticmethod
-    def of(A: arb_mat, F: arb_mat, c: Array, horizon: float, clock: Clock) -> Adjoint:
-        """That of the row ``c (d,)``, an exact one, with inputs through ``F (d, q)``."""
-        from flint import arb, arb_mat
+    def of(A: arb_mat, F: arb_mat, horizon: float, clock: Clock) -> Motion:
+        """That of rows with inputs through ``F (d, q)`` up to the ``horizon``."""
+        from flint import arb
 
-        d = A.nrows()
         own = OwnUnits.of(A, horizon, np.abs(middles(F)).sum(axis=1))
         inside = own.rows(own.states(own.matrix)).tolist()
         growth = max(float(sum((abs(x) for x in row), arb(0)).upper()) for row in inside) * OUTWARD
         step = 2.0 ** floor(log2(min(horizon / 64.0, SHORT / max(growth, 1e-300))))
         count = ceil(horizon / step)
-        if not (count <= MOST_STEPS and count * d <= MOST):
+        if not (count <= MOST_STEPS and count * A.nrows() <= MOST):
             raise Unchecked("the system is too fast for its horizon to be followed")
-        unit = arb_mat(d, d, [int(i == j) for i in range(d) for j in range(d)])
-        power, found = (A * arb(step)).exp(), [[arb(float(v)) for v in c]]
-        while len(found) < BLOCK:
-            clock.check()
-            found += (stacked(found) * power).tolist()
-            power = power * power
-        blocks = [stacked(found)]
-        while len(blocks) * BLOCK <= count:
-            clock.check()
-            blocks += [block * power for block in blocks[: -(-(count + 1) // BLOCK) - len(blocks)]]
-            power = power * power
-        parts = [Enclosed.of(block) for block in blocks]
-        nodes = Enclosed(
-            *(np.concatenate(one)[: count + 1] for one in zip(*((p.mid, p.rad) for p in parts), strict=True))
-        )
-        terms, driven = [unit], [F]
+        return Motion(A, F, own.units, growth, step, count, clock)
+
+    @cached_property
+    def _powers(self) -> list[arb_mat]:
+        """The transition over a step, and what was squared of it."""
+        from flint import arb
+
+        return [(self.A * arb(self.step)).exp()]
+
+    def over(self, place: int) -> arb_mat:
+        """The transition over ``2^place`` steps."""
+        while len(self._powers) <= place:
+            self.clock.check()
+            self._powers.append(self._powers[-1] * self._powers[-1])
+        return self._powers[place]
+
+    def _expanded(self, first: arb_mat) -> Enclosed:
+        """The terms ``(p + 1, d, n)`` of ``e^{A r}`` times a matrix ``(d, n)``, in the share of a step that ``r``
+        is."""
+        from flint import arb
+
+        terms = [first]
         for order in range(1, ORDER + 1):
-            clock.check()
-            terms.append(A * terms[-1] * (arb(step) / order))
-            driven.append(A * driven[-1] * (arb(step) / order))
-        rows = Enclosed.all(terms, (ORDER + 1, d, d))
-        return Adjoint(A, F, nodes, rows, Enclosed.all(driven, (ORDER + 1, d, F.ncols())), own.units, growth, step)
+            self.clock.check()
+            terms.append(self.A * terms[-1] * (arb(self.step) / order))
+        return Enclosed.all(terms, (ORDER + 1, first.nrows(), first.ncols()))
+
+    @cached_property
+    def rows(self) -> Enclosed:
+        """What makes of a node the terms of the polynomials of ``l`` on the step after it, ``(p + 1, d, d)``."""
+        from flint import arb_mat
+
+        d = self.A.nrows()
+        return self._expanded(arb_mat(d, d, [int(i == j) for i in range(d) for j in range(d)]))
+
+    @cached_property
+    def inputs(self) -> Enclosed:
+        """And those of ``l'F``, ``(p + 1, d, q)``."""
+        return self._expanded(self.F)
+
+    @cached_property
+    def bending(self) -> list[Enclosed]:
+        """Terms of ``e^{A r} [A^2, A F, A^2 F]``, ``(1, d, d + 2 q)`` each."""
+        from flint import arb, arb_mat
+
+        once = self.A * self.F
+        every = zip((self.A * self.A).tolist(), once.tolist(), (self.A * once).tolist(), strict=True)
+        term, found = arb_mat([[*a, *b, *c] for a, b, c in every]), []
+        for order in range(BENDING + 1):
+            self.clock.check()
+            if order:
+                term = self.A * term * (arb(self.step) / order)
+            found.append(Enclosed.all([term], (1, term.nrows(), term.ncols())))
+        return found
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Adjoint:
+    """``l`` at the ends of the steps of a ``motion``, ``nodes (N + 1, d)``."""
+
+    motion: Motion
+    nodes: Enclosed
+
+    @staticmethod
+    def of(motion: Motion, c: Array) -> Adjoint:
+        """That of the row ``c (d,)``, an exact one."""
+        from flint import arb
+
+        found, place = [[arb(float(v)) for v in c]], 0
+        while len(found) < BLOCK:
+            found += (stacked(found) * motion.over(place)).tolist()
+            place += 1
+        blocks = [stacked(found)]
+        while len(blocks) * BLOCK <= motion.count:
+            motion.clock.check()
+            power, place = motion.over(place), place + 1
+            blocks += [block * power for block in blocks[: -(-(motion.count + 1) // BLOCK) - len(blocks)]]
+        parts = [Enclosed.of(block) for block in blocks]
+        every = zip(*((part.mid, part.rad) for part in parts), strict=True)
+        return Adjoint(motion, Enclosed(*(np.concatenate(one)[: motion.count + 1] for one in every)))
+
+    @property
+    def step(self) -> float:
+        """The length of a step."""
+        return self.motion.step
 
     def reversed(self) -> Adjoint:
         """That of ``-c``."""
@@ -100,24 +161,24 @@ class Adjoint:
     @cached_property
     def sizes(self) -> Array:
         """The sums of the absolute values of ``l`` in own units at the ends of steps, ``(N + 1,)``."""
-        return np.asarray(((np.abs(self.nodes.mid) + self.nodes.rad) * self.units).sum(axis=1) * OUTWARD)
+        return np.asarray(((np.abs(self.nodes.mid) + self.nodes.rad) * self.motion.units).sum(axis=1) * OUTWARD)
 
     @cached_property
     def left(self) -> Array:
         """What is left of the expansion of ``l``, in the same sums, ``(N,)``."""
-        short = self.growth * self.step
+        short = self.motion.growth * self.step
         return np.asarray(self.sizes[:-1] * (short ** (ORDER + 1) / factorial(ORDER + 1) * exp(short)) * OUTWARD)
 
     @cached_property
     def pushes(self) -> Array:
         """How large a row of ``F`` is in own units, ``(q,)``."""
-        F = Enclosed.of(self.F)
-        return np.asarray(((np.abs(F.mid) + F.rad) / self.units[:, None]).max(axis=0, initial=0.0) * OUTWARD)
+        F = Enclosed.of(self.motion.F)
+        return np.asarray(((np.abs(F.mid) + F.rad) / self.motion.units[:, None]).max(axis=0, initial=0.0) * OUTWARD)
 
     @cached_property
     def driven(self) -> Enclosed:
         """The terms ``(N, p + 1, q)`` of ``l'F`` on every step, the rest among their radii, at the first."""
-        mid, rad = _product(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.inputs)
+        mid, rad = _product(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.motion.inputs)
         rad[:, 0] += self.left[:, None] * self.pushes
         return Enclosed(mid, rad * OUTWARD)
 
@@ -150,22 +211,22 @@ class Adjoint:
     def at(self, times: Array) -> Enclosed:
         """``l`` at exact times ``(k,)``, ``(k, d)``."""
         steps, shares = self.placed(times)
-        mid, rad = np.empty((times.size, self.units.size)), np.empty((times.size, self.units.size))
+        mid, rad = np.empty((times.size, self.motion.units.size)), np.empty((times.size, self.motion.units.size))
         whole = shares == 0.0
         mid[whole], rad[whole] = self.nodes.mid[steps[whole]], self.nodes.rad[steps[whole]]
         used, which = np.unique(steps[~whole], return_inverse=True)
         others = np.flatnonzero(~whole)
-        several = max(1, AT_ONCE // self.rows.mid[:, 0].size)
+        several = max(1, AT_ONCE // self.motion.rows.mid[:, 0].size)
         for start in range(0, used.size, several):
             part = used[start : start + several]
-            terms, off = _product(Enclosed(self.nodes.mid[part], self.nodes.rad[part]), self.rows)
+            terms, off = _product(Enclosed(self.nodes.mid[part], self.nodes.rad[part]), self.motion.rows)
             mine = (which >= start) & (which < start + several)
             here, place = others[mine], which[mine] - start
             powers = shares[here][:, None] ** np.arange(ORDER + 1)
             chosen = terms[place]
             mid[here] = np.einsum("kjd,kj->kd", chosen, powers)
             lost = np.einsum("kjd,kj->kd", off[place] + rounding(3 * ORDER) * np.abs(chosen), powers)
-            rad[here] = (lost + self.left[steps[here]][:, None] / self.units) * OUTWARD
+            rad[here] = (lost + self.left[steps[here]][:, None] / self.motion.units) * OUTWARD
         return Enclosed(mid, rad)
 
     def integrals(self, times: Array) -> tuple[Enclosed, Array]:
@@ -198,22 +259,15 @@ class Adjoint:
     @cached_property
     def bends(self) -> tuple[Array, Array, Array]:
         """On every step bounds of ``|l''|``, ``(N, d)``, of ``|l'AF|`` and of ``|l'A^2 F|``, ``(N, q)``."""
-        from flint import arb, arb_mat
-
-        d, q = self.A.nrows(), self.F.ncols()
-        once, twice = self.A * self.F, self.A * (self.A * self.F)
-        every = zip((self.A * self.A).tolist(), once.tolist(), twice.tolist(), strict=True)
-        term = arb_mat([[*a, *b, *c] for a, b, c in every])
-        first = Enclosed.of(term)
-        short = self.growth * self.step
+        motion = self.motion
+        d, q, first = motion.A.nrows(), motion.F.ncols(), motion.bending[0]
+        short = motion.growth * self.step
         rest = short ** (BENDING + 1) / factorial(BENDING + 1) * exp(short)
-        heights = ((np.abs(first.mid) + first.rad) / self.units[:, None]).max(axis=0)
+        heights = ((np.abs(first.mid[0]) + first.rad[0]) / motion.units[:, None]).max(axis=0)
         found = self.sizes[:-1, None] * rest * heights
         nodes = Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1])
-        for order in range(BENDING + 1):
-            if order:
-                term = self.A * term * (arb(self.step) / order)
-            mid, rad = _product(nodes, Enclosed.all([term], (1, d, d + 2 * q)))
+        for term in motion.bending:
+            mid, rad = _product(nodes, term)
             found += np.abs(mid[:, 0]) + rad[:, 0]
         found *= OUTWARD
         return found[:, :d], found[:, d : d + q], found[:, d + q :]
@@ -302,6 +356,35 @@ class Worst:
             top, rad, size = top + high, rad + more, size + np.abs(high)
         rad = (rad + 8.0 * HALF_ULP * (np.abs(top) + size)) * OUTWARD
         return top + rad, 3.0 * rad
+
+    def carried(self, time: float) -> list[arb]:
+        """What the initial state gives to the row at a time, ``(d,)``."""
+        from flint import arb
+
+        row = self.adjoint.at(np.array([time]))
+        return [arb(m, r) for m, r in zip(row.mid[0].tolist(), row.rad[0].tolist(), strict=True)]
+
+    def weights(self, time: float, starts: Array, stops: Array) -> list[list[arb]]:
+        """What inputs of 1 between ``starts (K,)`` and ``stops (K,)`` give to the row at a time, ``(q,)`` each."""
+        from flint import arb
+
+        begun, columns = starts < time, self.adjoint.motion.F.ncols()
+        found = [[arb(0)] * columns for _ in range(starts.size)]
+        part = self.adjoint.between(np.full(begun.sum(), time), starts[begun], np.minimum(stops[begun], time))
+        for k, mid, rad in zip(np.flatnonzero(begun).tolist(), part.mid.tolist(), part.rad.tolist(), strict=True):
+            found[k] = [arb(m, r) for m, r in zip(mid, rad, strict=True)]
+        return found
+
+    def pushed_by(self, time: float) -> arb:
+        """What the worst disturbance adds to the row at a time."""
+        from flint import arb
+
+        assert self.pushed is not None
+        if self.changes is None:
+            (value,), (rad,) = self._measurable(np.array([time]))
+            return arb(float(value), float(2.0 * rad))
+        every = self.weights(time, self.changes[:-1], self.changes[1:])
+        return sum((known(self.pushed).support(one[self._mine]) for one in every), arb(0))
 
     def _constant(self, times: Array) -> tuple[Array, Array]:
         assert self.pushed is not None and self.changes is not None

@@ -12,7 +12,8 @@ import pytest
 from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.claims import cells, claims, constraints, replay, units
+from sparserob_core.checker.claims import cells, claims, constraints, multipliers, replay, units
+from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Duality, Row
 from sparserob_core.checker.outcome import Broken
@@ -54,6 +55,30 @@ def test_a_row_is_the_worst_case_of_every_control(name: str) -> None:
         pushed = [[float(x.mid()) for x in block] for block in duality.pushed(row, time)] if made.bound else []
         assert np.array(pushed).reshape(-1, 2) == pytest.approx(exact.blocks[0], abs=1e-13)
         assert [float(x.mid()) for x in duality.carried(row, time)] == pytest.approx(exact.free[0], abs=1e-13)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_row_along_its_adjoint_is_the_one_that_exponentials_give(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(constraints, "FOLLOWED", 1)
+    case = kind(name).case()
+    if not constraints.follows(case):
+        return
+    cases, problem = [case], case.problem
+    if problem.disturbance is not None and problem.system.delay == 0.0:
+        cases.append(replace(case, problem=replace(problem, disturbance_class="measurable")))
+    for time in (0.0, 0.25, 0.7, 1.25, 1.3, 2.0):
+        for one in cases:
+            row, limit = DIRECTIONS[2], arb(0.375)
+            found = multipliers._along_adjoint(one, row, time, limit)
+            exact = one.duality.row(row, time, [], limit, disturbed=not one.looped)
+            constant = answers_of(one).disturbed(row, time, limit) if one.measurable else exact.constant
+            pairs = [(found.constant, constant)]
+            pairs += [
+                (a, b)
+                for mine, its in zip(found.slope, exact.slope, strict=True)
+                for a, b in zip(mine, its, strict=True)
+            ]
+            assert all(a.overlaps(b) and float(a.rad()) < 1e-12 for a, b in pairs), (time, one.measurable)
 
 
 def test_what_is_carried_over_many_pieces_is_that_of_few(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import pytest
 from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.outcome import Clock, Unchecked
-from sparserob_core.checker.reach.adjoint import Adjoint, Worst
+from sparserob_core.checker.reach.adjoint import Adjoint, Motion, Worst
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Box, Polytope
 
@@ -25,7 +25,7 @@ TIMES = np.array([0.0, 0.3, 1.0, 2.2, 3.99, 4.0])
 
 
 def adjoint() -> Adjoint:
-    return Adjoint.of(arb_mat(A), arb_mat(F), C, HORIZON, Clock())
+    return Adjoint.of(Motion.of(arb_mat(A), arb_mat(F), HORIZON, Clock()), C)
 
 
 def worst(kind: str) -> Worst:
@@ -108,7 +108,7 @@ def test_the_measurable_worst_is_that_of_ever_shorter_pieces() -> None:
 
 def test_a_system_that_is_too_fast_is_not_followed() -> None:
     with pytest.raises(Unchecked):
-        Adjoint.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), np.ones(1), 1.0, Clock())
+        Motion.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), 1.0, Clock())
 
 
 def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
