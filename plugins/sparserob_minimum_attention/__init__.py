@@ -37,7 +37,7 @@ class MinimumAttention(sr.LinearKeys):
                 expected="none: minimum_attention makes the control a state, which acts without delay",
                 got=f"{self.system.delay:g}",
             )
-        plain = self.system.build()
+        plain = self.system.build(self.horizon)
         d, m = plain.states, plain.controls
         path = [_extended_window(item, m) for item in self.windows(d)]
         ends = [_extended(end, m) for end in self.ends(d)]
@@ -97,9 +97,9 @@ class MinimumAttention(sr.LinearKeys):
             }
             made.append(larger if until is None else {"until": until, **larger})
         if system.pieces is None:
-            return system.model_copy(update=made[0]).build()
+            return system.model_copy(update=made[0]).build(self.horizon)
         pieces = [piece.model_copy(update=one) for piece, one in zip(system.pieces, made, strict=True)]
-        return system.model_copy(update={"pieces": pieces}).build()
+        return system.model_copy(update={"pieces": pieces}).build(self.horizon)
 
     def _initial_control(self, m: int) -> list[float]:
         given = self.initial_control if isinstance(self.initial_control, list) else [self.initial_control] * m

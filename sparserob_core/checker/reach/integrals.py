@@ -13,7 +13,6 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.names import Names
@@ -110,22 +109,23 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 
 def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> System:
-    """The system with its coordinates, cut where one of them begins or ends; one that changes with time has none that
-    begins later than it does."""
+    """The system with its coordinates, cut where one of them begins or ends."""
+    switches, modes = system.switches, system.modes
     if isinstance(system, VaryingSystem):
-        if any(one.begin > 0.0 for one in coordinates):
-            raise Unchecked("of a system that changes with time the checker knows integrals from 0 on")
-        law = _with(system.law, [(one.h, one.g) for one in coordinates])
-        return VaryingSystem(law, system.horizon, system.delay)
-    turns = [*system.switches, horizon]
+        switches, modes = tuple(begin for begin, _ in system.later), tuple(law for _, _, law in system.laws)
+    turns = [*switches, horizon]
     for time in sorted({t for one in coordinates for t in (one.begin, one.end)}):
         if all(abs(time - turn) > APART * horizon for turn in (0.0, *turns)):
             turns.append(time)
-    pieces, begin = [], 0.0
+    pieces, begins, begin = [], [0.0], 0.0
     for until in sorted(turns):
-        which = sum(switch <= begin for switch in system.switches)
-        pieces.append((until, _with(system.modes[which], list(_acting(coordinates, begin, until)))))
+        which = sum(switch <= begin for switch in switches)
+        pieces.append((until, _with(modes[which], list(_acting(coordinates, begin, until)))))
+        begins.append(until)
         begin = until
+    if isinstance(system, VaryingSystem):
+        laws = [(start, law) for start, (_, law) in zip(begins, pieces, strict=False)]
+        return VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:]))
     return SwitchedSystem(pieces, system.delay) if len(pieces) > 1 else replace(pieces[0][1], delay=system.delay)
 
 

@@ -57,9 +57,7 @@ class Disturbance:
 def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tuple[System, ConvexSet, DisturbanceClass]:
     """The system under all of these disturbances side by side until the ``horizon``, the set of them together, and
     their class; raises `InputError` that begins with ``disturbance`` and the number of the one at fault."""
-    if isinstance(system, VaryingSystem):
-        return _joined_in_time(system, every, horizon)
-    kind = every[0].kind
+    kind, first = every[0].kind, system.law if isinstance(system, VaryingSystem) else system.modes[0]
     for i, one in enumerate(every):
         if one.kind not in get_args(DisturbanceClass):
             wanted = f"one of {', '.join(get_args(DisturbanceClass))}"
@@ -73,17 +71,22 @@ def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tupl
             )
     windows = [_window(f"disturbance.{i}", one, horizon) for i, one in enumerate(every)]
     sets = [
-        _checked(f"disturbance.{i}.set", one.set, one.entering(f"disturbance.{i}", system.modes[0]))
+        _checked(f"disturbance.{i}.set", one.set, one.entering(f"disturbance.{i}", first))
         for i, one in enumerate(every)
     ]
     pieces: list[tuple[float, LinearSystem]] = []
+    begins: list[float] = []
     for begin, until, mode in legs(system, {time for window in windows for time in window}, horizon):
         columns = []
         for i, (one, (start, stop)) in enumerate(zip(every, windows, strict=True)):
             E = _columns(one.entering(f"disturbance.{i}", mode))
             acts = start < until - SHORTEST * horizon and begin + SHORTEST * horizon < stop
             columns.append(E if acts else np.zeros((mode.states, sets[i].dimension)))
+        begins.append(begin)
         pieces.append((until, replace(mode, E=reduce(beside, columns))))
+    if isinstance(system, VaryingSystem):
+        laws = [(begin, law) for begin, (_, law) in zip(begins, pieces, strict=True)]
+        return system.lawful(laws), product(sets), kind
     if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
         return pieces[0][1], product(sets), kind
     return (
@@ -91,18 +94,6 @@ def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tupl
         product(sets),
         kind,
     )
-
-
-def _joined_in_time(
-    system: VaryingSystem, every: Sequence[Disturbance], horizon: float
-) -> tuple[VaryingSystem, ConvexSet, DisturbanceClass]:
-    """`joined` of a system that changes with time: that of its law."""
-    law, bound, kind = joined(system.law, every, horizon)
-    if not isinstance(law, LinearSystem):
-        place = next(i for i, one in enumerate(every) if one.start > 0.0 or one.stop not in (None, horizon))
-        expected = "one that acts all the time where the system changes with time"
-        raise InputError(path=f"disturbance.{place}", expected=expected, got="one in a window")
-    return replace(system, law=law), bound, kind
 
 
 def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:
@@ -117,14 +108,19 @@ def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]
 
 
 def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[tuple[float, float, LinearSystem]]:
-    """Between which times which of the systems acts, cut at more times than its own, but not at rounding."""
-    ends = [*system.switches, horizon]
+    """Between which times which of the systems acts, or of the laws, cut at more times than its own, but not at
+    rounding."""
+    if isinstance(system, VaryingSystem):
+        switches, modes = tuple(begin for begin, _ in system.later), [law for _, _, law in system.laws]
+    else:
+        switches, modes = system.switches, list(system.modes)
+    ends = [*switches, horizon]
     for time in sorted(cuts):
         if min(abs(time - end) for end in (0.0, *ends)) > SHORTEST * horizon:
             ends.append(time)
     begin = 0.0
     for until in sorted(ends):
-        yield begin, until, system.modes[bisect_right(system.switches, begin)]
+        yield begin, until, modes[bisect_right(switches, begin)]
         begin = until
 
 

@@ -18,7 +18,13 @@ from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass, joined
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.prices import checked_weights, counted, integrals
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.system import (
+    LinearSystem,
+    SwitchedSystem,
+    System,
+    VaryingSystem,
+    require_period,
+)
 from sparserob_core.control.sets.sets import Equality, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense, sealed
@@ -157,9 +163,9 @@ class OptimalControlProblem:
 
     ``repeat``: at the horizon the plan begins again, for ever. Every final state is then one of the initial states,
     from which all constraints hold for another period, so that they hold for all time; the steps from any last control
-    to any first one are in ``control_step`` too. No set has to be invariant in between. What changes with time has the
-    horizon as its period. Final states stay inside by `WITHIN` of the set, so that what is proven to a tolerance is
-    proven for ever; coordinates of which there is one value are fixed at the end, to rounding.
+    to any first one are in ``control_step`` too. No set has to be invariant in between. What changes with time begins
+    again too, and has the horizon as its period. Final states stay inside by `WITHIN` of the set, so that what is
+    proven to a tolerance is proven for ever; coordinates of which there is one value are fixed at the end, to rounding.
 
     ``execution``: a share of the control, from 0 to 1, one for each: what is delivered differs from the command by at
     most that share of it, any function of time, and every constraint on the state holds nonetheless; of nothing
@@ -268,19 +274,22 @@ class OptimalControlProblem:
             )
 
     def _check_varying(self, system: VaryingSystem) -> None:
-        """What cannot be proven yet of a system that changes with time."""
+        """Raise `InputError` where the laws of a system that changes with time do not fill the horizon."""
+        last = len(system.later)
         if abs(system.horizon - self.horizon) > SHORTEST * self.horizon:
             raise InputError(
-                path="system", expected=f"a law up to {self.horizon:g}, the horizon", got=f"up to {system.horizon:g}"
+                path=f"system.pieces.{last}.until" if last else "system",
+                expected=f"{self.horizon:g}, the horizon, since it is the last piece"
+                if last
+                else f"a law up to {self.horizon:g}, the horizon",
+                got=f"up to {system.horizon:g}",
             )
-        for i, entry in enumerate(self.integral):
-            late = system.delay > 0.0 and np.any(entry.G)
-            if entry.start > 0.0 or late:
+        for i, (begin, until, _) in enumerate(system.laws):
+            if until - begin <= SHORTEST * self.horizon:
                 raise InputError(
-                    path=f"integral.{i}.from",
-                    expected="0, and a control that acts at once, where the system changes with time: a window that"
-                    " begins later makes pieces of it, which are not proven",
-                    got=f"from {entry.start:g} with a delay of {system.delay:g}",
+                    path=f"system.pieces.{i}.until",
+                    expected=f"a time that is after {begin:g} by more than rounding",
+                    got=f"{until!r}",
                 )
 
     def _executed(self) -> Array | None:
@@ -498,11 +507,7 @@ class OptimalControlProblem:
         if not self.repeat:
             return
         if isinstance(self.system, VaryingSystem):
-            raise InputError(
-                path="repeat",
-                expected="a system that stays the same with time, or has pieces, since no period of another is known",
-                got="one that changes with time",
-            )
+            require_period(self.system)
         if self.system.delay > 0.0:
             raise InputError(
                 path="repeat",

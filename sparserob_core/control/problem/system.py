@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import TypeAlias, final
 
 import numpy as np
@@ -26,8 +27,19 @@ from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, dense, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
+InTime: TypeAlias = tuple[
+    Sequence[Sequence[str | float]],
+    Sequence[Sequence[str | float]],
+    Sequence[Sequence[str | float]] | None,
+    Sequence[str | float] | None,
+]
+"""``A``, ``B``, ``E`` and ``c`` with entries in the time."""
 Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
 TIME = "t"
+PERIODIC = 1e-9
+"""Of an entry, by how much its values at both ends of a period may differ. What a horizon of 53 bits misses of a period
+is a tenth of it where an entry changes by its size in a millionth of the period; of ten times more a rounded decimal
+would pass for the period."""
 LOOKS = 65  # times at which the size of a system is looked at; with ten times fewer a short pericentre is overlooked
 _Entry: TypeAlias = Array | Callable[..., object] | ExpressionMatrix
 
@@ -516,21 +528,35 @@ class VaryingSystem:
     uncertain parameters.
 
     ``law``: a `LinearSystem` whose one parameter is the time: its matrices at ``p = (t,)`` are those at the time ``t``.
-    ``delay``, as that of a `LinearSystem`: what was commanded acts through the ``B`` of the time at which it acts. Made
-    of expressions by `of`. Raises `InputError`.
+    ``later``: times, one after another, each with the law that holds from then on. ``delay``, as that of a
+    `LinearSystem`: what was commanded acts through the ``B`` of the time at which it acts. Made of expressions by `of`
+    and `taking_turns`. Raises `InputError`.
     """
 
     law: LinearSystem
     horizon: float
     delay: float = 0.0
+    later: tuple[tuple[float, LinearSystem], ...] = ()
 
     __repr__ = noun
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "delay", _duration(self.delay))
-        if self.law.parameter_count != 1 or self.law.delay:
+        every = [self.law, *(law for _, law in self.later)]
+        if any(law.parameter_count != 1 or law.delay for law in every):
             expected = "a law whose one parameter is the time, without a delay of its own"
             raise InputError(path="system", expected=expected, got="another")
+        times = [0.0, *(begin for begin, _ in self.later), self.horizon]
+        for i, (begin, until) in enumerate(pairwise(times)):
+            if self.later and not begin < until:
+                raise InputError(path=f"system.pieces.{i}.until", expected=f"a time after {begin:g}", got=f"{until:g}")
+        for i, law in enumerate(every[1:], 1):
+            for what in ("states", "controls", "disturbances"):
+                _check_as_many(i, what, law, self.law)
+        if self.later and len({law.c is None for law in every}) > 1:
+            drifting = [law if law.c is not None else replace(law, c=np.zeros((law.states, 1))) for law in every]
+            object.__setattr__(self, "law", drifting[0])
+            object.__setattr__(self, "later", tuple(zip(times[1:-1], drifting[1:], strict=True)))
 
     @staticmethod
     def of(
@@ -544,23 +570,32 @@ class VaryingSystem:
     ) -> VaryingSystem:
         """The system whose entries are numbers and expressions in ``t`` and in the names that ``define`` gives to
         expressions in ``t``; see `parse_expression`. Raises `InputError` that begins with the key of a config."""
-        names, where = (TIME,), "system"
-        try:
-            defined = parse_definitions(define or {}, names)
-        except InputError as error:
-            raise error.under(where) from None
-        return VaryingSystem(
-            LinearSystem(
-                parse_matrix(f"{where}.A", A, names, defined),
-                parse_matrix(f"{where}.B", B, names, defined),
-                None if E is None else parse_matrix(f"{where}.E", E, names, defined),
-                Box(np.zeros(1), np.array([horizon])),
-                names,
-                None if c is None else parse_column(f"{where}.c", c, names, defined),
-            ),
-            horizon,
-            delay,
-        )
+        return VaryingSystem(_law("system", (A, B, E, c), (0.0, horizon), define), horizon, delay)
+
+    @staticmethod
+    def taking_turns(
+        pieces: Sequence[tuple[float, InTime]], define: Mapping[str, str | float] | None = None, delay: float = 0.0
+    ) -> VaryingSystem:
+        """Systems as those of `of`, each up to a time with its ``A``, ``B``, ``E`` and ``c``; ``t`` counts from 0 in
+        all of them, and the last one ends at the horizon."""
+        begins = [0.0, *(float(until) for until, _ in pieces[:-1])]
+        laws = [
+            _law(f"system.pieces.{i}", given, (begin, float(until)), define)
+            for i, (begin, (until, given)) in enumerate(zip(begins, pieces, strict=True))
+        ]
+        later = tuple(zip(begins[1:], laws[1:], strict=True))
+        return VaryingSystem(laws[0], float(pieces[-1][0]), delay, later)
+
+    @property
+    def laws(self) -> tuple[tuple[float, float, LinearSystem], ...]:
+        """Between which times which law holds."""
+        ends = [*(begin for begin, _ in self.later), self.horizon]
+        begun = ((0.0, self.law), *self.later)
+        return tuple((begin, until, law) for (begin, law), until in zip(begun, ends, strict=True))
+
+    def lawful(self, laws: Sequence[tuple[float, LinearSystem]]) -> VaryingSystem:
+        """The same with other ``laws``, each with the time from which it holds, the first from 0 on."""
+        return VaryingSystem(laws[0][1], self.horizon, self.delay, tuple(laws[1:]))
 
     @property
     def states(self) -> int:
@@ -594,7 +629,7 @@ class VaryingSystem:
 
     @property
     def switches(self) -> tuple[float, ...]:
-        """It never jumps from one system to another."""
+        """None: where another law takes over, no piece of a grid has to end."""
         return ()
 
     @property
@@ -605,16 +640,20 @@ class VaryingSystem:
     @cached_property
     def forced(self) -> VaryingSystem:
         """As `LinearSystem.forced`."""
-        return self if self.law.c is None else replace(self, law=self.law.forced)
+        return self if self.law.c is None else self.lawful([(begin, law.forced) for begin, _, law in self.laws])
 
     @cached_property
     def modes(self) -> tuple[LinearSystem, ...]:
         """The system as it is at several times, for what asks how large its numbers are; nothing is proven by them."""
+        found = list[LinearSystem]()
         # Chebyshev's points, closer to the ends: an entry that is 0 at evenly spaced times is seen
-        times = self.horizon * (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
-        A, B, E = self.law.matrices(times)
-        drifts = [None] * LOOKS if self.c is None else list(self.law.forced.matrices(times)[1][:, :, -1:])
-        return tuple(LinearSystem(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True))
+        shares = (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
+        for begin, until, law in self.laws:
+            times = begin + (until - begin) * shares
+            A, B, E = law.matrices(times)
+            drifts = [None] * LOOKS if self.c is None else list(law.forced.matrices(times)[1][:, :, -1:])
+            found += [LinearSystem(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True)]
+        return tuple(found)
 
     @shaped
     def in_units(
@@ -627,8 +666,9 @@ class VaryingSystem:
         time: float = 1.0,
     ) -> VaryingSystem:
         """As `LinearSystem.in_units`; the time of the law is divided too."""
-        law = self.law.in_units(A, B, E, np.array([time]), c, 1.0)
-        return VaryingSystem(law, self.horizon / time, self.delay / time)
+        first, *others = (law.in_units(A, B, E, np.array([time]), c, 1.0) for _, _, law in self.laws)
+        later = tuple((begin / time, law) for (begin, _), law in zip(self.later, others, strict=True))
+        return VaryingSystem(first, self.horizon / time, self.delay / time, later)
 
     @shaped
     def describe(self, parameter: Float[Array, " nu"]) -> str:
@@ -637,6 +677,25 @@ class VaryingSystem:
 
 
 System: TypeAlias = LinearSystem | SwitchedSystem | VaryingSystem
+
+
+def require_period(system: VaryingSystem) -> None:
+    """Raise `InputError` where the horizon is no period of a law, but for what rounding it explains. Nothing is proven
+    by that: the law of a plan that repeats begins again at the horizon, as pieces of a system do. Laws that take turns
+    may differ there as at any other time."""
+    if system.later:
+        return
+    every = [[part[0] for part in mode.forced.matrices(np.zeros((1, 0)))] for mode in system.modes]
+    sizes = [np.abs(parts).max(axis=0) for parts in zip(*every, strict=True)]
+    ends = system.law.forced.matrices(np.array([[0.0], [system.horizon]]))
+    for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
+        for i, j in np.argwhere(np.abs(last - first) > PERIODIC * size):
+            entry = f"c[{i + 1}]" if name == "B" and j >= system.controls else f"{name}[{i + 1}][{j + 1}]"
+            raise InputError(
+                path="repeat",
+                expected="a horizon that is a period of the system, which begins again there",
+                got=f"{entry} = {first[i, j]:.12g} at 0, and {last[i, j]:.12g} at {system.horizon:.12g}",
+            )
 
 
 def _check_piece(i: int, pair: object, before: float) -> None:
@@ -652,14 +711,40 @@ def _check_piece(i: int, pair: object, before: float) -> None:
         raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=said)
 
 
+def _law(
+    where: str, given: InTime, during: tuple[float, float], define: Mapping[str, str | float] | None
+) -> LinearSystem:
+    """The law that is ``given`` at a key of a config, whose entries speak of the time between two."""
+    names, (A, B, E, c) = (TIME,), given
+    try:
+        defined = parse_definitions(define or {}, names)
+    except InputError as error:
+        raise error.under("system") from None
+    begin, until = during
+    if not begin < until < np.inf:
+        raise InputError(path=f"{where}.until", expected=f"a time after {begin:g}", got=f"{until:g}")
+    return LinearSystem(
+        parse_matrix(f"{where}.A", A, names, defined),
+        parse_matrix(f"{where}.B", B, names, defined),
+        None if E is None else parse_matrix(f"{where}.E", E, names, defined),
+        Box([begin], [until]),
+        names,
+        None if c is None else parse_column(f"{where}.c", c, names, defined),
+    )
+
+
+def _check_as_many(i: int, what: str, system: LinearSystem, first: LinearSystem) -> None:
+    if getattr(system, what) != getattr(first, what):
+        raise InputError(
+            path=f"system.pieces.{i}",
+            expected=f"{getattr(first, what)} {what}, as the other pieces",
+            got=f"{getattr(system, what)}",
+        )
+
+
 def _check_alike(i: int, system: LinearSystem, first: LinearSystem) -> None:
     for what in ("states", "controls", "disturbances"):
-        if getattr(system, what) != getattr(first, what):
-            raise InputError(
-                path=f"system.pieces.{i}",
-                expected=f"{getattr(first, what)} {what}, as the other pieces",
-                got=f"{getattr(system, what)}",
-            )
+        _check_as_many(i, what, system, first)
     mine, other = system.parameters, first.parameters
     if mine is None:
         return

@@ -368,9 +368,12 @@ class Propagator:
     @cached_property
     def marks(self) -> Array:
         """The breakpoints, and the times between which a system that changes with time is one polynomial of it; one of
-        these that is a breakpoint but for rounding counts as that."""
+        these that is a breakpoint but for rounding counts as that, unless another law takes over there: then what
+        moves the state jumps, however near a breakpoint is."""
         breaks = self.grid.breakpoints
-        return breaks if self.expansion is None else _joined(breaks, self.expansion.ends[1:-1])
+        if self.expansion is None:
+            return breaks
+        return np.union1d(_joined(breaks, self.expansion.ends[1:-1]), self.expansion.ends[list(self.expansion.turns)])
 
     @cached_property
     def expansion(self) -> Expansion | None:

@@ -103,15 +103,14 @@ def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -
 def _system(system: System, running: list[Running], horizon: float) -> System:
     """The system beside what is integrated of it; of pieces where one of the integrals begins later than at 0, or ends
     before it is looked at."""
-    if isinstance(system, VaryingSystem):
-        assert all(one.start == 0.0 for one in running)  # others are refused
-        h, g = np.stack([one.h for one in running]), np.stack([one.g for one in running])
-        return replace(system, law=system.law.accumulating(h, g))
-    slack, pieces = SHORTEST * horizon, list[tuple[float, LinearSystem]]()
+    slack, pieces, begins = SHORTEST * horizon, list[tuple[float, LinearSystem]](), list[float]()
     for begin, until, mode in legs(system, {time for one in running for time in (one.start, one.stop)}, horizon):
         acts = np.array([[one.start <= begin + slack and until <= one.stop + slack] for one in running])
         h, g = np.stack([one.h for one in running]), np.stack([one.g for one in running])
+        begins.append(begin)
         pieces.append((until, mode.accumulating(acts * h, acts * g)))
+    if isinstance(system, VaryingSystem):
+        return system.lawful([(begin, law) for begin, (_, law) in zip(begins, pieces, strict=True)])
     if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
         return pieces[0][1]
     return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay)

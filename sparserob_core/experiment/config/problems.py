@@ -195,7 +195,7 @@ class SystemOptions(Options):
         parameters, every = self._parameter_set(names), self.matrices()
         where, until, first = every[0]
         if self._changes(names, every):
-            return self._varying(first, horizon)
+            return self._varying(every, horizon)
         try:
             defined = parse_definitions(self.define or {}, names)
         except InputError as error:
@@ -214,17 +214,19 @@ class SystemOptions(Options):
             texts += [entry for rows in (A, B, E or []) for row in rows for entry in row] + (c or [])
         return any(TIME in re.findall(r"[A-Za-z_]\w*", text) for text in texts if isinstance(text, str))
 
-    def _varying(self, of: Matrices, horizon: float | None) -> VaryingSystem:
-        refused = {"parameters": self.parameters, "pieces": self.pieces}
-        for key, given in refused.items():
-            if given:
-                expected = "none where the system changes with the time t, of which known ones are proven"
-                raise InputError(path=f"system.{key}", expected=expected, got="one")
+    def _varying(self, every: list[tuple[str, float | None, Matrices]], horizon: float | None) -> VaryingSystem:
+        if self.parameters:
+            expected = "none where the system changes with the time t, of which known ones are proven"
+            raise InputError(path="system.parameters", expected=expected, got="one")
         if horizon is None:
             raise InputError(path="system", expected="a system that stays the same with time here", got="one in t")
-        _check_shapes("system", of)
-        A, B, E, c = of
-        return VaryingSystem.of(A, B, horizon, E, c, self.define, self.delay)
+        for where, _, of in every:
+            _check_shapes(where, of)
+        if self.pieces is None:
+            A, B, E, c = every[0][2]
+            return VaryingSystem.of(A, B, horizon, E, c, self.define, self.delay)
+        turns = [(float(until or 0.0), of) for _, until, of in every]
+        return VaryingSystem.taking_turns(turns, self.define, self.delay)
 
     def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
         if isinstance(self.parameters, ParameterSetOptions):

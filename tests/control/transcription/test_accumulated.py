@@ -86,16 +86,6 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
         "integral.0.to",
     ),
     "a plan that repeats": ({"G": [[1]]}, {"repeat": True}, "integral"),
-    "a system in t": (
-        {"G": [[1]], "start": 1.0},
-        {"system": sr.VaryingSystem.of([["-t"]], [[1]], 5.0), "initial_state": [0]},
-        "integral.0.from",
-    ),
-    "a system in t that hears late": (
-        {"G": [[1]], "stop": 4.0},
-        {"system": sr.VaryingSystem.of([["-t"]], [[1]], 5.0, delay=0.5), "initial_state": [0]},
-        "integral.0.from",
-    ),
 }
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from math import ceil
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -21,7 +22,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat, arb_poly
 
-    from sparserob_core.control.problem.system import VaryingSystem
+    from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 
 ORDER = 24  # of the system in time on a segment; with a tenth of it segments are a million times shorter
 TERMS = (16, 24, 32, 48, 64)  # of the solution over a part of a segment: the fewest that are sharp, else the last
@@ -74,28 +75,33 @@ class VaryingFlow:
     def segments(self) -> list[Segment]:
         """The system on parts of the horizon, one after another; raises `Unchecked` where it is not finite."""
         horizon, found = self.until, []
-        todo = [(horizon * k / FIRST, horizon * (k + 1) / FIRST) for k in reversed(range(FIRST))]
+        cuts = [*(begin for begin, _, _ in self.system.laws), horizon]
+        todo = [
+            (start, stop, law)
+            for (begin, until), (_, _, law) in zip(pairwise(cuts), self.system.laws, strict=True)
+            for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
+        ][::-1]
         while todo:
-            start, stop = todo.pop()
-            made = self._segment(start, stop)
+            start, stop, law = todo.pop()
+            made = self._segment(start, stop, law)
             if made is not None:
                 found.append(made)
                 continue
             if stop - start <= SHORTEST * horizon:
                 raise Unchecked(f"near t = {start:.9g} the system is not enclosed")
             middle = (start + stop) / 2
-            todo += [(middle, stop), (start, middle)]
+            todo += [(middle, stop, law), (start, middle, law)]
         return found
 
-    def _segment(self, start: float, stop: float) -> Segment | None:
+    def _segment(self, start: float, stop: float, system: LinearSystem) -> Segment | None:
         """The system from ``start`` to ``stop``; ``None`` where that is too long."""
         from flint import arb, arb_poly
 
         centre = (start + stop) / 2
         half = upper(abs(arb(stop) - arb(centre)).max(abs(arb(start) - arb(centre))))
         try:
-            exact = self._table(arb(centre), ORDER + 1)
-            wide = self._table(arb(start).union(arb(stop)), ORDER + 2)
+            exact = self._table(system, arb(centre), ORDER + 1)
+            wide = self._table(system, arb(start).union(arb(stop)), ORDER + 2)
         except Unchecked:
             return None
         d, u = self.system.states, self.units
@@ -116,13 +122,14 @@ class VaryingFlow:
         law = [[arb_poly(entry) for entry in row] for row in exact]
         return Segment(start, stop, centre, law, [[entry[ORDER + 1] for entry in row] for row in wide])
 
-    def _table(self, centre: arb, length: int) -> list[list[list[arb]]]:
-        """The first coefficients of every entry of ``[A B E]`` at all times of a ball."""
+    @staticmethod
+    def _table(law: LinearSystem, centre: arb, length: int) -> list[list[list[arb]]]:
+        """The first coefficients of every entry of ``[A B E]`` of a law at all times of a ball."""
         from flint import arb, ctx
 
         before, ctx.cap = ctx.cap, length
         try:
-            law, time = self.system.law, np.empty(1, dtype=object)
+            time = np.empty(1, dtype=object)
             time[0] = Timed.time(centre, length)
             parts = [law.A, law.B, *([] if law.c is None else [law.c]), law.E]
             values = np.hstack([np.asarray(part(time) if callable(part) else part, dtype=object) for part in parts])

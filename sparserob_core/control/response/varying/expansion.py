@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import comb
+from itertools import pairwise
+from math import ceil, comb
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
@@ -33,7 +34,7 @@ LONG = 2.0  # norm of A times the length of a segment; ten times more needs thre
 SHARPEST = 1e-13  # remainder on a segment, as a share of the numbers: ten times less is below what is rounded
 BLUNTEST = 1e-10  # from which on a segment is halved even where that did not help: else what a state misses shows
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
-_KNOWN: WeakKeyDictionary[LinearSystem, dict[float, Expansion]] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[LinearSystem, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
 FIRST = 8  # segments to begin with
 SWEEPS = 20  # of balancing
 
@@ -82,7 +83,8 @@ class Expansion:
     """A system on segments between ``ends (s + 1,)``: ``coefficients (s, DEGREE + 1, d, d + m + mw)`` of ``[A B E]``
     in powers of the time from -1 to 1 over each segment, and what they may be off by, ``remainder (s, d, d + m + mw)``.
 
-    ``units (d,)``: of states, in which no entry of ``A`` is much larger than the others.
+    ``units (d,)``: of states, in which no entry of ``A`` is much larger than the others. ``turns``: the numbers of the
+    ends at which another law takes over.
     """
 
     ends: Array
@@ -90,20 +92,25 @@ class Expansion:
     remainder: Array
     units: Array
     channels: tuple[int, int]
+    turns: tuple[int, ...] = ()
 
     @staticmethod
     def of(system: VaryingSystem) -> Expansion:
         """The expansion of a system; raises `InputError`, which names a time, where there is none, as at a pole or at
         the root of a negative number."""
-        kept = _KNOWN.setdefault(system.law, {})
-        if system.horizon not in kept:
-            law = system.law
+        kept, law = _KNOWN.setdefault(system.law, {}), system.law
+        key = system.horizon, *((begin, ref(later)) for begin, later in system.later)
+        if key not in kept:
             if isinstance(law, SystemInUnits):
-                base = VaryingSystem(law.base, system.horizon * float(law.units[0]))
-                kept[system.horizon] = Expansion.of(base)._in_units(law, system)
+                unit, bases = float(law.units[0]), list[tuple[float, LinearSystem]]()
+                for begin, later in system.later:
+                    assert isinstance(later, SystemInUnits)  # as the first one is
+                    bases.append((begin * unit, later.base))
+                base = VaryingSystem(law.base, system.horizon * unit, later=tuple(bases))
+                kept[key] = Expansion.of(base)._in_units(law, system)
             else:
-                kept[system.horizon] = Expansion._made(system)
-        return kept[system.horizon]
+                kept[key] = Expansion._made(system)
+        return kept[key]
 
     def _in_units(self, law: SystemInUnits, system: VaryingSystem) -> Expansion:
         factors = np.hstack([law.factors[name] * np.ones(part) for name, part in self._shapes])
@@ -114,6 +121,7 @@ class Expansion:
             self.remainder * factors,
             self.units * states,
             (system.controls, system.disturbances),
+            self.turns,
         )
 
     @property
@@ -123,15 +131,19 @@ class Expansion:
 
     @staticmethod
     def _made(system: VaryingSystem) -> Expansion:
-        law, space, horizon = system.law, TaylorSpace(1, DEGREE), system.horizon
+        space, horizon = TaylorSpace(1, DEGREE), system.horizon
         A = np.max([np.abs(np.asarray(mode.A, dtype=float)) for mode in system.modes], axis=0)
         units = balanced(A, horizon)
         scale = 1.0 / units[:, None]
         size = float((np.abs(A) * scale * units).sum(axis=1).max())
-        todo = [(horizon * k / FIRST, horizon * (k + 1) / FIRST, np.inf) for k in reversed(range(FIRST))]
+        todo = [
+            (start, stop, np.inf, law)
+            for begin, until, law in system.laws
+            for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
+        ][::-1]
         ends, found, left = [0.0], [], []
         while todo:
-            start, stop, before = todo.pop()
+            start, stop, before, law = todo.pop()
             centre = (start + stop) / 2
             radius = float(np.nextafter(max(stop - centre, centre - start), np.inf))
             off, here = np.inf, np.inf
@@ -151,8 +163,10 @@ class Expansion:
             elif stop - start <= SHORTEST * horizon:
                 raise InputError(f"near t = {centre:.9g} the system {why}", path="system")
             else:
-                todo += [(centre, stop, off), (start, centre, off)]
-        return Expansion(np.array(ends), np.array(found), np.array(left), units, (system.controls, system.disturbances))
+                todo += [(centre, stop, off, law), (start, centre, off, law)]
+        turns = tuple(ends.index(begin) for begin, _ in system.later)
+        channels = system.controls, system.disturbances
+        return Expansion(np.array(ends), np.array(found), np.array(left), units, channels, turns)
 
     @shaped
     def flow(self, starts: Float[Array, " k"], stops: Float[Array, " k"]) -> Flow:

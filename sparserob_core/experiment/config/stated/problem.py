@@ -114,8 +114,11 @@ def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
 
 def _system_keys(system: System) -> dict[str, Any]:
     if isinstance(system, VaryingSystem):
-        late = {"delay": system.delay} if system.delay else {}
-        return {**_matrix_keys(system.law), **late, **_defined_keys([system.law])}
+        late: dict[str, Any] = {"delay": system.delay} if system.delay else {}
+        late.update(_defined_keys([law for _, _, law in system.laws]))
+        if not system.later:
+            return {**_matrix_keys(system.law), **late}
+        return {"pieces": [{"until": until, **_matrix_keys(law)} for _, until, law in system.laws], **late}
     unknown = {one.name for mode in system.modes for one in fields(mode)} - WRITTEN_OF_SYSTEM
     if unknown:
         raise InputError(path=f"system.{sorted(unknown)[0]}", expected="a system in its own units", got="another")
