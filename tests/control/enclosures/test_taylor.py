@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparserob_core.control.enclosures.algebra import lifted_matrix, lifted_transitions
-from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.control.enclosures.algebra import flows_rounding, lifted_matrix, lifted_transitions
+from sparserob_core.control.enclosures.matrix_exponential import exponential_rounding, transitions
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import parse_expression
 from sparserob_core.errors import NotEnclosable
@@ -131,3 +131,17 @@ def test_the_transitions_of_the_coefficients_are_those_of_the_lifted_matrix(nu, 
         lifted_transitions(space, A, rows)(matrix, durations), transitions(matrix, durations), strict=True
     ):
         assert np.allclose(found, expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("nu", "degree"), [(0, 0), (1, 4), (2, 3), (4, 2)])
+def test_rounding_of_flows_counts_the_terms_of_the_fullest_coefficient(nu, degree):
+    """Of a product of two polynomials of matrices, and the sum of the norms of all coefficients."""
+    space, rng = TaylorSpace(nu, degree), np.random.default_rng(nu)
+    terms = max(
+        sum(1 for a in space.exponents if (a <= b).all() and a.sum() + (b - a).sum() <= degree) for b in space.exponents
+    )
+    A, durations = rng.normal(size=(space.size, 3, 3)), np.array([0.0, 0.3, 2.0])
+    size = sum(float(np.linalg.norm(part, 1)) for part in A)
+    np.testing.assert_allclose(
+        flows_rounding(space, A, durations), exponential_rounding(terms * 2 * 3, size * durations), rtol=1e-12
+    )
