@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 from scipy.special import roots_jacobi
 
 import sparserob_core as sr
@@ -448,3 +449,46 @@ def test_a_failure_says_once_what_is_wrong_and_what_to_do():
     assert "try another solver" in result.message
     parts = result.message.split("; ")
     assert len(parts) == len(set(parts)) <= 3
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize("seed", range(12))
+def test_programs_in_numbers_up_to_1e12_have_the_answer_of_a_linear_program_on_a_grid(seed):
+    """Variables, rows and prices each in a unit of their own; what lies between the indices of a fine grid is below
+    the slack."""
+    rng = np.random.default_rng([seed, 77])
+    n, units, price = int(rng.integers(1, 5)), 10.0 ** rng.uniform(0, 12, 4), 10.0 ** rng.uniform(0, 12)
+    C, c, size = rng.normal(size=(n, 3)), rng.normal(size=3), 10.0 ** rng.uniform(0, 12)
+    weights, q, reach = rng.uniform(0, 1, n) * (seed % 3 > 0), rng.normal(size=n), rng.uniform(0.5, 5, n)
+    units = units[:n]
+
+    def sides(s):
+        basis = np.stack([np.ones_like(s), np.cos(2 * s), np.sin(3 * s)], axis=-1)
+        return basis @ C.T, basis @ c
+
+    def rows(index):
+        G, h = sides(index[:, 0])
+        return size * (G / units)[:, np.newaxis], size * h[:, np.newaxis]
+
+    G, h = sides(np.linspace(0.0, 1.0, 4001))
+    eye, none = np.eye(n), np.zeros(n)
+    table = np.vstack([np.hstack([G, 0.0 * G]), np.hstack([eye, -eye]), np.hstack([-eye, -eye])])
+    bounds = [*((-r, r) for r in reach), *[(0, None)] * n]
+    truth = linprog(np.concatenate([q, weights]), table, np.concatenate([h, none, none]), bounds=bounds)
+    result = sr.solve(
+        sr.SemiInfiniteProgram(
+            n=n,
+            weights=price * weights / units,
+            q=price * q / units,
+            lower=-reach * units,
+            upper=reach * units,
+            families=[family("walls", [0.0], [1.0], rows)],
+        )
+    )
+    if truth.status == 2:
+        assert result.status == "infeasible", result.message
+        return
+    slack = 2e-6 * max(1.0, abs(truth.fun))
+    assert result.status == "undecided", result.message
+    assert abs(result.cost / price - truth.fun) <= slack
+    assert truth.fun - slack <= result.lower_bound / price <= truth.fun + slack
