@@ -14,6 +14,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.response.response import Propagator, merge_grids
 from sparserob_core.control.response.varying.expansion import Expansion
 from tests.known_answers.test_checks import pieces, verified
 from tests.known_answers.test_varying_systems import FADING
@@ -148,6 +149,22 @@ def test_laws_that_stay_the_same_cost_what_pieces_of_a_system_do(more: str, tmp_
     assert costs[1] == pytest.approx(costs[0], rel=2e-6)
 
 
+def test_a_measurable_push_is_a_control_at_one_of_which_anything_may_be_delivered(tmp_path: Path) -> None:
+    # (1 + t) x gains at most 0.1 * 4 by any w, 0.6 of it by the initial set and the end: 2.5 of it has to go
+    problem = {
+        **FADING,
+        "system": {"A": [["-1/(1 + t)"]], "B": [[1, 0.1]], "c": [-0.1]},
+        "initial_state": {"centre": [2.5], "box": 0.2},
+        "control": {"box": {"lower": [-1, 1], "upper": [1, 1]}},
+        "weights": [[0, 1, 0]],
+        "execution": [0, 1],
+        "terminal": [{"box": 0.2}],
+    }
+    assert verified(tmp_path / "run", problem, pieces(20))["cost"] == pytest.approx(1.0, rel=1e-7)
+    change = tampering.problem(execution=[0, 0.9999], terminal=[{"box": 0.19995}])
+    assert sr.check(tampering.forged(tmp_path / "run", tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
 def returning(**more: Any) -> dict[str, Any]:
     """``x' = u + w + 3 sin(2 pi t)`` from ``[-1, 1]`` over a period, in which the drift comes to nothing."""
     dictionary = pieces(1)
@@ -186,6 +203,15 @@ def test_a_plan_over_a_period_of_the_plant_holds_for_ever(tmp_path: Path) -> Non
 def test_a_horizon_that_is_no_period_is_refused(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
     with pytest.raises(sr.InputError, match=said):
         sr.run(returning(**changes), out=tmp_path / "run", figures=False)
+
+
+def test_a_turn_beside_a_breakpoint_stays_a_mark() -> None:
+    breaks = np.linspace(0.0, 2.0, 21)
+    system = VaryingSystem.taking_turns([(0.3, ([["t"]], [[1]], None, None)), (2.0, ([[0]], [["t"]], None, None))])
+    grid = merge_grids(breaks, breaks, varying=True)
+    propagator = Propagator(system, grid)
+    assert breaks[3] != 0.3  # by rounding
+    assert {0.3, breaks[3]} <= set(propagator.marks.tolist())
 
 
 def test_transitions_across_a_turn_are_products_of_both_laws() -> None:

@@ -4,6 +4,7 @@ what is refused of them."""
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.experiment.check.check import check
 from tests.known_answers.test_checks import pieces, verified
 from tests.support import tampering
@@ -346,3 +349,71 @@ def test_a_constant_plant_that_hears_late_is_the_same_as_a_function_of_time(
         assert outcome.status == "certified" and check(tmp_path / name).status == "verified"
         costs.append(outcome.result.cost)
     assert costs[0] == pytest.approx(costs[1], rel=2e-7)
+
+
+def drawn(rng: np.random.Generator, tau: float, size: float) -> tuple[str, Callable[[Any], Any]]:
+    """An entry of a random analytic function of ``t / tau`` as a config says it, and as numbers of any kind."""
+    a, b, c = (float(one) for one in rng.normal(size=3).round(3))
+    s, L, x = np.longdouble(size), np.longdouble, f"(t/{tau!r})"
+    every: list[tuple[str, Callable[[Any], Any]]] = [
+        (f"{a!r} + {b!r}*sin({3 * c!r}*{x})", lambda t: a + L(b) * np.sin(L(3 * c) * t)),
+        (f"{a!r}*exp({-abs(c)!r}*{x}) + {b!r}", lambda t: a * np.exp(-L(abs(c)) * t) + b),
+        (f"{a!r}/(1.25 + cos({c!r}*{x}))", lambda t: a / (L(1.25) + np.cos(L(c) * t))),
+        (f"{a!r}*sqrt(1.0625 + sin({b!r}*{x}))", lambda t: a * np.sqrt(L(1.0625) + np.sin(L(b) * t))),
+        (f"{a!r}*log(1.0625 + {x}^2)", lambda t: a * np.log(L(1.0625) + t**2)),
+        (f"{a!r}*tan(0.25*{x})*cos({b!r}*{x})", lambda t: a * np.tan(L(0.25) * t) * np.cos(L(b) * t)),
+    ]
+    text, entry = every[rng.integers(len(every))]
+    return f"({text})*{size!r}", lambda t: entry(t / L(tau)) * s
+
+
+def integrated(rates: Callable[[Any], Any], horizon: float, size: int, steps: int) -> Any:
+    """The solution of ``Y' = A Y + [0 B]`` from ``[1 0]``, in numbers of 64 bits: midpoints, extrapolated (Gragg)."""
+    d = size
+    Y = np.hstack([np.eye(d), np.zeros((d, 1))]).astype(np.longdouble)
+    h = np.longdouble(horizon) / steps
+
+    def slope(t: Any, state: Any) -> Any:
+        F = rates(t)
+        return F[:, :d] @ state + np.hstack([np.zeros((d, d)), F[:, d:]])
+
+    for k in range(steps):
+        rows: list[list[Any]] = []
+        for q in range(1, 10):
+            before, now, part = Y, Y + h / (2 * q) * slope(k * h, Y), h / (2 * q)
+            for i in range(1, 2 * q):
+                before, now = now, before + 2 * part * slope(k * h + i * part, now)
+            row = [(before + now + part * slope((k + 1) * h, now)) / 2]
+            for j in range(1, q):
+                row.append(row[-1] + (row[-1] - rows[-1][j - 1]) / ((np.longdouble(q) / (q - j)) ** 2 - 1))
+            rows.append(row)
+        Y = rows[-1][-1]
+    return Y
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize("seed", [1, 6, 3, 8])
+def test_random_analytic_coefficients_are_integrated_in_any_unit_of_time_and_length(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    d, tau = int(rng.integers(1, 4)), float(2.0 ** rng.integers(-12, 14))
+    lengths, horizon = 2.0 ** rng.integers(-10, 12, d), tau * 2.5
+    entries = [[drawn(rng, tau, float(a / b / tau)) for b in (*lengths, 1.0)] for a in lengths]
+    texts = [[text for text, _ in row] for row in entries]
+    system = sr.VaryingSystem.of([row[:d] for row in texts], [row[d:] for row in texts], horizon)
+    table = [[entry for _, entry in row] for row in entries]
+    found = integrated(lambda t: np.array([[entry(t) for entry in row] for row in table]), horizon, d, 7)
+    again = integrated(lambda t: np.array([[entry(t) for entry in row] for row in table]), horizon, d, 9)
+    expansion = Expansion.of(system)
+    flow, u = expansion.flow(np.zeros(1), np.array([horizon])), expansion.units
+    off = np.abs(np.hstack([flow.state[0], flow.control[0]]) - again) / u[:, None]
+    off[:, :d] *= u
+    missed = np.abs(found - again) / u[:, None]  # by the integrator
+    missed[:, :d] *= u
+    allowed = np.append(np.full(d, flow.error[0]), flow.error[0] * flow.sizes[0, 0])
+    assert missed.max() <= 1e-14 * max(1.0, float((np.abs(again) / u[:, None]).max()))
+    assert (off <= allowed + 2 * missed).all()
+    Phi, Gamma, _ = VaryingFlow(system, horizon).over(0.0, horizon)
+    for i, row in enumerate([*one, *more] for one, more in zip(Phi.tolist(), Gamma.tolist(), strict=True)):
+        for j, ball in enumerate(row):
+            far = abs(np.longdouble(float(ball.mid())) - again[i, j])
+            assert far <= float(ball.rad()) + 2 * abs(found[i, j] - again[i, j]) + 1e-15 * abs(again[i, j])
