@@ -72,10 +72,11 @@ BALL = sr.NormBall(2.0, 0.05, dimension=2)
 SMALL = sr.Box([-0.1], [0.1])
 
 
+@pytest.mark.parametrize("other", KINDS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_disturbances_push_adds_up(kind):
+def test_what_disturbances_push_adds_up(kind, other):
     """``0.6 + 2 (0.05 |(3, 4)| + 2 * 0.1)``."""
-    problem = integrator(sr.Disturbance(BALL, [[3.0, 4.0]], kind), sr.Disturbance(SMALL, [[2.0]], kind))
+    problem = integrator(sr.Disturbance(BALL, [[3.0, 4.0]], kind), sr.Disturbance(SMALL, [[2.0]], other))
     result = sr.solve(problem, control=FOUR)
     assert isinstance(problem.disturbance, Product) and problem.system.disturbances == 3
     assert result.status == "certified"
@@ -194,7 +195,10 @@ def test_minimum_attention_takes_a_list(tmp_path):
 @pytest.mark.parametrize(
     ("disturbance", "key"),
     [
-        ([{"set": {"box": 0.1}}, {"set": {"box": 0.1}, "class": "measurable"}], "disturbance.1.class"),
+        (
+            [{"set": {"box": 0.1}, "class": "measurable"}, {"set": {"box": 0.1}, "class": "l1_ball"}],
+            "disturbance.1.class",
+        ),
         ([{"set": {"box": 0.1}, "E": [[1]]}], "disturbance.0.E"),
         ([{"set": {"box": 0.1}, "E": [[1], ["q"]]}], "disturbance.0.E.1.0"),
         ([{"set": {"box": [0.1, 0.1]}, "E": [[1], [1]]}], "disturbance.0.set.box"),

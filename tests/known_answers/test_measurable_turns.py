@@ -1,8 +1,10 @@
 """Guards known answers: measurable disturbances where systems take turns, where the control acts late, where it is a
-sum of functions, and in a window, against a program on a fine grid, values by hand, and forgeries."""
+sum of functions, in a window, and beside others that are constant on pieces, against a program on a fine grid, values
+by hand, and forgeries."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +36,15 @@ def ran(place: Path, dictionary: Any, **more: Any) -> sr.Outcome:
 
 
 def on_a_fine_grid(
-    w: float, delay: float = 0.0, window: tuple[float, float] = (0.0, 5.0), count: int = 10, steps: int = 200
+    w: float,
+    delay: float = 0.0,
+    window: tuple[float, float] = (0.0, 5.0),
+    held: np.ndarray | None = None,
+    count: int = 10,
+    steps: int = 200,
 ) -> float:
     """The least cost where the constraints hold at the times of a fine grid and disturbances are constant between
-    them: a lower bound, which misses little."""
+    them, components in ``held`` on the pieces of the control: a lower bound, which misses little."""
     total = count * steps
     h, free, R = 5.0 / total, np.array([-1.0, 1.0]), np.zeros((2, count))
     W, rows, limits = np.zeros((2, total, 2)), [], []
@@ -56,7 +63,11 @@ def on_a_fine_grid(
         sides = np.array([0.7 if (j + 1) * h >= 0.5 - 1e-9 else np.inf, np.inf])
         sides = np.minimum(sides, 0.5) if j == total - 1 else sides
         for i in np.flatnonzero(np.isfinite(sides)):
-            room = sides[i] - w * np.abs(W[i]).sum()
+            pushed = W[i]
+            if held is not None:
+                on_pieces = pushed.reshape(count, steps, 2).sum(axis=1)
+                pushed = np.concatenate([pushed[:, ~held].ravel(), on_pieces[:, held].ravel()])
+            room = sides[i] - w * np.abs(pushed).sum()
             rows += [R[i], -R[i]]
             limits += [room - free[i], room + free[i]]
     G = np.array(rows)
@@ -314,3 +325,92 @@ def test_initial_states_beside_measurable_disturbances_over_turns(tmp_path: Path
     assert found.status == "certified"
     assert found.result.cost == pytest.approx((1.05 * grown + 0.1 * pushed - 2.0) / pushed, rel=1e-7)
     assert sr.check(tmp_path / "run").status == "verified"
+
+
+def of_two_classes(first: float = 0.03, second: float = 0.03, **other: Any) -> dict[str, Any]:
+    """The first component any function of time, the second constant on pieces; both enter as they are."""
+    one = {"set": {"box": [first]}, "E": [[1], [0]], "class": "measurable", **other}
+    two = {"set": {"box": [second]}, "E": [[0], [1]], "class": "piecewise_constant"}
+    return {"disturbance": [one, two], "disturbance_class": "measurable"}
+
+
+PLAIN = {"pieces": [TURNS["pieces"][0], {**TURNS["pieces"][1], "E": [[1, 0], [0, 1]]}]}
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("two") / "run"
+    assert ran(directory, 10, system={**FIRST, "delay": 0.15}, **of_two_classes()).status == "certified"
+    assert sr.check(directory).status == "verified"
+    return directory
+
+
+def test_two_classes_cost_less_than_one_that_does_all(two: Path, tmp_path: Path) -> None:
+    cost = json.loads((two / "result.json").read_text())["cost"]
+    all_of_it = ran(tmp_path / "more", 10, system={**FIRST, "delay": 0.15})
+    held = ran(tmp_path / "less", 10, system={**FIRST, "delay": 0.15}, disturbance_class="piecewise_constant")
+    assert held.result.cost * (1 + 1e-6) < cost < all_of_it.result.cost * (1 - 1e-6)
+
+
+@pytest.mark.slow
+def test_two_classes_over_turns_cost_what_a_fine_grid_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SECOND, "E", np.eye(2).tolist())
+    found = ran(tmp_path / "run", 10, system=PLAIN, **of_two_classes())
+    below = on_a_fine_grid(0.03, held=np.array([False, True]))
+    assert below * (1 - 1e-9) <= found.result.cost <= below * (1 + 2e-4)
+    assert sr.check(tmp_path / "run").status == "verified"
+
+
+def test_two_classes_are_bounded_simulated_and_have_a_margin(two: Path, tmp_path: Path) -> None:
+    found = sr.bound(two, out=tmp_path / "bound")
+    assert {abs(row.proven - row.reached) < 1e-8 for row in found.rows} == {True}
+    assert sr.check(tmp_path / "bound").status == "verified"
+    replayed = sr.simulate(two, law="adversary").constraints
+    assert [one.largest for one in replayed] == pytest.approx([one.worst for one in replayed], abs=1e-9)
+    drawn = sr.simulate(two, 50).constraints
+    assert all(one.largest <= one.worst + 1e-9 for one in drawn)
+
+
+def _class(number: int, kind: str) -> tampering.Change:
+    return lambda files: files.problem["disturbance"][number].update({"class": kind})
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize(
+    "change",
+    [
+        _class(1, "measurable"),
+        lambda files: files.problem["disturbance"][0].update(set={"box": [0.0301]}),
+        lambda files: files.problem["disturbance"][1].update(set={"box": [0.0301]}),
+        lambda files: files.problem["disturbance"][1].update(E=[[0.02], [1]]),
+        lambda files: files.certificate.update(lower_bound=files.certificate["lower_bound"] + 1e-6),
+        _decision(1e-5),
+    ],
+    ids=["class", "measurable", "held", "E", "bound", "decision"],
+)
+def test_what_is_changed_of_two_classes_is_refuted(change: tampering.Change, two: Path, tmp_path: Path) -> None:
+    assert sr.check(tampering.forged(two, tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
+def test_a_bound_whose_held_disturbance_jumps_within_a_piece_is_refuted(two: Path, tmp_path: Path) -> None:
+    sr.bound(two, out=tmp_path / "bound")
+    place = next((tmp_path / "bound").glob("bound.json"))
+    data = json.loads(place.read_text())
+    row = next(row for row in data["rows"] if len(row["changes"]) > 12)
+    inside = next(k for k, t in enumerate(row["changes"]) if 0 < k < len(row["changes"]) - 2 and (t / 0.5) % 1 > 1e-6)
+    row["disturbance"][1][inside] = -row["disturbance"][1][inside]
+    place.write_text(json.dumps(data))
+    assert sr.check(tmp_path / "bound").status == "refuted"
+
+
+def test_two_classes_are_refused_where_they_are_not_proven(tmp_path: Path) -> None:
+    for more, key in (
+        ({"policy": "affine"}, "policy"),
+        ({"dictionaries": {"control": FOUR, "disturbance": {"name": "walsh", "pieces": 8, "functions": 3}}}, "dict"),
+    ):
+        config = {"problem": {**SPRING, "system": FIRST, **of_two_classes()}, "observers": []}
+        config = {**config, "dictionaries": {"control": FOUR}, **more}
+        with pytest.raises(sr.InputError, match=key):
+            sr.run(config, out=tmp_path / "run", quiet=True, figures=False)
+    with pytest.raises(sr.InputError, match="disturbance_class"):
+        integrator(disturbance=sr.Box([-0.1], [0.1]), disturbance_class=("piecewise_constant", "measurable"))

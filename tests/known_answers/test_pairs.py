@@ -81,6 +81,14 @@ def in_a_list(config: Config) -> None:
         ]
 
 
+def of_two_classes(config: Config) -> None:
+    """One component any function of time, the other constant on pieces."""
+    config["problem"]["disturbance"] = [
+        {"set": {"box": 0.015}, "E": [[1], [0]], "class": "measurable"},
+        {"set": {"box": 0.03}, "E": [[0], [1]]},
+    ]
+
+
 def changing_with_time(config: Config) -> None:
     for one in systems(config):
         one["A"][1][1] = "-0.4 - 0.1*sin(t)"
@@ -111,6 +119,7 @@ FEATURES: dict[str, Callable[[Config], object]] = {
     ),
     "entries in t": changing_with_time,
     "execution": in_problem(execution=0.03),
+    "two classes": of_two_classes,
 }
 SIGNS = {
     ("proven", "verified"): "●",

@@ -18,11 +18,12 @@ from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.effort import at_most
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.measurable import MeasurableLoop
+from sparserob_core.checker.reach.measurable import LoopBeside, MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along
+from sparserob_core.control.problem.disturbances import apart
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -92,7 +93,9 @@ class Answers:
             raise Unchecked("the checker knows feedback and measurable disturbances of known systems only")
         if case.answering and case.measurable and (case.problem.system.delay or case.problem.system.switches):
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
-        held = (changes or []) if case.measurable else (case.changes or [])
+        if case.answering and case.several:
+            raise Unchecked("the checker knows feedback under disturbances of one class")
+        held = (changes or []) if case.measurable and not case.several else (case.changes or [])
         measured = case.problem.measurements if case.answering else None
         if measured is not None and case.measurable:
             raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
@@ -104,12 +107,18 @@ class Answers:
             sorted({*case.grid, *held}),
             [float(t) for t in case.control.breakpoints],
             held,
-            case.problem.disturbance,
+            apart(case.problem.disturbance, case.problem.disturbance_class, "piecewise_constant")
+            if case.several
+            else case.problem.disturbance,
             case.problem.initial_set,
             tuple(float(v) for v in before(case.problem)),
             measured,
             self.observer,
         )
+        if case.several:
+            return LoopBeside(
+                *parts, beside=MeasurableLoop.alone(case.problem, parts[4], parts[5], case.control.pieces)
+            )
         if case.changing is not None:
             return VaryingLoop(*parts, law=case.changing)
         return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(*parts)

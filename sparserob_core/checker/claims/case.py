@@ -169,8 +169,13 @@ class Case:
 
     @property
     def measurable(self) -> bool:
-        """Whether disturbances are measurable."""
-        return self.problem.disturbance is not None and self.problem.disturbance_class == "measurable"
+        """Whether there are measurable disturbances."""
+        return self.problem.measurable is not None
+
+    @property
+    def several(self) -> bool:
+        """Whether there are others beside them, which are constant on pieces."""
+        return not isinstance(self.problem.disturbance_class, str)
 
     @cached_property
     def changes(self) -> list[float] | None:
@@ -178,10 +183,10 @@ class Case:
         not checked; of measurable ones, where those jump by which rows are measured."""
         if self.problem.disturbance is None:
             return None
-        if self.measurable:
+        if self.measurable and not self.several:
             return self.grid[:-1]
         jumps = np.flatnonzero(self.disturbance.changes) + 1
-        if self.problem.disturbance_class != "piecewise_constant":
+        if not self.several and self.problem.disturbance_class != "piecewise_constant":
             raise Unchecked(
                 "the checker knows piecewise constant and measurable disturbances, not those of the class"
                 f" {self.problem.disturbance_class}"

@@ -96,7 +96,7 @@ def follows(case: Case) -> bool:
     system = case.problem.system
     if not isinstance(system, LinearSystem) or system.parameter_count or system.states < FOLLOWED:
         return False
-    return not case.answering and case.execution is None and len(case.grid) <= MANY
+    return not case.answering and not case.several and case.execution is None and len(case.grid) <= MANY
 
 
 def _along_rows(case: Case, window: Window) -> Proven:
@@ -368,6 +368,8 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     answers, found = answers_of(case), []
     last = answers.loop.nodes[-1].tolist() if case.looped else _unreached(case, scene)
     for state, value in case.equalities:
+        if case.several:
+            raise Unchecked("the checker knows fixed final states beside disturbances of one class")
         off, responses = last[state][0] - balls([value])[0], last[state][1:]
         high, low = off + answers.support(responses), answers.support([-x for x in responses]) - off
         found.append((high.max(low), float(sums[state]) + (answers.added(state) if case.looped else 0.0)))

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 
-def reached(case: Case, signal: object, time: float, parameter: Array, deviation: object = None) -> list[arb]:
+def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
     """The state at ``time`` under the case's control, and ``signal (mw, pieces)`` on the pieces of the common grid
     (``None``: no disturbance), from the centre of the initial states and a ``deviation (d,)`` in their set."""
     from flint import arb, arb_mat
@@ -115,7 +115,7 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
         elif case.measurable:  # the worst is no signal on pieces: how far all of them reach is enclosed instead
             value = answers.farthest(*window.split(direction), time, piece)
         else:
-            state = reached(case, data.get("disturbance"), time, parameter, data.get("deviation"))
+            state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
             state += [] if piece is None else case.pieces[piece].entries()
             value = _along(direction, None, [[x] for x in state])
         if case.execution is not None:

@@ -13,7 +13,7 @@ Errors of execution, by which what is delivered of a control differs from the co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
 from typing import TYPE_CHECKING, final
@@ -29,6 +29,7 @@ from sparserob_core.checker.sets.flat import Boxed, Cornered
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -229,6 +230,17 @@ class MeasurableLoop(ClosedLoop):
 
     _kernels: dict[tuple[int, float, bool], Kernel] = field(default_factory=dict, repr=False)
 
+    @staticmethod
+    def alone(
+        problem: OptimalControlProblem, grid: list[float], breakpoints: list[float], pieces: int
+    ) -> MeasurableLoop:
+        """What the measurable disturbances of a problem do from 0 on, without a control and whatever else acts."""
+        system, m = _undriven(problem.system), problem.system.controls
+        still = [stacked([[balls([0.0])[0]]] * m)] * pieces
+        none, rest = np.zeros((pieces, pieces, m, system.states)), [0.0] * system.states
+        bound, none_acts = problem.measurable, (0.0,) * m
+        return MeasurableLoop(system, rest, still, none, grid, breakpoints, [], bound, None, none_acts)
+
     @property
     def blocks(self) -> int:
         return len(self.grid) - 1
@@ -371,6 +383,41 @@ class MeasurableLoop(ClosedLoop):
         assert isinstance(rows, np.ndarray)
         steep = self.kernel(piece).steepest(rows, self.sides)
         return np.asarray(super().bent(piece, start, stop, rows) + (stop - start) ** 2 / 8.0 * steep * OUTWARD)
+
+
+def _undriven(system: System) -> System:
+    """The system without what is known to act on it."""
+    if isinstance(system, SwitchedSystem):
+        return SwitchedSystem([(until, replace(one, c=None)) for until, one in system.pieces], system.delay)
+    assert isinstance(system, LinearSystem)  # of one that changes with time measurable disturbances are refused
+    return replace(system, c=None)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LoopBeside(ClosedLoop):
+    """`ClosedLoop` of disturbances that are constant on pieces, and ``beside`` them others that are measurable: what
+    both do adds up, and so do the largest values and what chords may miss."""
+
+    beside: MeasurableLoop | None = None
+
+    @property
+    def _other(self) -> MeasurableLoop:
+        assert self.beside is not None
+        return self.beside
+
+    @cached_property
+    def _speed(self) -> Array:
+        """That of all sources: without the others a state may have none but the rounding of a control."""
+        return np.asarray(super()._speed + self._other._speed)
+
+    def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
+        both = super().highest(piece, time, rows, beside), self._other.highest(piece, time, rows)
+        return [one + other for one, other in zip(*both, strict=True)]
+
+    def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
+        both = super().bent(piece, start, stop, rows), self._other.bent(piece, start, stop, rows)
+        return np.asarray((both[0] + both[1]) * OUTWARD)
 
 
 @final

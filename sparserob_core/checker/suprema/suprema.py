@@ -22,6 +22,7 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.sides import Bounded, Sides
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.disturbances import columns_of
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array
@@ -161,7 +162,7 @@ def _followed(case: Case, asked: Asked) -> Worst | None:
         raise Unchecked("worst cases of a system that changes with time are not derived")
     if case.problem.execution is not None and case.theta.any():
         raise Unchecked("worst cases of a control that is delivered with errors are not derived")
-    if not isinstance(system, LinearSystem) or system.parameter_count:
+    if not isinstance(system, LinearSystem) or system.parameter_count or case.several:
         return None
     return followed(case, asked.window.split(asked.direction)[0])
 
@@ -187,7 +188,8 @@ def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Wor
     if followed is not None:
         value = followed.along(time, deviation, changes, signal)
         return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
-    state = reached(*_following(case, changes, signal), time, parameter, deviation=entry.get("deviation"))
+    fine, on_grid = _following(case, changes, signal)
+    state = reached(fine, time, parameter, on_grid, entry.get("deviation"))
     direction = window.split(asked.direction)[0]
     total = sum((a * x for a, x in zip(balls(direction), state, strict=True)), balls([0.0])[0])
     return below(total + low), above(total + high)
@@ -208,8 +210,9 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
     signal = numbers(entry.get("disturbance"), "disturbance")
     if signal.shape != (problem.disturbance.dimension, changes.size - 1):
         raise Broken(f"disturbance: expected shape {(problem.disturbance.dimension, changes.size - 1)}")
-    jumps = changes[1:-1][(signal[:, 1:] != signal[:, :-1]).any(axis=0)]
-    if not case.measurable and not np.isin(jumps, case.changes or []).all():
+    held = ~columns_of(problem.disturbance, problem.disturbance_class, "measurable")
+    jumps = changes[1:-1][(signal[held, 1:] != signal[held, :-1]).any(axis=0)]
+    if not np.isin(jumps, case.changes or []).all():
         raise Broken("the disturbance jumps within a piece")
     shape, seen = known(problem.disturbance), set[tuple[float, ...]]()
     for value in case.clock.each(map(tuple, signal.T.tolist())):

@@ -143,9 +143,10 @@ class Sensitivity:
         parameters, model = self.constraint.parameters.clamp(points), self.constraint.functionals.disturbance
         at = self._functional(times[:, 0], parameters, z, rows)
         weights = at.pushed
-        closed = signals is None and model is not None and model.kind == "measurable"
-        if signals is None and model is not None and not closed:
-            signals = model.worst(self._entered(weights, at))
+        by_block, support = None if model is None else model.on_blocks, self.constraint.functionals.measurable
+        closed = signals is None and support is not None
+        if signals is None and by_block is not None:
+            signals = by_block.worst(self._entered(weights, at))
         force = at.force(self.constraint.functionals.on_grid(x), signals)
         in_time, in_parameters, states = at.in_time(force), at.in_parameters(force), at.states(force)
         if self._response.propagator.expansion is not None:
@@ -245,6 +246,7 @@ class Sensitivity:
     def _sigma_slopes(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:
         """What measurable disturbances add to the derivatives in time, parameters and directions."""
         support, grid = self.constraint.functionals.measurable, self._response.grid
+        assert support is not None
         if grid.mode is None:
             in_time = support.bound.support((at.free[:, :1] @ at.W[:, 0])[:, 0])[:, None]
         else:  # of what earlier systems did there is no closed form

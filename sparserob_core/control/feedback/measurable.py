@@ -104,7 +104,9 @@ class MeasurablePieces:
         distinct, which = np.unique(np.clip(times - response.grid.breakpoints[pieces], 0.0, None), return_inverse=True)
         count = distinct.size
         none = np.zeros((count * r, 0))
-        found = self.functionals.measurable(np.repeat(distinct, r), np.tile(H, (count, 1)), none).reshape(count, r)
+        support = self.functionals.measurable
+        assert support is not None
+        found = support(np.repeat(distinct, r), np.tile(H, (count, 1)), none).reshape(count, r)
         _, E = self._matrices
         found = found - (H @ response.flows(distinct)[1] @ (E @ self.middle))
         return np.asarray(found[which.reshape(k)])

@@ -2,7 +2,9 @@
 
 Disturbances ``E_i w_i`` of one class, with ``w_i`` in ``W_i``, push the state as ``[E_1 E_2 ...] w`` does, with ``w``
 in the product of the ``W_i``: every signal of the one is a signal of the other. So a problem that lists them is a
-problem with one, and whatever is proven of one disturbance is proven of a list. One that acts in a window of time alone
+problem with one, and whatever is proven of one disturbance is proven of a list. Of two classes they are one in a
+`Product`, each part of it of a class of its own; what each class does is that of the set that is 0 along the columns of
+the other, and both add up (`apart`). One that acts in a window of time alone
 enters a system that takes turns, whose ``E`` is 0 outside of the window.
 """
 
@@ -19,11 +21,12 @@ import numpy as np
 from sparserob_core.brief import noun
 from sparserob_core.control.problem.expression import Entries, beside
 from sparserob_core.control.problem.system import LinearSystem, Matrix, SwitchedSystem, System, VaryingSystem
-from sparserob_core.control.sets.sets import product
+from sparserob_core.control.sets.sets import Product, product
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import ConvexSet
+from sparserob_core.sip.convex_set import Box, ConvexSet
 
 DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
+Classes: TypeAlias = DisturbanceClass | tuple[DisturbanceClass, ...]
 SHORTEST = 1e-12  # of the horizon: ten times more and windows are lost that a clock can tell apart; ten times less and
 # ends that are sums of steps make pieces of the system that are rounding
 
@@ -54,19 +57,19 @@ class Disturbance:
             raise InputError(error.sentence, path=f"{where}.E") from None
 
 
-def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tuple[System, ConvexSet, DisturbanceClass]:
+def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tuple[System, ConvexSet, Classes]:
     """The system under all of these disturbances side by side until the ``horizon``, the set of them together, and
-    their class; raises `InputError` that begins with ``disturbance`` and the number of the one at fault."""
+    their class, or that of every part of the set; raises `InputError` that begins with ``disturbance`` and the number
+    of the one at fault."""
     kind, first = every[0].kind, system.law if isinstance(system, VaryingSystem) else system.modes[0]
     for i, one in enumerate(every):
         if one.kind not in get_args(DisturbanceClass):
             wanted = f"one of {', '.join(get_args(DisturbanceClass))}"
             raise InputError(path=f"disturbance.{i}.class", expected=wanted, got=f"{one.kind!r}")
-        if one.kind != kind:
+        if one.kind != kind and "l1_ball" in (one.kind, kind):
             raise InputError(
                 path=f"disturbance.{i}.class",
-                expected=f"{kind}, the class of the first: two classes at once are not built; a measurable disturbance"
-                " may do all that a piecewise constant one does",
+                expected=f"{kind}, the class of the first: l1_ball is of all of a list, or of none",
                 got=one.kind,
             )
     windows = [_window(f"disturbance.{i}", one, horizon) for i, one in enumerate(every)]
@@ -84,16 +87,38 @@ def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tupl
             columns.append(E if acts else np.zeros((mode.states, sets[i].dimension)))
         begins.append(begin)
         pieces.append((until, replace(mode, E=reduce(beside, columns))))
+    kinds = tuple(one.kind for one in every)
+    together: tuple[ConvexSet, Classes] = (product(sets), kind)
+    if len(set(kinds)) > 1:
+        together = Product(tuple(sets)), kinds
     if isinstance(system, VaryingSystem):
         laws = [(begin, law) for begin, (_, law) in zip(begins, pieces, strict=True)]
-        return system.lawful(laws), product(sets), kind
+        return system.lawful(laws), *together
     if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
-        return pieces[0][1], product(sets), kind
-    return (
-        SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay),
-        product(sets),
-        kind,
-    )
+        return pieces[0][1], *together
+    return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay), *together
+
+
+def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
+    """The set of the disturbances in ``bound`` that are of one class, which is 0 along the columns of others; ``None``
+    where there are none."""
+    if bound is None or isinstance(classes, str):
+        return bound if classes == kind else None
+    assert isinstance(bound, Product)
+    every = zip(bound.parts, classes, strict=True)
+    return product([part if one == kind else _nothing(part.dimension) for part, one in every])
+
+
+def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np.ndarray:
+    """Which columns of ``E`` are of disturbances of one class, ``(mw,)``."""
+    if isinstance(classes, str):
+        return np.full(bound.dimension, classes == kind)
+    assert isinstance(bound, Product)
+    return np.repeat([one == kind for one in classes], [part.dimension for part in bound.parts])
+
+
+def _nothing(dimension: int) -> ConvexSet:
+    return Box(np.zeros(dimension), np.zeros(dimension))
 
 
 def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from sparserob_core.brief import noun
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost
-from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass, joined
+from sparserob_core.control.problem.disturbances import Classes, Disturbance, DisturbanceClass, apart, joined
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.prices import checked_weights, counted, integrals
 from sparserob_core.control.problem.system import (
@@ -25,7 +25,7 @@ from sparserob_core.control.problem.system import (
     VaryingSystem,
     require_period,
 )
-from sparserob_core.control.sets.sets import Equality, Polytope
+from sparserob_core.control.sets.sets import Equality, Polytope, Product
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense, sealed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
@@ -151,7 +151,7 @@ class OptimalControlProblem:
     ``disturbances``: instead of ``disturbance``, a list of them, each with its set, its ``E``, its class and its window
     of time; ``w`` is made of all of them, one after another. After construction ``disturbance`` is the product of their
     sets, ``E`` of the system has the columns of theirs (0 in pieces of the system outside of a window), and the list is
-    empty.
+    empty; where there are two classes, ``disturbance_class`` has that of every part of the product.
 
     ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
     anywhere in ``initial_state + initial_set``, and every constraint holds from there.
@@ -188,7 +188,7 @@ class OptimalControlProblem:
     initial_set: ConvexSet | None = None
     weights: npt.ArrayLike | None = None
     disturbance: ConvexSet | None = None
-    disturbance_class: DisturbanceClass = "piecewise_constant"
+    disturbance_class: Classes = "piecewise_constant"
     path: Sequence[PathConstraint | MixedConstraint | ConvexSet] = ()
     terminal: Sequence[ConvexSet | Equality] = ()
     integral: Sequence[IntegralConstraint] = ()
@@ -220,14 +220,6 @@ class OptimalControlProblem:
         if isinstance(self.system, SwitchedSystem):
             self._check_pieces(self.system)
         self._join_disturbances()
-        measurable = self.disturbance is not None and self.disturbance_class == "measurable"
-        if measurable and isinstance(self.system, VaryingSystem):
-            raise InputError(
-                path="disturbance_class",
-                expected="piecewise_constant where the system changes with time, of which measurable ones are not"
-                " proven",
-                got="measurable",
-            )
         self._set("initial_state", self._state())
         self._set("initial_set", self._deviations())
         self._set("weights", checked_weights(self.weights, self.system.controls, self.horizon))
@@ -238,6 +230,13 @@ class OptimalControlProblem:
             step = _checked_set("control_step", self.control_step, self.system.controls, "controls")
             self._set("control_step", None if _restricts_nothing(step) else step)
         self._check_disturbance()
+        if self.measurable is not None and isinstance(self.system, VaryingSystem):
+            raise InputError(
+                path="disturbance_class",
+                expected="piecewise_constant where the system changes with time, of which measurable ones are not"
+                " proven",
+                got="measurable",
+            )
         self._set("measurements", self._measured())
         self._check_names()
         windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
@@ -251,6 +250,11 @@ class OptimalControlProblem:
             self._return()
         self._set("execution", self._executed())
         sealed(self)
+
+    @property
+    def measurable(self) -> ConvexSet | None:
+        """The set of the measurable disturbances, 0 along the columns of others; ``None`` where there are none."""
+        return apart(self.disturbance, self.disturbance_class, "measurable")
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
@@ -316,7 +320,7 @@ class OptimalControlProblem:
             "pieces of the system": isinstance(self.system, SwitchedSystem),
             "uncertain parameters": bool(self.system.parameter_count),
             "a delay": self.system.delay > 0.0,
-            "measurable disturbances": self.disturbance is not None and self.disturbance_class == "measurable",
+            "measurable disturbances": self.measurable is not None,
             "integrals of state and control": bool(self.integral),
             "curved sets of states": any(one.halfspaces() is None for one in sets),
             "a cost other than the L1 norm": not self.cost.is_linear,
@@ -398,7 +402,12 @@ class OptimalControlProblem:
         return control
 
     def _check_disturbance(self) -> None:
-        if self.disturbance_class not in get_args(DisturbanceClass):
+        kinds, bound = self.disturbance_class, self.disturbance
+        if isinstance(kinds, tuple) and isinstance(bound, Product) and len(bound.parts) == len(kinds):
+            known = set(kinds) == {"piecewise_constant", "measurable"}
+        else:
+            known = isinstance(kinds, str) and kinds in get_args(DisturbanceClass)
+        if not known:
             raise InputError(
                 path="disturbance_class",
                 expected=f"one of {', '.join(get_args(DisturbanceClass))}",
@@ -425,7 +434,7 @@ class OptimalControlProblem:
             raise InputError(
                 path="disturbance_class" if self.disturbance is None else "disturbance",
                 expected="none beside a list of disturbances, each of which has its own",
-                got=self.disturbance_class if self.disturbance is None else self.disturbance.kind,
+                got=f"{self.disturbance_class}" if self.disturbance is None else self.disturbance.kind,
             )
         system, bound, kind = joined(self.system, every, self.horizon)
         self._set("system", system)

@@ -8,13 +8,14 @@ exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.disturbances import Classes, apart
 from sparserob_core.control.response.response import TimeGrid
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.errors import InputError
@@ -29,16 +30,34 @@ class DisturbanceModel:
 
     ``basis (nb, L, q)`` lists for block ``b`` the grid-piece values of its ``q`` functions; a block is a vector of
     ``q mw`` coefficients (channel-major) scaled by ``scale (mw,)``, and it ranges over ``set``. ``pieces`` is a
-    shortcut when the blocks are the pieces themselves.
+    shortcut when the blocks are the pieces themselves. Of ``several`` classes the ``classes`` of the parts of ``bound``
+    are told; the blocks are then those of disturbances that are all constant on pieces, which are admissible.
     """
 
-    kind: Literal["piecewise_constant", "measurable", "l1_ball"]
+    kind: Literal["piecewise_constant", "measurable", "l1_ball", "several"]
     set: ConvexSet
     bound: ConvexSet
     grid: TimeGrid
     starts: np.ndarray | None = None
     functions: Array | None = None
     scale: Array | None = None
+    classes: Classes = ()
+
+    @cached_property
+    def on_blocks(self) -> DisturbanceModel | None:
+        """The model of those that blocks make, ``None`` where all are measurable."""
+        if self.kind == "measurable":
+            return None
+        if self.kind != "several":
+            return self
+        held = apart(self.bound, self.classes, "piecewise_constant")
+        assert held is not None
+        return replace(self, kind="piecewise_constant", set=held, bound=held, classes=())
+
+    @cached_property
+    def measurable(self) -> ConvexSet | None:
+        """The set of those that are measurable, ``None`` where there are none."""
+        return apart(self.bound, self.classes if self.kind == "several" else self.kind, "measurable")
 
     @property
     def channels(self) -> int:
@@ -128,7 +147,7 @@ class DisturbanceModel:
         return answer
 
 
-def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid) -> DisturbanceModel:
+def disturbance_model(kind: Classes, bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid) -> DisturbanceModel:
     """The model of a disturbance class.
 
     ``piecewise_constant``: every combination of the dictionary's functions whose values stay in ``bound`` on every
@@ -137,6 +156,14 @@ def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid:
     """
     if kind == "measurable":
         return DisturbanceModel("measurable", bound, bound, grid, starts=np.arange(grid.pieces))
+    if not isinstance(kind, str):
+        if not dictionary.is_complete:
+            raise InputError(
+                "fewer functions than pieces are not proven beside measurable disturbances",
+                path="dictionaries.disturbance",
+            )
+        alone = disturbance_model("piecewise_constant", bound, dictionary, grid)
+        return replace(alone, kind="several", classes=kind)
     if kind == "l1_ball":
         box = bound.bounding_box()
         if not bound.is_box or not np.array_equal(box.lower, -box.upper):

@@ -77,9 +77,7 @@ class WorstCase:
     @shaped
     def from_state(self, initial_state: Float[Array, " d"]) -> WorstCase:
         """The functionals from another initial state ``(d,)``; what does not depend on it is shared."""
-        measurable = self.disturbance is not None and self.disturbance.kind == "measurable"
-        support = self.measurable if measurable else None
-        return replace(self, response=self.response.from_state(initial_state), shared=support)
+        return replace(self, response=self.response.from_state(initial_state), shared=self.measurable)
 
     @cached_property
     def channels(self) -> int:
@@ -251,7 +249,7 @@ class WorstCase:
         linear in the direction, so that those of the axes are computed once."""
         known, model = self._axes(times, parameters), self.disturbance
         states = known.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", known.control, self.on_grid(theta))
-        by_block = model if model is not None and model.kind != "measurable" else None
+        by_block, measurable = None if model is None else model.on_blocks, self.measurable
         blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(known.disturbance)
 
         def along(directions: Array, which: np.ndarray) -> Array:
@@ -265,8 +263,8 @@ class WorstCase:
                 if by_block is not None:
                     on_blocks = turned @ blocks[at].reshape(*blocks[at].shape[:2], -1)
                     found[part] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
-            if model is not None and by_block is None:
-                found += self.measurable(times[which], directions, parameters[which]).reshape(found.shape)
+            if measurable is not None:
+                found += measurable(times[which], directions, parameters[which]).reshape(found.shape)
             return found.reshape(-1)
 
         return along
@@ -279,8 +277,8 @@ class WorstCase:
         where the grid allows."""
         model, (k, r) = self.disturbance, (times.size, directions.shape[0])
         changes = self.response.grid.mode is not None
-        aged = model is None or (model.kind != "measurable" and self.response.uniform and model.by_piece)
-        if (changes or not aged) and r > directions.shape[1] and not (model and model.kind == "measurable"):
+        aged = model is None or (self.measurable is None and self.response.uniform and model.by_piece)
+        if (changes or not aged) and r > directions.shape[1] and self.measurable is None:
             return self._profile_by_axes(times, directions, parameter)
         if changes or not aged:
             every = np.broadcast_to(parameter, (k * r, parameter.size))
@@ -337,14 +335,15 @@ class WorstCase:
             found += [] if model is None else [VaryingSupport.of_disturbance(lifted, model, rows, joined)]
             found += [] if self.initial is None else [VaryingSupport.of_initial(lifted, self.initial, rows, joined)]
             return Supports(tuple(found)) if found else None
-        if model is not None and model.kind != "measurable":
-            found.append(DisturbanceSupport(lifted, model, rows, joined))
-        elif model is not None:
+        by_block, measurable = None if model is None else model.on_blocks, self.measurable
+        if by_block is not None:
+            found.append(DisturbanceSupport(lifted, by_block, rows, joined))
+        if measurable is not None:
             if lifted.space.nu or joined is not None:
                 raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
             from sparserob_core.control.response.measurable import MeasurableCellSupport
 
-            found.append(MeasurableCellSupport(self.measurable, H, lifted))
+            found.append(MeasurableCellSupport(measurable, H, lifted))
         if self.initial is not None:
             found.append(InitialSupport(lifted, self.initial, rows, joined))
         return Supports(tuple(found)) if found else None
@@ -392,15 +391,17 @@ class WorstCase:
         return self.initial.support_point(self.response.weights(times, directions, parameters).free)
 
     @cached_property
-    def measurable(self) -> MeasurableSupport:
-        """The support of measurable disturbances; the ``shared`` one where it is of this system and set."""
+    def measurable(self) -> MeasurableSupport | None:
+        """The support of measurable disturbances, ``None`` where there are none; the ``shared`` one where it is of this
+        system and set."""
         from sparserob_core.control.response.measurable import MeasurableSupport
 
-        assert self.disturbance is not None
-        given = self.shared
-        if given and given.response.propagator is self.response.propagator and given.bound is self.disturbance.bound:
+        bound, given = None if self.disturbance is None else self.disturbance.measurable, self.shared
+        if bound is None:
+            return None
+        if given and given.response.propagator is self.response.propagator and given.bound is bound:
             return given
-        return MeasurableSupport(self.response, self.disturbance.bound)
+        return MeasurableSupport(self.response, bound)
 
     @shaped
     def given(self, weights: Float[Array, "k L mc"]) -> Float[Array, " k"]:
@@ -471,12 +472,10 @@ class WorstCase:
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
     ) -> Float[Array, " k"]:
-        begun = self._begun(known.free)
-        if self.disturbance is None:
-            return begun
-        if self.disturbance.kind == "measurable":
-            return begun + self.measurable(times, directions, parameters)
-        return begun + self.disturbance.support(known.disturbance)
+        found, by_block = self._begun(known.free), None if self.disturbance is None else self.disturbance.on_blocks
+        if by_block is not None:
+            found = found + by_block.support(known.disturbance)
+        return found if self.measurable is None else found + self.measurable(times, directions, parameters)
 
     @shaped
     def _begun(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:

@@ -82,7 +82,7 @@ class MeasurableSupport:
 
     response: Response
     bound: ConvexSet
-    _tables: dict[tuple[bytes, bytes, bool, int], _Table] = field(default_factory=dict, repr=False)
+    _tables: dict[bytes, _Table] = field(default_factory=dict, repr=False)
 
     @shaped
     def __call__(
@@ -139,7 +139,7 @@ class MeasurableSupport:
             A, E = (part[0] for part in self.response.system.modes[number].matrices(parameter[None])[::2])
             ages, length = self._legs[number].breakpoints, float(self._legs[number].breakpoints[-1])
             last, through = np.flatnonzero(legs == number), np.flatnonzero(legs > number)
-            key = (parameter.tobytes(), enclosed, number)
+            key = parameter.tobytes() + number.to_bytes(4) + bytes([enclosed])
             total[last] += self._until(A, E, ages, times[last], rows[last], key)
             if through.size:
                 total[through] += self._through(A, E, length, rows[through], enclosed)
@@ -150,11 +150,10 @@ class MeasurableSupport:
                 rows[mine] = _moved(A, rows[mine], spent[:, None])[:, 0]
         return total
 
-    def _until(
-        self, A: Array, E: Array, ages: Array, times: Array, directions: Array, key: tuple[bytes, bool, int]
-    ) -> Array:
+    def _until(self, A: Array, E: Array, ages: Array, times: Array, directions: Array, key: bytes) -> Array:
         """What one system adds until ``times (k,)`` from where it begins, ``(k, 1)`` or ``(k, 2)``; integrals up to
-        ``ages (L + 1,)`` are remembered, of the parameter and the system that the ``key`` names."""
+        ``ages (L + 1,)`` are remembered, of the parameter and the system that the ``key`` names, which ends with
+        whether they are enclosed."""
         if not times.size:
             return np.zeros((0, 1))
         unique, which = np.unique(directions, axis=0, return_inverse=True)
@@ -164,7 +163,7 @@ class MeasurableSupport:
         parts = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
         within = np.clip(times - starts[parts], 0.0, None)
         before, found = np.array([tables[one].sums[part] for one, part in zip(which, parts, strict=True)]), None
-        if key[1]:
+        if key[-1]:
             terms = np.array([tables[one].terms[part] for one, part in zip(which, parts, strict=True)])
             lost = np.array([tables[one].lost[part] for one, part in zip(which, parts, strict=True)])
             accuracy = np.array([table.accuracy for table in tables])[which]
@@ -198,13 +197,13 @@ class MeasurableSupport:
             found[part] = bounds.reshape(*lost.shape, -1, 2).sum(axis=1) + (lost + late)[:, None] * [-1.0, 1.0]
         return found
 
-    def _known(self, A: Array, E: Array, ages: Array, directions: Array, key: tuple[bytes, bool, int]) -> list[_Table]:
+    def _known(self, A: Array, E: Array, ages: Array, directions: Array, key: bytes) -> list[_Table]:
         """What is remembered of each of ``directions (k, d)``."""
-        keys = [(direction.tobytes(), *key) for direction in directions]
+        keys = [direction.tobytes() + key for direction in directions]
         found = {one: self._tables[one] for one in keys if one in self._tables}
         for one, direction in zip(keys, directions, strict=True):
             if one not in found:
-                make = self._enclosing if key[1] else self._measuring
+                make = self._enclosing if key[-1] else self._measuring
                 found[one] = remember(self._tables, one, make(A, E, ages, direction), TABLES_KEPT)
         return [found[one] for one in keys]
 

@@ -12,11 +12,10 @@ import numpy as np
 from sparserob_core.brief import brief
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.flows import Leaps
-from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.transcription.record import Feedback
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from sparserob_core.control.feedback.closed_loop import ClosedLoop
@@ -118,9 +117,10 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     ``direction'e^{A (time - s)} E w`` (Pontryagin's principle): constant between finitely many switches for a polytope,
     approached by `SIGNAL` constants for a set without corners.
     """
-    grid, model = functionals.response.grid, functionals.disturbance
-    if model is None or model.kind != "measurable":
+    grid, model, support = functionals.response.grid, functionals.disturbance, functionals.measurable
+    if model is None or support is None:
         return grid.breakpoints, functionals.worst_disturbance(time, direction, parameter)
+    bound = support.bound
     flow = _Way.of(functionals.response, parameter, time, direction)
     starts = np.concatenate(
         [
@@ -130,11 +130,16 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     )
     ends = np.append(starts[1:], grid.breakpoints[-1])
     past = starts < time
-    starts, ends = _halved(model, flow, (starts[past], np.minimum(ends[past], time)))
-    values = model.bound.support_point(flow.gains(starts, ends))
+    starts, ends = _halved(bound, flow, (starts[past], np.minimum(ends[past], time)), float(grid.breakpoints[-1]))
+    values = bound.support_point(flow.gains(starts, ends))
     if time < grid.breakpoints[-1]:  # afterwards nothing matters
-        starts, values = np.append(starts, time), np.vstack([values, model.bound.interior_point()])
-    return _merged(starts, values, grid.breakpoints)
+        starts, values = np.append(starts, time), np.vstack([values, bound.interior_point()])
+    points, signal = _merged(starts, values, grid.breakpoints)
+    if model.on_blocks is not None:  # of other columns
+        weights = functionals.response.weights(np.array([time]), direction[None], parameter[None]).disturbance
+        held = model.on_blocks.worst(weights)[0]
+        signal = signal + held[:, grid.locate((points[:-1] + points[1:]) / 2)]
+    return points, signal
 
 
 def pushed_by(
@@ -190,13 +195,14 @@ class _Way:
         return found
 
 
-def _halved(model: DisturbanceModel, flow: _Way, parts: tuple[Array, Array]) -> tuple[Array, Array]:
+def _halved(bound: ConvexSet, flow: _Way, parts: tuple[Array, Array], horizon: float) -> tuple[Array, Array]:
     """The parts, halved wherever the best constant on one is not the best at both of its ends; the most lossy of them
     when they are too many."""
     starts, ends = parts
     here = np.arange(starts.size)
     for _ in range(HALVINGS):
-        lost, allowed = _lost(model, flow, starts[here], ends[here])
+        lost, size = _lost(bound, flow, starts[here], ends[here])
+        allowed = LOST * size * horizon
         middles = (starts[here] + ends[here]) / 2
         open_ = np.flatnonzero((lost > allowed) & (middles > starts[here]) & (middles < ends[here]))
         open_ = open_[np.argsort(-lost[open_], kind="stable")][: max(0, SIGNAL - starts.size)]
@@ -210,17 +216,17 @@ def _halved(model: DisturbanceModel, flow: _Way, parts: tuple[Array, Array]) -> 
     return starts[order], ends[order]
 
 
-def _lost(model: DisturbanceModel, flow: _Way, starts: Array, ends: Array) -> tuple[Array, float]:
-    """What the best constant on each part misses at its two ends, times the part's length, ``(k,)``, and how much of
-    that is rounding."""
-    best = model.bound.support_point(flow.gains(starts, ends))
+def _lost(bound: ConvexSet, flow: _Way, starts: Array, ends: Array) -> tuple[Array, float]:
+    """What the best constant on each part misses at its two ends, times the part's length, ``(k,)``, and the largest
+    that is there."""
+    best = bound.support_point(flow.gains(starts, ends))
     missed, largest = np.zeros(starts.size), 0.0
     for times in (starts, ends):
         rows = flow.at(times, (starts + ends) / 2)
-        height = model.bound.support(rows)
+        height = bound.support(rows)
         missed += (ends - starts) * (height - (best * rows).sum(axis=1))
         largest = max(largest, float(np.abs(height).max(initial=0.0)))
-    return missed, LOST * largest * float(model.grid.breakpoints[-1])
+    return missed, largest
 
 
 def _merged(starts: Array, values: Array, breakpoints: Array) -> tuple[Array, Array]:

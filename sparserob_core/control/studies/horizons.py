@@ -265,7 +265,7 @@ class Horizons:
         own = self._own
         if own.disturbance is None:
             return None
-        if own.disturbance_class == "measurable":  # what is constant on pieces is measurable
+        if own.measurable is not None:  # what is constant on pieces is measurable
             starts = np.arange(self._grid.pieces)
             return DisturbanceModel("piecewise_constant", own.disturbance, own.disturbance, self._grid, starts=starts)
         return disturbance_model(own.disturbance_class, own.disturbance, stretched(self.disturbance, 1.0), self._grid)

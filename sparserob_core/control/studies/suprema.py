@@ -186,7 +186,7 @@ def followed(
     that adds up otherwise."""
     control, disturbance = dictionaries
     system, d = problem.system, problem.system.states
-    if not isinstance(system, LinearSystem) or system.parameter_count:
+    if not isinstance(system, LinearSystem) or system.parameter_count or not isinstance(problem.disturbance_class, str):
         return None
     changes: Array | None = None
     if problem.disturbance is not None and problem.disturbance_class == "piecewise_constant":
@@ -319,9 +319,9 @@ def _of_program(
     missed = 0.0
     if disturbance is not None and problem.disturbance is not None:
         disturbance = within(problem.disturbance, disturbance.T).T
-        if problem.disturbance_class == "measurable":  # whose worst signal is found to rounding, or less
-            support = functionals.measurable(at[0], at[1], at[2])[0]
-            missed = max(0.0, float(support) - pushed_by(functionals, *of_state, (changes, disturbance)))
+        if functionals.measurable is not None:  # whose worst signal is found to rounding, or less
+            support = float(functionals.offsets(*at)[0]) - functionals.parts(*of_state).begun
+            missed = max(0.0, support - pushed_by(functionals, *of_state, (changes, disturbance)))
     edges, middles = _bins(row)
     low = np.full(middles.size, -np.inf)
     for p in (found.index[1:], middle[1:]):

@@ -164,7 +164,8 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         "system without uncertain parameters: else what is measured is not the disturbance alone": bool(
             problem.system.parameter_count
         ),
-        f"disturbance of the class piecewise_constant or measurable, not {kind}": disturbed
+        "disturbance of one class, piecewise_constant or measurable, not "
+        f"{kind if isinstance(kind, str) else ' and '.join(sorted(set(kind)))}": disturbed
         and kind not in ("piecewise_constant", "measurable"),
         f"measurable disturbance in a set with known corners, which the {bound.kind if bound else ''} has not": bool(
             measurable and bound is not None and not has_corners(bound)

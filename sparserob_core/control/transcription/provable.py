@@ -24,7 +24,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
 
     Nothing is solved: this takes milliseconds.
     """
-    if problem.disturbance is not None and problem.disturbance_class == "measurable":
+    if problem.measurable is not None:
         paths = [entry if isinstance(entry, ConvexSet) else entry.set for entry in problem.path]
         ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
         curved = [one for one in (*paths, *ends) if one.halfspaces() is None]
@@ -55,9 +55,9 @@ def announced(why: str, limited: bool) -> str:
 def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
     """What a claim about a problem rests on that is not proven; empty where there is nothing of the kind, as where the
     set of measurable disturbances is flat. Under ``feedback`` the checker proves it."""
-    if problem.disturbance is None or problem.disturbance_class != "measurable":
+    if problem.measurable is None:
         return ""
-    if not feedback and problem.disturbance.halfspaces() is not None:
+    if not feedback and problem.measurable.halfspaces() is not None:
         return ""
     if feedback:
         return (

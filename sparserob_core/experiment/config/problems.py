@@ -370,7 +370,7 @@ class DisturbanceOptions(Sparse):
     given."""
 
     kind: DisturbanceClass = Field(default="piecewise_constant", alias="class")
-    """Which functions it may be, as in ``disturbance_class``; the same for all of a list."""
+    """Which functions it may be, as in ``disturbance_class``; ``l1_ball`` is that of all of a list, or of none."""
 
     start: float | None = Field(default=None, alias="from", ge=0.0)
     """When it begins to act; 0 unless given."""

@@ -57,7 +57,7 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         "initial_state": _initial_keys(problem),
         "control": set_keys("control", problem.control),
         "weights": np.asarray(problem.weights).tolist(),
-        "disturbance_class": problem.disturbance_class,
+        "disturbance_class": _class_of(problem, 0),
         "path": [_path_keys(f"path.{i}", entry) for i, entry in enumerate(path)],
         "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
         "integral": [_integral_keys(entry) for entry in problem.integral],
@@ -88,15 +88,23 @@ def _disturbance_keys(problem: OptimalControlProblem, system: dict[str, Any]) ->
         return set_keys("disturbance", bound)
     if "E" not in system:
         raise InputError(
-            path="disturbance", expected="sets with flat sides, or one system for all of the horizon", got=bound.kind
+            path="disturbance",
+            expected="sets with flat sides and of one class, or one system for all of the horizon",
+            got=bound.kind,
         )
     found, begin, rows = [], 0, system.pop("E")
     for i, part in enumerate(bound.parts):
         columns = [row[begin : begin + part.dimension] for row in rows]
         begin += part.dimension
-        keys = {"set": set_keys(f"disturbance.{i}.set", part), "E": columns, "class": problem.disturbance_class}
+        keys = {"set": set_keys(f"disturbance.{i}.set", part), "E": columns, "class": _class_of(problem, i)}
         found.append(keys)
     return found
+
+
+def _class_of(problem: OptimalControlProblem, part: int) -> str:
+    """The class of a part of the disturbance."""
+    kinds = problem.disturbance_class
+    return kinds if isinstance(kinds, str) else kinds[part]
 
 
 def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
