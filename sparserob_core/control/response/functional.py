@@ -277,21 +277,24 @@ class WorstCase:
         where the grid allows."""
         model, (k, r) = self.disturbance, (times.size, directions.shape[0])
         changes = self.response.grid.mode is not None
-        aged = model is None or (self.measurable is None and self.response.uniform and model.by_piece)
-        if (changes or not aged) and r > directions.shape[1] and self.measurable is None:
+        by_block, measurable = None if model is None else model.on_blocks, self.measurable
+        aged = model is None or (self.response.uniform and (by_block is None or by_block.by_piece))
+        if (changes or not aged) and r > directions.shape[1] and measurable is None:
             return self._profile_by_axes(times, directions, parameter)
         if changes or not aged:
             every = np.broadcast_to(parameter, (k * r, parameter.size))
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
-        sigma = np.zeros((k, r))
-        if model is not None:
+        sigma, several = np.zeros((k, r)), max(1, CHUNK // (r * directions.shape[1]))
+        if by_block is not None:
             known = self._frozen.get(parameter.tobytes())
             if known is None:
                 fixed = (self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
                 known = remember(self._frozen, parameter.tobytes(), frozen(*fixed), LEGS_KEPT)
-            sigma = DisturbanceSupport(known, model, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
+            sigma = DisturbanceSupport(known, by_block, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
+        for part in _parts(0 if measurable is None else k, several):
+            at = np.repeat(times[part], r), np.tile(directions, (times[part].size, 1))
+            sigma[part] += measurable(*at, np.broadcast_to(parameter, (at[0].size, parameter.size))).reshape(-1, r)
         if self.initial is not None:
-            several = max(1, CHUNK // (r * directions.shape[1]))
             for part in _parts(k, several):
                 rows = self.response.propagator.backwards(times[part], directions, parameter)
                 sigma[part] += self.initial.support(rows)

@@ -32,7 +32,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance_support import Carried, carried
 from sparserob_core.control.response.initial_support import InitialSupport, Support
 from sparserob_core.control.response.lifted import LiftedSystem
-from sparserob_core.control.response.response import Response, TimeGrid
+from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.response.varying_motion import OUTWARD, VaryingMotion
 from sparserob_core.shapes import Float, Int, shaped
@@ -76,6 +76,35 @@ class _Table:
 
 
 @dataclass(frozen=True, eq=False)
+class _Balanced:
+    """``A (d, d)`` in ``units (d,)`` of the states in which it is small, powers of two: what is left of an expansion is
+    bounded by its norm there, the ``speed``."""
+
+    A: Array
+    units: Array
+    speed: float
+    leaps: Leaps
+
+    @staticmethod
+    def of(A: Array) -> _Balanced:
+        from scipy.linalg import matrix_balance
+
+        balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
+        return _Balanced(balanced, units, float(np.linalg.norm(balanced, 2)), Leaps(balanced))
+
+    @cached_property
+    def fastest(self) -> float:
+        """How fast rows move: not by the norm alone, which of a matrix far from normal is much larger than what its
+        flow does."""
+        return min(self.speed, max(4.0 * float(np.abs(np.linalg.eigvals(self.A)).max()), self.speed / 16.0))
+
+    @cached_property
+    def products(self):  # type: ignore[no-untyped-def]  # arrays, or sparse ones of scipy
+        """The matrix and that of its absolute values."""
+        return products(self.A), products(np.abs(self.A))
+
+
+@dataclass(frozen=True, eq=False)
 class MeasurableSupport:
     """The support ``sigma`` for one set ``bound``; integrals up to the grid's breakpoints are remembered per direction
     and parameter, of the system that acts last."""
@@ -83,6 +112,7 @@ class MeasurableSupport:
     response: Response
     bound: ConvexSet
     _tables: dict[bytes, _Table] = field(default_factory=dict, repr=False)
+    _balanced: dict[bytes, _Balanced] = field(default_factory=dict, repr=False)
 
     @shaped
     def __call__(
@@ -156,8 +186,7 @@ class MeasurableSupport:
         whether they are enclosed."""
         if not times.size:
             return np.zeros((0, 1))
-        unique, which = np.unique(directions, axis=0, return_inverse=True)
-        which = which.reshape(-1)
+        unique, which = unique_rows(directions)
         tables = self._known(A, E, ages, unique, key)
         starts = tables[0].starts
         parts = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
@@ -233,24 +262,25 @@ class MeasurableSupport:
 
     def _short(self, A: Array, ages: Array) -> Array:
         """The ends ``(n + 1,)`` of short intervals, as many between all neighbours of ``ages (L + 1,)``."""
-        A, pieces = balanced(A)[0], np.diff(ages)
-        speed = float(np.linalg.norm(A, 2))
-        # not by the norm alone, which of a matrix far from normal is much larger than what its flow does
-        fastest = min(speed, max(4.0 * float(np.abs(np.linalg.eigvals(A)).max()), speed / 16.0))
-        count = int(np.clip(np.ceil(fastest * pieces.max() / SHORT), 1, MOST_SHORT))
+        pieces = np.diff(ages)
+        count = int(np.clip(np.ceil(self._in_balance(A).fastest * pieces.max() / SHORT), 1, MOST_SHORT))
         return np.append((ages[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), ages[-1])
+
+    def _in_balance(self, A: Array) -> _Balanced:
+        """What is remembered of the matrix of a system."""
+        key = A.tobytes()
+        return self._balanced.get(key) or remember(self._balanced, key, _Balanced.of(A), KEPT)
 
     def _expanded(self, A: Array, E: Array, directions: Array, starts: Array) -> tuple[Array, Array, Array]:
         """Of every row ``directions (k, d)`` on every interval between ``starts (n + 1,)``: polynomials ``(k, n,
         ORDER + 1, mw)`` in the share of it that has passed, what the integral over it may be off by with them, ``(k,
         n)``, and the largest integrand, ``(k,)``."""
-        # In units of the states in which the matrix is small, powers of two: what is left is bounded by its norm.
-        A, units = balanced(A)
-        E, speed = E / units[:, None], float(np.linalg.norm(A, 2))
+        known = self._in_balance(A)
+        A, units, speed, E = known.A, known.units, known.speed, E / known.units[:, None]
         lengths, far, count = np.tile(np.diff(starts), len(directions)), self.bound.radius_bound, len(directions)
-        once, sized = products(A), products(np.abs(A))
+        once, sized = known.products
         every = np.repeat(directions * units, starts.size - 1, axis=0)
-        row = Leaps(A).rows(every, np.tile(starts[:-1], count))[0]
+        row = known.leaps.rows(every, np.tile(starts[:-1], count))[0]
         terms, sizes, size = [row @ E], np.abs(row) @ np.abs(E), np.abs(row)
         for order in range(1, ORDER + 1):
             step = (lengths / order)[:, None]
@@ -329,14 +359,6 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
         if not owner.size:
             break
     return total
-
-
-def balanced(A: Array) -> tuple[Array, Array]:
-    """The matrix in units of the states in which it is small, and these units ``(d,)``, powers of two."""
-    from scipy.linalg import matrix_balance
-
-    A, (units, _) = matrix_balance(A, permute=False, separate=True)
-    return A, units
 
 
 @cache
@@ -559,7 +581,7 @@ class Execution:
         """``int_0^age |c'e^{A s} B_j| ds`` for ages ``(k, q)`` of directions ``(k, d)``, of every channel; of ages that
         are alike once."""
         alike = ALIKE * float(self.breakpoints[-1])
-        c, owner = np.unique(directions, axis=0, return_inverse=True)
+        c, owner = unique_rows(directions)
         keys = np.stack([np.repeat(owner.reshape(-1), ages.shape[1]), np.rint(ages.ravel() / alike)])
         (who, _), first, which = np.unique(keys, axis=1, return_index=True, return_inverse=True)
         times, rows = ages.ravel()[first], c[who.astype(int)]

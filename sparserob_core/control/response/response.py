@@ -423,7 +423,7 @@ class Propagator:
         """
         if self.expansion is not None:
             return self._varying_adjoint(self.expansion, times, directions)
-        unique, which = _unique_rows(parameters)
+        unique, which = unique_rows(parameters)
         steps = self.steps(unique)
         pieces = self.grid.locate(times)
         if self.uniform and not parameters.shape[1] and times.size <= FEW:
@@ -479,7 +479,7 @@ class Propagator:
         if times.size > 1 and self.inputs.reach < self.grid.pieces:
             # later times are shifts of one impulse response, and an opposite row has the opposite one
             signs = np.where(rows[every, np.abs(rows).argmax(axis=1)] < 0.0, -1.0, 1.0)
-            apart, which = _unique_rows(rows * signs[:, None])
+            apart, which = unique_rows(rows * signs[:, None])
         by_age = self.inputs.of(apart, count)
         control = np.zeros((times.size, self.grid.pieces, channels))
         disturbance = np.zeros((times.size, self.grid.pieces, steps.E.shape[2]))
@@ -1006,8 +1006,17 @@ def _series(A: Array, rows: Array, times: Array, size: float) -> tuple[Array, Ar
 
 
 @shaped
-def _unique_rows(parameters: Float[Array, "k nu"]) -> tuple[Float[Array, "u nu"], Int[np.ndarray, " k"]]:
-    if parameters.shape[1] == 0 or parameters.shape[0] == 1:
-        return parameters[:1], np.zeros(parameters.shape[0], dtype=int)
-    unique, which = np.unique(parameters, axis=0, return_inverse=True)
-    return unique, which.reshape(-1)
+def unique_rows(rows: Float[Array, "k n"]) -> tuple[Float[Array, "u n"], Int[np.ndarray, " k"]]:
+    """The rows without copies, in increasing order, and which of them every row is.
+
+    Copies are found by their bytes first: to sort long ones costs a look at all their numbers for every comparison.
+    """
+    if rows.shape[1] == 0 or rows.shape[0] == 1:
+        return rows[:1], np.zeros(rows.shape[0], dtype=int)
+    apart: dict[bytes, int] = {}
+    keys = np.ascontiguousarray(rows + 0.0).view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))  # one zero
+    met = np.array([apart.setdefault(key, len(apart)) for key in keys.ravel().tolist()], dtype=int)
+    first = np.empty(len(apart), dtype=int)
+    first[met[::-1]] = np.arange(met.size)[::-1]
+    unique, which = np.unique(rows[first], axis=0, return_inverse=True)
+    return unique, which.reshape(-1)[met]
