@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any
+
 import numpy as np
 import pytest
 
+import sparserob_core as sr
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.problem.units import power_of_two
+from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.sets.sets import Box, Cylinder, Ellipsoid, NormBall, Polytope
 
 SETS = [
@@ -81,3 +86,83 @@ def test_an_uncertain_system_in_other_units_is_the_same_in_values_and_taylor_mod
     for ours, theirs, name in zip(found, wanted, "AABBEE", strict=True):
         np.testing.assert_array_equal(ours, theirs * factors["ABE".index(name)])
     assert other.describe(points[0] / p) == plain.describe(points[0])
+
+
+# What has no unit, by its field: shares, choices, and what a row of the user's is bounded by in the user's own unit.
+UNITLESS = {
+    "disturbance_class", "title", "names", "repeat", "execution", "path.name", "path.h", "integral.lower",
+    "integral.upper", "integral.name", "cost.group", "cost.l1", "disturbances",
+}  # fmt: skip
+
+
+def problems() -> list[sr.OptimalControlProblem]:
+    """Problems that have, together, every field, each with numbers that are not what a field has by default."""
+    system: dict[str, Any] = {
+        "system": sr.LinearSystem(
+            [[0.5, 2.0], [-3.0, 0.25]], [[0.75], [1.5]], E=[[1.25], [0.5]], c=[0.5, 3.0], delay=0.5
+        ),
+        "horizon": 3.0,
+        "initial_state": [1.5, -0.5],
+        "initial_set": sr.Box([-0.25, -0.75], [0.25, 0.75]),
+        "control": sr.Box([-3.0], [1.25]),
+        "disturbance": sr.Box([-0.5], [0.5]),
+        "initial_control": [0.75],
+        "title": "all of it",
+    }
+    path = [
+        sr.PathConstraint(sr.Box([-7.0, -9.0], [7.0, 5.0]), 0.5, 2.5, "wall", [[0.0, 0.5, 0.25], [3.0, 1.5, 0.75]]),
+        sr.MixedConstraint([[1.0, 3.0]], [[2.0]], [9.0], 0.75, 1.75, "mixed"),
+    ]
+    weight = [[3.0, 1.0], [1.0, 5.0]]
+    cost = sr.Cost(l1=0.5, state={"Q": weight, "reference": [1.5, 2.5]}, control={"R": [[7.0]]}, final={"Q": weight})
+    return [
+        sr.OptimalControlProblem(
+            **system, path=path, terminal=[sr.Box([-5.0, -3.0], [3.0, 7.0])], weights=[1.5], cost=cost,
+            control_step=sr.Box([-0.75], [0.75]), names=sr.Names(time="s"),
+        ),
+        sr.OptimalControlProblem(
+            **system, integral=[sr.IntegralConstraint([[1.0, 3.0]], [[5.0]], [-7.0], [11.0], 0.5, 2.5, "sum")],
+        ),
+        sr.OptimalControlProblem(**system, disturbance_class="measurable"),
+        sr.OptimalControlProblem(
+            system=sr.LinearSystem([[0.5, 2.0], [-3.0, 0.25]], [[0.75], [1.5]]), horizon=3.0, initial_state=[1.5, -0.5],
+            control=sr.Box([-3.0], [1.25]), execution=[0.125],
+        ),
+    ]  # fmt: skip
+
+
+def numbers(record: Any, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Every number of a record, with the fields that lead to it."""
+    if isinstance(record, sr.LinearSystem):
+        yield from (
+            (f"{path}.{name}", part[0])
+            for name, part in zip("ABE", record.forced.matrices(np.zeros((1, 0))), strict=True)
+        )
+        yield f"{path}.delay", np.array(record.delay)
+    elif is_dataclass(record):
+        for one in fields(record):
+            yield from numbers(getattr(record, one.name), f"{path}.{one.name}".lstrip("."))
+    elif isinstance(record, list | tuple) and any(is_dataclass(one) for one in record):
+        for one in record:
+            yield from numbers(one, path)
+    elif record is not None and not isinstance(record, str | bool):
+        values = np.asarray(record)
+        if values.dtype.kind in "fi" and values.size:
+            yield path, values.astype(float)
+
+
+def test_every_number_of_every_record_of_a_problem_is_converted_or_has_no_unit():
+    units = Units(2.0, np.array([8.0, 0.125]), np.array([32.0]), np.array([0.5]), np.zeros(0), 128.0)
+    back = Units(*(1.0 / np.asarray(getattr(units, one.name)) for one in fields(Units)))
+    met = set[str]()
+    for problem in problems():
+        other = units.of_problem(problem)
+        mine, its, again = (list(numbers(one)) for one in (problem, other, back.of_problem(other)))
+        assert [path for path, _ in mine] == [path for path, _ in its]
+        for (path, value), (_, converted), (_, returned) in zip(mine, its, again, strict=True):
+            np.testing.assert_array_equal(returned, value, err_msg=path)
+            assert np.array_equal(converted, value) == (path in UNITLESS or not value.any()), path
+            met.add(path.split(".")[0])
+        met |= {one.name for one in fields(problem) if isinstance(getattr(problem, one.name), str | sr.Names)}
+    left = {one.name for one in fields(sr.OptimalControlProblem)} - met
+    assert left <= {"disturbances", "repeat", "measurements"}, left
