@@ -291,9 +291,10 @@ class WorstCase:
                 fixed = (self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
                 known = remember(self._frozen, parameter.tobytes(), frozen(*fixed), LEGS_KEPT)
             sigma = DisturbanceSupport(known, by_block, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
-        for part in _parts(0 if measurable is None else k, several):
-            at = np.repeat(times[part], r), np.tile(directions, (times[part].size, 1))
-            sigma[part] += measurable(*at, np.broadcast_to(parameter, (at[0].size, parameter.size))).reshape(-1, r)
+        if measurable is not None:
+            for part in _parts(k, several):
+                at = np.repeat(times[part], r), np.tile(directions, (times[part].size, 1))
+                sigma[part] += measurable(*at, np.broadcast_to(parameter, (at[0].size, parameter.size))).reshape(-1, r)
         if self.initial is not None:
             for part in _parts(k, several):
                 rows = self.response.propagator.backwards(times[part], directions, parameter)
