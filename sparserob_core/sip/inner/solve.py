@@ -484,7 +484,8 @@ def _failed(case: _Case) -> FiniteSolution:
 
 def _short(solution: FiniteSolution) -> str:
     """By how much an answer misses its rows, and its own lower bound."""
-    bound = "has no lower bound" if solution.gap == np.inf else f"is {solution.gap:.1e} above its lower bound"
+    side = "above" if solution.gap >= 0.0 else "below"  # where it misses its rows
+    bound = "has no lower bound" if solution.gap == np.inf else f"is {abs(solution.gap):.1e} {side} its lower bound"
     return f"misses its rows by {solution.residual:.1e} and {bound}"
 
 
