@@ -175,6 +175,31 @@ def test_in_a_narrow_panel_of_the_climb_what_is_proven_far_below_is_said_below_i
     assert np.unique(np.diff([y for y, *_ in below])).tolist() == [0.0, climb.LINE]  # three lines, none on another
 
 
+def test_a_panel_of_the_climb_has_all_of_a_climb_and_no_number_on_that_of_its_neighbour(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from unittest.mock import MagicMock
+
+    from sparserob_rerun.search import climb
+    from sparserob_rerun.search.way import Stage
+
+    drawn: list[climb.Drawing] = []
+    monkeypatch.setattr(climb.Drawing, "log", lambda self, *rest, **more: drawn.append(self))
+    for low in np.linspace(0.3, 0.9, 16):
+        stages = [Stage(number, 0.1, 2000 * number) for number in range(climb.MOST)]
+        for stage in stages:
+            stage.values = np.linspace(low, 1.27, 2000)  # it gains at every other step, and no walk is told of
+            stage.values[1::2] -= 0.05
+        climb.Climb(MagicMock(), MagicMock()).draw(stages)
+        heights = drawn[-1].strips["best"][0][0][:, 1]
+        assert np.mean(heights >= climb.HEIGHT - 1e-9) <= 0.06  # it lies on the axis for a twentieth at most
+        places = np.array([at for at, *_ in drawn[-1].labels])
+        near = (np.abs(places[:, None] - places[None]) < [60.0, climb.LINE - 1e-9]).all(axis=2)
+        assert not near[~np.eye(len(places), dtype=bool)].any()
+        left = [words for at, words, _ in drawn[-1].labels if at[0] < 0.0]
+        assert len(left) >= 2  # one number is no scale
+
+
 def test_words_are_bright_and_lines_of_plots_legible_on_a_dark_and_on_a_light_ground() -> None:
     from sparserob_rerun.drawing import palette as ink
 

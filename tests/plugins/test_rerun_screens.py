@@ -16,8 +16,8 @@ pytest.importorskip("rerun")
 import rerun as rr
 
 from sparserob_core.experiment.run.replay import stored_result, stored_run
-from sparserob_rerun.drawing.canvas import Axes
-from sparserob_rerun.exchange.bounds import Bounds
+from sparserob_rerun.drawing.canvas import Axes, Drawing
+from sparserob_rerun.exchange.bounds import FEWEST, Bounds
 from sparserob_rerun.exchange.clash import draw_clash, extent
 from sparserob_rerun.exchange.rounds import Rounds, Worst, told_by_result
 from sparserob_rerun.physics.pages import heading, pages
@@ -151,6 +151,37 @@ def test_the_bounds_are_drawn_where_they_are_with_the_gap_between_them() -> None
     assert picture.rows[-1][3] == 0.01  # the gap beside it, too
 
 
+@pytest.mark.parametrize("gap", [1e-9, 1e-6, 1e-3, 0.5])
+def test_numbers_beside_the_bounds_differ_and_have_room(gap: float) -> None:
+    paper = Paper()
+    picture = Bounds(rr, paper)
+    picture.add(entry(1, 12.254221, 12.254221 * (1.0 + gap)))
+    beside = paper.labels("rounds/picture/bounds/labels")
+    numbers = [words for words in beside if words.replace(".", "").isdigit() and float(words) > FEWEST + 0.5]
+    assert len(numbers) >= 2 and len(set(numbers)) == len(numbers) and max(map(len, numbers)) <= 7
+
+
+def test_what_a_drawing_has_no_more_is_taken_away() -> None:
+    paper, before = Paper(), Drawing()
+    before.line("bound", np.zeros((2, 2)), (0, 0, 0, 255))
+    before.line("frame", np.zeros((2, 2)), (0, 0, 0, 255))
+    before.dot(np.zeros((1, 2)), (0, 0, 0, 255))
+    before.log(rr, paper, "here")
+    after = Drawing()
+    after.line("frame", np.ones((2, 2)), (0, 0, 0, 255))
+    after.log(rr, paper, "here")
+    gone = {path for path, parts in paper.kept.items() if isinstance(parts[0], rr.Clear)}
+    assert gone == {"here/bound", "here/dots"}
+
+
+@pytest.mark.parametrize(("horizon", "left"), [(5.0, -60.0), (7200.0, -96.0), (0.5, -78.0)])
+def test_the_map_has_room_for_the_numbers_of_its_times(horizon: float, left: float) -> None:
+    from sparserob_rerun.search.views import landscape
+
+    limits = landscape(False, False, horizon).properties["VisualBounds2D"].range.as_arrow_array().to_pylist()
+    assert limits[0]["x_range"][0] == left
+
+
 def test_an_upper_bound_of_a_simpler_program_is_none() -> None:
     paper = Paper()
     Bounds(rr, paper).add(replace(entry(1, 0.5, 0.7), simplified=True))
@@ -168,6 +199,19 @@ def test_the_strip_of_a_clash_is_as_far_from_its_wall_as_it_misses(infeasible: s
     assert strips[0].sigma_low == pytest.approx(strips[0].sigma_high)
     assert f"the disturbance alone moves it by {strips[0].sigma_high:.4g};" in said
     assert extent(strips)[3] >= len(strips) * 100
+
+
+def test_the_numbers_of_two_walls_that_are_near_one_another_stand_beside_one_another(infeasible: sr.Outcome) -> None:
+    from sparserob_rerun.exchange.clash import CHARACTER, MARGIN, _beside
+
+    one = sr.Inspection.read(infeasible.directory).clash(infeasible.result)[0]
+    paper = Paper()
+    draw_clash(rr, paper, [replace(one, low=-0.5, high=0.5)])
+    assert {"-0.5", "0.5"} <= set(paper.labels("clash/labels"))
+    left, right = _beside([300.0, 306.0], ["-0.5", "0.5"], 1.0)
+    assert right - left == pytest.approx(3.5 * CHARACTER + MARGIN) and left + right == 606.0
+    assert _beside([100.0, 400.0], ["-0.5", "0.5"], 1.0) == [100.0, 400.0]
+    assert _beside([100.0], ["7"], 1.0) == [100.0]
 
 
 def test_an_infeasible_run_has_no_empty_panel_and_no_bound(infeasible: sr.Outcome) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -16,7 +17,12 @@ from sparserob_rerun.drawing.palette import FAINT, GREY, GROUND, INK, Colour, Fl
 
 HATCHES = 60
 LINE = 34.0  # units between two numbers on an axis upwards: a line of words is 26 high, and the lowest is lifted
+LEAST = 5e-4
+"""Of the best value, the least height of a panel that shows values. With a tenth of it the numbers beside it are wider
+than their room; with ten times as much, the last tenths of a search look flat."""
 LETTER = 5.0  # half the width of a letter, in units of a drawing that is a little smaller than its panel
+SHOWN: WeakKeyDictionary[Any, dict[str, set[str]]] = WeakKeyDictionary()
+"""What the last drawing below each path had, of every stream: the viewer keeps an entity until it hears of it again."""
 LIFT = 9.0  # the viewer writes labels this far below their points
 
 
@@ -84,10 +90,14 @@ class Drawing:
         which is more in a panel that is small."""
         left, top, right, bottom = axes.left, axes.top, axes.left + axes.width, axes.top + axes.height
         self.line("frame", np.array([[left, top], [left, bottom], [right, bottom]]), GREY, 1.0)
-        for value in _apart(axes, room * LINE, decades):
+        upwards = _apart(axes, room * LINE, decades)
+        digits = next(
+            n for n in range(6, 18) if len({f"{value:.{n}g}" for value in upwards}) == upwards.size or n == 17
+        )
+        for value in upwards:
             y = float(axes.at(axes.x[0], value)[0, 1])
             self.line("frame", np.array([[left - 5, y], [left, y]]), GREY, 1.0)
-            words = f"1e{value:g}" if decades else f"{value:.6g}"
+            words = f"1e{value:g}" if decades else f"{value:.{digits}g}"
             # above the corner, where the first number across has its place
             self.text(left - room * (10 + LETTER * len(words)), min(y, bottom - 8 * room), words, GREY)
         for value in ticks(*axes.x):
@@ -124,7 +134,14 @@ class Drawing:
                 )
 
     def log(self, rr: Any, stream: Any, path: str, static: bool = False, layers: Sequence[str] = ()) -> None:
-        """Log everything below ``path``, later ``layers`` above earlier ones."""
+        """Log everything below ``path``, later ``layers`` above earlier ones, and take away what the drawing before had
+        there and this one has not."""
+        names = {*self.strips, *(["labels"] if self.labels else []), *(["dots"] if self.dots else [])}
+        if not static:
+            shown = SHOWN.setdefault(stream, {})
+            for name in sorted(shown.get(path, set()) - names):
+                stream.log(f"{path}/{name}", rr.Clear(recursive=False))
+            shown[path] = names
         order = {layer: 10.0 * (place + 1) for place, layer in enumerate(layers)}
         for layer, strips in self.strips.items():
             stream.log(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_rerun.drawing import palette as ink
-from sparserob_rerun.drawing.canvas import Axes, Drawing
+from sparserob_rerun.drawing.canvas import LEAST, Axes, Drawing
 from sparserob_rerun.drawing.palette import Floats
 
 if TYPE_CHECKING:
@@ -63,7 +63,8 @@ class Bounds:
         low = (
             max(float(shown.min()), high - VIEW * abs(high)) if shown.size and high else float(min(known, default=0.0))
         )
-        margin = 0.1 * (high - low) if high > low else 0.5 * max(1.0, abs(high))
+        least = (LEAST * abs(high) - (high - low)) / 2.0  # a gap of 1e-8 is a line, and no panel full of it
+        margin = max(0.1 * (high - low), least) if high > low else 0.5 * max(1.0, abs(high))
         axes = Axes(LEFT, 0.0, WIDTH, HEIGHT, across, (low - margin, high + margin))
         said = f"{_number(lower.max())} ≤ J* ≤ {_number(best)}"
         there, closes = np.isfinite(lower), bool(np.isfinite(best))

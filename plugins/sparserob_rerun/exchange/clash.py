@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 LEFT, WIDTH, HEIGHT, GAP = 40.0, 640.0, 84.0, 104.0
 BAR = 11.0  # pixels
+CHARACTER, MARGIN = 7.0, 16.0
+"""Units of the drawing that a character takes, and the edges of a label: of up to three strips, which are as large as
+the panel is wide; more of them are smaller, and their words are not."""
 
 
 def extent(strips: Sequence[sr.Strip]) -> tuple[float, float, float, float]:
@@ -27,19 +30,22 @@ def draw_clash(rr: Any, stream: Any, strips: Sequence[sr.Strip]) -> None:
     """Draw the strips below ``/clash``, each on an axis of its own."""
     drawing = Drawing()
     for place, strip in enumerate(strips):
-        _strip(drawing, place, strip)
+        _strip(drawing, place, strip, max(1.0, len(strips) / 3.0))
     drawing.log(rr, stream, "clash", layers=("hatch", "frame", "marks", "reach", "worst", "curve", "wall"))
 
 
-def _strip(drawing: Drawing, place: int, strip: sr.Strip) -> None:
+def _strip(drawing: Drawing, place: int, strip: sr.Strip, size: float) -> None:
+    """One strip; ``size``: of its words, in those that three strips have."""
     worst = (strip.best - strip.sigma_low, strip.best + strip.sigma_high)
     axes = Axes(LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, strip.view, (0.0, 3.0))
     (left, top), (right, bottom) = axes.at(axes.x[0], 3.0)[0], axes.at(axes.x[1], 0.0)[0]
     drawing.text((left + right) / 2, top - 34.0, strip.label.replace("\n", ", "))
     drawing.text((left + right) / 2, top - 14.0, _said(strip), ink.ORANGE)
     drawing.line("frame", np.array([[left, bottom], [right, bottom]]), ink.GREY, 1.0)
-    for value in sorted({v for v in (strip.low, strip.high) if np.isfinite(v)}):
-        drawing.text(float(axes.at(value, 0.0)[0, 0]), bottom + 16.0, f"{value:.4g}", ink.VERMILLION)
+    walls = sorted({v for v in (strip.low, strip.high) if np.isfinite(v)})
+    words = [f"{value:.4g}" for value in walls]
+    for x, said in zip(_beside([float(axes.at(value, 0.0)[0, 0]) for value in walls], words, size), words, strict=True):
+        drawing.text(x, bottom + 16.0, said, ink.VERMILLION)
     for edge, end in ((strip.low, axes.x[0]), (strip.high, axes.x[1])):
         if np.isfinite(edge):
             drawing.hatched("hatch", axes, (min(edge, end), max(edge, end)), (0.0, 3.0), ink.HATCH)
@@ -54,6 +60,14 @@ def _strip(drawing: Drawing, place: int, strip: sr.Strip) -> None:
         else:
             drawing.dot(axes.at(low, height), colour, BAR / 2)
     drawing.line("curve", axes.at(np.full(2, strip.best), np.array([0.4, 1.4])), ink.INK, 2.0)
+
+
+def _beside(places: list[float], words: list[str], size: float) -> list[float]:
+    """Where the labels of one or two walls have their middle: below them, or as far apart as the words are wide."""
+    if len(places) < 2:
+        return places
+    missing = size * (CHARACTER * sum(map(len, words)) / 2.0 + MARGIN) - (places[1] - places[0])
+    return [places[0] - max(0.0, missing) / 2.0, places[1] + max(0.0, missing) / 2.0]
 
 
 def _said(strip: sr.Strip) -> str:

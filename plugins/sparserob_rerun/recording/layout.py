@@ -73,7 +73,7 @@ def _columns(rrb: Any, shown: Shown) -> list[Any]:
     )
     middle = (
         rrb.Vertical(
-            search.landscape(shown.searches, shown.answers),
+            search.landscape(shown.searches, shown.answers, shown.problem.horizon if shown.problem else 1.0),
             *numbers,
             row_shares=[10, *([8, 4, 4][: len(numbers)] if shown.searches else [_room(shown), 5])],
         )

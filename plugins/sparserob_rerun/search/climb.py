@@ -8,18 +8,16 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_rerun.drawing import palette as ink
-from sparserob_rerun.drawing.canvas import Axes, Drawing, ticks
+from sparserob_rerun.drawing.canvas import LEAST, Axes, Drawing, ticks
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.way import Stage
 
 WIDTH, HEIGHT, GAP = 1150.0, 240.0, 110.0
 EXTENT = (-120.0, WIDTH + 50.0, -120.0, HEIGHT + 186.0)
 LINE = 56.0  # units between two lines of words
+ROOM = LINE - 26.0  # units above the axis across, without a number: those below it have their middle 26 units lower
 CORNERS, POINTS = 500, 300  # of a curve, and of a cloud, in one panel
 MOST = 4  # panels beside one another; of more stages the last ones
-LEAST = 5e-4
-"""Of the best value, the least height of a panel. With a tenth of it the numbers beside it are wider than their room;
-with ten times as much, the last tenths of a search look flat."""
 
 
 @final
@@ -95,10 +93,11 @@ def _frame(drawing: Drawing, axes: Axes, stage: Stage, best: float) -> None:
     """The box of a panel, with the weight and the best value above it and few ticks: it may be narrow."""
     left, top, right, bottom = axes.left, axes.top, axes.left + axes.width, axes.top + axes.height
     drawing.line("frame", np.array([[left, top], [left, bottom], [right, bottom]]), ink.GREY, 1.0)
-    for value in ticks(*axes.y, 3):
+    for value in ticks(*axes.y, 4):
         y = float(axes.at(axes.x[0], value)[0, 1])
         drawing.line("frame", np.array([[left - 5, y], [left, y]]), ink.GREY, 1.0)
-        drawing.text(left - 48.0, y, f"{value:.7g}", ink.GREY)
+        if y < bottom - ROOM:  # the last number of the panel on the left is below it
+            drawing.text(left - 48.0, y, f"{value:.7g}", ink.GREY)
     for value, x in ((axes.x[0], left + 8.0), (axes.x[1], right - 8.0)):
         drawing.text(x, bottom + 26.0, f"{value:.0f}", ink.GREY)
     middle = (left + right) / 2
@@ -120,12 +119,13 @@ def _corners(values: Floats) -> np.ndarray:
 
 
 def _limits(values: Floats, walk: Floats, best: Floats, levels: list[float]) -> tuple[float, float]:
-    """The range of a panel: that of the walk after the first twentieth, or of the better half of the values, and what
-    is proven where that is near."""
+    """The range of a panel: that of the walk after the first twentieth, or of the better half of the values and of the
+    best so far from then on, and what is proven where that is near."""
     top = float(np.nanmax(best))
     settled = walk[walk.size // 20 :]
     walked = bool(np.isfinite(settled).any())
-    low = float(np.nanmin(settled)) if walked else float(np.nanquantile(values, 0.5))
+    started = float(np.nanmin(best[best.size // 20 :]))  # what climbs to its end has passed its median late
+    low = float(np.nanmin(settled)) if walked else min(float(np.nanquantile(values, 0.5)), started)
     span = max(top - low, LEAST * (abs(top) or 1.0))
     for level in levels:
         if np.isfinite(level):

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from typing import Any, Literal
 
 from sparserob_rerun.drawing import palette as ink
-from sparserob_rerun.drawing.canvas import view
+from sparserob_rerun.drawing.canvas import ticks, view
 from sparserob_rerun.search import climb as stages
 from sparserob_rerun.search.search import LOGARITHMIC, NOTES
 
@@ -14,13 +14,17 @@ FIRST = ("temperature", "depth", "constant", "radius", "reach", "spread", "slope
 SHARES = ("accepted", "rejected")
 
 
-def landscape(searches: bool, answers: bool) -> Any:
-    """The landscape of g as a map, of a control that ``answers`` what it measures at the end only."""
+def landscape(searches: bool, answers: bool, horizon: float = 1.0) -> Any:
+    """The landscape of g as a map, of a control that ``answers`` what it measures at the end only; with room beside it
+    for the times up to the ``horizon``."""
     name = "Landscape of g around the best tuple" + (", and the way of the search" if searches else "")
-    return view("/landscape/map", f"{name}: when the run is over" if answers else name, EXTENT)
+    letters = max(len(f"{time:.6g}") for time in ticks(0.0, horizon))
+    left = EXTENT[0] - LETTER * max(0, letters - LETTERS)
+    return view("/landscape/map", f"{name}: when the run is over" if answers else name, (left, *EXTENT[1:]))
 
 
 EXTENT = (-60.0, 1090.0, -76.0, 520.0)
+LETTER, LETTERS = 18.0, 2  # how much room a letter takes, and how many have it within the `EXTENT`
 
 
 def climb() -> Any:

@@ -57,7 +57,7 @@ class StudyRecorder:
         searched = self.event.arrangement == "search"
         self.text = "its points are found on the way" if searched else self._done()
         self.over = ""
-        self.seconds, self.next, self.seen = 0.0, 0.0, dict[str, set[str]]()
+        self.seconds, self.next = 0.0, 0.0
         self._tell(f"study: {self.event.title}")
         if self.rows:
             self._tell(f"{len(self.rows)} points were finished before")
@@ -160,7 +160,7 @@ class StudyRecorder:
         if self.board.kind == "table":
             self._markdown("study/table", self.board.table(self.rows, list(self.newest)))
             return
-        self._log("study/map", self.board.draw(self.rows, list(self.running)))
+        self.board.draw(self.rows, list(self.running)).log(self.rr, self.stream, "study/map", layers=LAYERS)
         centres, colours = self.board.boxes
         if centres:
             self.stream.log(
@@ -193,7 +193,7 @@ class StudyRecorder:
         for line, place in enumerate(shown):
             self._one(drawing, axes, (line + 0.5) * ROW, place)
         drawing.text((LEFT + WIDTH) / 2, -20.0, self._heading(len(shown)))
-        self._log("study/bounds", drawing)
+        drawing.log(self.rr, self.stream, "study/bounds", layers=LAYERS)
 
     def _heading(self, shown: int) -> str:
         if not shown:
@@ -286,14 +286,6 @@ class StudyRecorder:
 
     def _markdown(self, path: str, text: str) -> None:
         self.stream.log(path, self.rr.TextDocument(text, media_type="text/markdown"))
-
-    def _log(self, path: str, drawing: Drawing) -> None:
-        """Log a drawing, and take away what the one before had and this one has not."""
-        names = {*drawing.strips, *(["dots"] if drawing.dots else []), *(["labels"] if drawing.labels else [])}
-        for name in self.seen.get(path, set()) - names:
-            self.stream.log(f"{path}/{name}", self.rr.Clear(recursive=False))
-        self.seen[path] = names
-        drawing.log(self.rr, self.stream, path, layers=LAYERS)
 
 
 def layout(opening: StudyOpening) -> Any:
