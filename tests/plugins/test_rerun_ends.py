@@ -26,7 +26,9 @@ from tests.support.recordings import read, slowness, texts
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 pytest.importorskip("psutil", reason="a process that is gone is told from one that is not with psutil")
 
-from sparserob_rerun.recording.guard import broken
+from sparserob_rerun.recording import channel
+from sparserob_rerun.recording import guard as guards
+from sparserob_rerun.recording.guard import Guard, broken
 from sparserob_rerun.recording.outlet import Outlet
 from sparserob_rerun.recording.recorder import Opening
 from sparserob_rerun.recording.sinks import Destinations
@@ -150,6 +152,40 @@ def test_a_recorder_that_is_killed_leaves_a_file_that_is_said_not_to_be_whole(tm
     assert outlet.incomplete
 
 
+def begun(file: Path) -> Outlet:
+    """An outlet whose recorder has begun to write, and leaves signals to the run."""
+    outlet, end = opened(file), time.monotonic() + STARTING
+    while not (file.exists() and file.stat().st_size):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return outlet
+
+
+def test_a_recorder_that_is_told_to_end_with_its_run_records_what_the_run_says_of_its_end(tmp_path: Path) -> None:
+    file = tmp_path / "x.rrd"
+    outlet = begun(file)
+    assert outlet.process.pid is not None
+    os.kill(outlet.process.pid, signal.SIGTERM)
+    time.sleep(0.3)
+    outlet.send(sr.RunFinished(status="undecided", message="interrupted by SIGTERM", seconds=1.0))
+    assert outlet.close() == [] and broken(file) == ""
+    assert "undecided: interrupted by SIGTERM" in texts(read(file)["/log"], "TextLog:text")
+
+
+def test_a_recorder_that_is_told_to_end_without_its_run_ends_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(channel, "TOLD", 0.1)
+    file = tmp_path / "x.rrd"
+    outlet = begun(file)
+    outlet.send(proof(0))
+    assert outlet.process.pid is not None
+    os.kill(outlet.process.pid, signal.SIGTERM)
+    assert ended(outlet.process.pid) < ENDING * slowness()
+    assert broken(file) == ""
+    outlet.close()
+
+
 def fills(file: Path, told: Connection) -> None:
     """A run whose recorder may write 80 000 bytes, and has more to write."""
     sys.dont_write_bytecode = True  # it would be cut off like the recording
@@ -172,6 +208,43 @@ def test_a_disk_that_is_full_in_mid_run_leaves_no_recording_that_anybody_claims(
     assert f"{file} is not a complete recording" in ours.recv()
     run.join()
     assert broken(file)
+
+
+class Stalling:
+    """A stream whose first flushes are too late, and that has a whole file all the same."""
+
+    def __init__(self, late: float) -> None:
+        self.late, self.flushes = late, 0
+
+    def flush(self, timeout_sec: float) -> None:
+        self.flushes += 1
+        if self.flushes <= self.late:
+            raise RuntimeError("Flush timed out")
+
+    def disconnect(self) -> None:
+        """Nothing is left."""
+
+
+@pytest.mark.parametrize(("late", "full", "lost"), [(3, False, False), (np.inf, False, True), (1, True, True)])
+def test_a_machine_that_stands_still_for_a_moment_ends_no_recording_and_a_dead_writer_is_told_of(
+    late: float, full: bool, lost: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, stream = tmp_path / "x.rrd", Stalling(late)
+    file.write_bytes(guards.TRAILER)
+    monkeypatch.setattr(guards, "LOOK", 1e-3)
+    if full:
+        monkeypatch.setattr(guards.shutil, "disk_usage", lambda _: type("Usage", (), {"free": 0}))
+    guard = Guard(file, lambda: False, lambda: None)
+    guard.open(stream, alone=True)
+    end = time.monotonic() + STARTING
+    while stream.flushes < 3 * guards.STUCK and not guard.lost:
+        assert time.monotonic() < end
+        time.sleep(1e-3)
+    guard.done()
+    assert guard.lost == lost
+    said = guard.close(0.1)
+    assert (said == "") == (not lost)
+    assert not lost or "nothing could be written any more (Flush timed out)" in said
 
 
 @pytest.mark.slow

@@ -23,6 +23,10 @@ LOOK = 0.25
 """Seconds between two looks at whether the run is alive, and between two flushes. Ten times as many, and a recorder
 outlives a killed run by more than the two seconds that it has to finish, and what was sent a second ago is not in the
 file; a tenth wakes the process up for nothing."""
+TOLD = 30.0
+"""Seconds that a run which was told to end, with its recorder, has for its end. A tenth, and the recording of a run
+that returns what it has is without its verdict; ten times as many, and a recorder that alone was told to end stays for
+minutes."""
 DRAINING = 0.1
 """Seconds in which nothing more comes out of the pipe of a run that has died: then everything was read."""
 
@@ -120,12 +124,18 @@ class Receiver:
         self.inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.ended = False  # nothing comes out of the pipe any more
         self.over = math.inf  # the moment at which the last event came, whatever is still to be read before it
+        self.told = math.inf  # the moment at which this process was told to end
         threading.Thread(target=self._read, name="reading", daemon=True).start()
 
     @property
     def orphaned(self) -> bool:
-        """Whether the run is gone. Another process of the run may hold the pipe open, so its end is not enough."""
-        return self.ended or os.getppid() != self.parent
+        """Whether the run is gone, or counts as gone. Another process of the run may hold the pipe open, so its end is
+        not enough."""
+        return self.ended or os.getppid() != self.parent or time.monotonic() - self.told > TOLD
+
+    def tell(self) -> None:
+        """Note that this process was told to end: with the run as a rule, which then has something to say, and ends."""
+        self.told = min(self.told, time.monotonic())
 
     @property
     def empty(self) -> bool:

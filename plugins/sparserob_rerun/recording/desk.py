@@ -65,7 +65,7 @@ def record(
     if theirs is not None:
         theirs.close()
     messages = Receiver(pipe, room, os.getppid())
-    _settle()
+    _settle(messages)
     account = Account()
     try:
         account = _record(messages, opening, chosen, name)
@@ -181,13 +181,14 @@ class _WithoutPandas(MetaPathFinder):
             raise ModuleNotFoundError("pandas is left out", name=fullname)
 
 
-def _settle() -> None:
-    """Ignore the signals of the terminal, and take no more than one core at a time: it is whichever is free, for where
-    all recorders take the same one, each waits for the others. Shares of processor time, not a low priority, hold the
-    work back: with one, the first picture waits for everybody else's work."""
+def _settle(messages: Receiver) -> None:
+    """Leave the signals to the run: those of the terminal, and the one that ends a whole group of processes (`timeout`,
+    a queue of jobs), after which the run returns what it has, and says so. And take no more than one core at a time: it
+    is whichever is free, for where all recorders take the same one, each waits for the others. Shares of processor
+    time, not a low priority, hold the work back: with one, the first picture waits for everybody else's work."""
     from threadpoolctl import threadpool_limits
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))  # through `finally`, to the servers
+    signal.signal(signal.SIGTERM, lambda number, frame: messages.tell())
     threadpool_limits(limits=1)
     sys.stdin = None

@@ -17,6 +17,10 @@ from sparserob_rerun.recording.channel import LOOK
 
 FLUSHING = 1.0
 """Seconds that a flush may take. Ten times as many, and a viewer that hangs keeps the recorder alive after its run."""
+STUCK = 10
+"""Flushes in a row that do not arrive, each of `FLUSHING` seconds, after which the thread that writes the file is taken
+to be dead. A tenth, and a machine or a disk that stands still for a moment ends the recording; ten times as many, and
+what is logged meanwhile fills the memory."""
 ENDING = 5.0
 """Seconds that the last flush and the end of the files may take, when nobody waits for the process to be gone."""
 GRACE = 1.0
@@ -38,7 +42,7 @@ class Guard:
         self.file, self.orphaned, self.leave = file, orphaned, leave
         self.stream: Any = None
         self.alone = False  # nothing but the file is written
-        self.wrong, self.lost = "", False
+        self.wrong, self.lost, self.missed = "", False, 0
         self.over, self.once, self.closed = threading.Event(), threading.Lock(), False
         threading.Thread(target=self._watch, name="guard", daemon=True).start()
 
@@ -47,12 +51,15 @@ class Guard:
         self.alone, self.stream = alone, stream
 
     def flush(self, seconds: float) -> bool:
-        """Send what was logged; returns whether it arrived."""
+        """Send what was logged; returns whether it arrived, with all that was late before."""
         try:
             self.stream.flush(timeout_sec=seconds)
         except RuntimeError as error:
-            self.wrong = str(error)
+            self.wrong, self.missed = str(error), self.missed + 1
             return False
+        if self.alone and not self.lost:  # a viewer that went away takes everything, and stays away
+            self.wrong = ""
+        self.missed = 0
         return True
 
     def close(self, seconds: float = ENDING) -> str:
@@ -62,7 +69,10 @@ class Guard:
                 self.closed = True
                 self.flush(seconds)
                 within(seconds, self.stream.disconnect)
-        return "" if self.file is None else broken(self.file)
+        if self.file is None:
+            return ""
+        halted = f"{self.file} is not a complete recording: nothing could be written any more ({self.wrong})"
+        return broken(self.file) or (halted if self.lost else "")
 
     def done(self) -> None:
         """The recorder has ended by itself."""
@@ -76,9 +86,17 @@ class Guard:
                 gone = min(gone, now)
             if now - gone > GRACE:
                 self._leave()
-            if self.stream is not None and not self.closed:
+            if self.stream is not None and not self.closed and not self.lost:
                 # with a file only there is nothing left to do; another destination goes on without it
-                self.lost |= not self.flush(FLUSHING) and self.alone
+                late = not self.flush(FLUSHING) and self.alone
+                self.lost |= late and (self.missed >= STUCK or self._full)
+
+    @property
+    def _full(self) -> bool:
+        """Whether the disk has no room for more of the file."""
+        with suppress(OSError):
+            return self.file is not None and shutil.disk_usage(self.file.parent).free < SPARE
+        return False
 
     def _leave(self) -> None:
         with suppress(Exception):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import queue
 import sys
@@ -26,6 +27,7 @@ from sparserob_rerun.study.recorder import StudyOpening
 CAPACITY = 512  # events that may wait
 LASTING = 10  # seconds that the last event may wait for its place in the queue
 CLOSING = 60.0  # seconds that the process may take to finish its files, beyond the patience of the landscape
+LEAVING = 5.0  # seconds until a process that has lost its pipe, and is given a moment to end its file, is killed
 OVER = 600.0  # the same for a run that is over, and has nothing else to wait for
 START = "fork" if sys.platform.startswith("linux") else "spawn"
 
@@ -59,6 +61,7 @@ class Outlet:
         for end in (theirs, reader):
             end.close()
         self.sender = Sender(writer, room, follows, packed)
+        atexit.register(self.sender.close)  # before Python waits for processes that end with this pipe
 
     def send(self, event: sr.Event) -> None:
         """Pass an event on, or drop it where too many are waiting already. Evaluations are collected for a moment."""
@@ -84,12 +87,11 @@ class Outlet:
         except KeyboardInterrupt:
             self.incomplete = "" if keep else "interrupted while the recording was being finished"
         finally:
-            if self.process.is_alive():
-                self.process.terminate()
-            self.process.join(3.0)
+            atexit.unregister(self.sender.close)
+            self.sender.close()  # the end of the pipe ends the process, and its file
+            self.process.join(LEAVING)
             if self.process.is_alive():
                 self.process.kill()
-            self.sender.close()
         self.dropped += self.sender.lost
         if self.dropped and not self.incomplete:
             self.incomplete = f"{self.dropped} events came faster than they could be recorded, and were dropped"

@@ -56,8 +56,12 @@ def _writable(file: Path) -> Path:
         raise InputError(f"save: expected a file, got the directory {file}")
     if path.is_file() and path.stat().st_size:
         raise InputError(path="save", expected="a new file, or an empty one", got=f"{file}, which holds something")
+    there = path.exists()
     try:
         with path.open("ab"):
-            return path
+            pass
+        if not there:  # a command that ends with an error of its config leaves nothing behind
+            path.unlink()
     except OSError as error:
         raise InputError(f"save: {file} cannot be written to: {error.strerror}") from error
+    return path
