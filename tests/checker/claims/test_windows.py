@@ -24,7 +24,7 @@ from sparserob_core.checker.claims.causal import _shared, causal_bound
 from sparserob_core.checker.claims.cells import Place, _cut
 from sparserob_core.checker.cost.nominal import integrated
 from sparserob_core.checker.cost.price import _semidefinite
-from sparserob_core.checker.outcome import Broken, Clock, Finding, Unchecked
+from sparserob_core.checker.outcome import RESOLVED, Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
@@ -760,3 +760,22 @@ def test_a_round_set_of_disturbances_takes_the_state_as_far_in_units_of_any_size
     assert kept(case_of(Box([-9.0 * size] * 2, [1.7501 * size, 9.0 * size]), **plane))
     with pytest.raises((Broken, Unchecked)):
         kept(case_of(Box([-9.0 * size] * 2, [1.7499 * size, 9.0 * size]), **plane))
+
+
+def test_a_direction_of_a_curved_wall_is_allowed_a_billionth_of_its_width_or_of_what_double_precision_resolves():
+    plane = {
+        "system": LinearSystem(np.zeros((2, 2)), np.eye(2)), "initial_state": [1.0, 0.5], "disturbance": None,
+        "control": Box([-1.0] * 2, [1.0] * 2), "decision": ((0.5, -0.5), (0.0, 0.0)),
+    }  # fmt: skip
+    direction = np.array([0.6, -2.0])
+    wide = case_of(NormBall(2.0, 3.0, centre=[0.5, 0.1]), **plane)
+    (window,) = wide.windows
+    length = float(np.linalg.norm(direction))
+    assert wide.units(window).slack(direction, window.limit(direction, 0.0)) == pytest.approx(3e-9 * length, rel=1e-12)
+    thin = case_of(NormBall(2.0, 1e-12, centre=[1.0, 0.5]), **plane)
+    (window,) = thin.windows
+    told = thin.units(window)
+    # the initial state, and the range of the control on each of two pieces
+    assert told.sums == pytest.approx([3.0, 2.5])
+    expected = 1e-9 * RESOLVED * float(np.abs(direction) @ told.sums)
+    assert told.slack(direction, window.limit(direction, 0.0)) == pytest.approx(expected, rel=1e-12)
