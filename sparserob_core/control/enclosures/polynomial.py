@@ -80,7 +80,7 @@ def face_matrix(space: TaylorSpace, ends: Float[Array, " nu"]) -> Float[Array, "
 def _face_matrix(space: TaylorSpace, ends: Array) -> Array:
     fixed = ends != 0
     sign = np.prod(np.where(fixed, ends, 1.0) ** space.exponents, axis=1)
-    target = [space.index[tuple(int(e) for e in exponents)] for exponents in np.where(fixed, 0, space.exponents)]
+    target = [space.index[tuple(exponents)] for exponents in np.where(fixed, 0, space.exponents).tolist()]
     matrix = np.zeros((space.size, space.size))
     matrix[target, np.arange(space.size)] = sign
     return matrix

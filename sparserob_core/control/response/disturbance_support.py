@@ -40,7 +40,10 @@ class DisturbanceSupport:
     def steepness(self, times: Array) -> Array:
         """How steep the support function of *any* one disturbance can be in each parameter over the cell:
         ``(k, r, nu)``."""
-        return self._gathered(times, self._reaches) @ self._space.exponents
+        if self._repeats:
+            return np.asarray(self._gathered(times, self._reaches) @ self._space.exponents[self._monomials])
+        self._asked["blocks"] = times, (blocks := self._side_by_side(self.blocks(times)))
+        return np.asarray(self._reaches(blocks).sum(axis=2) @ self._space.exponents[self._monomials])
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """Taylor coefficients ``(k, r, M)`` of the support function under the worst disturbance of a centre, and its
@@ -49,13 +52,21 @@ class DisturbanceSupport:
         ``ends (k, r, nu)``: parameters that are known to be at an end of the cell (-1 or 1); the centre is that of the
         face they leave.
         """
+        if not self._repeats:  # and `steepness` has just been asked for these times, where there are parameters
+            asked, blocks = self._asked.pop("blocks", (None, None))
+            if blocks is None or asked is not times:
+                blocks = self._side_by_side(self.blocks(times))
+            return over_faces(self._space, ends, lambda here, face: self._summed(blocks[here], face).sum(axis=2))
         return over_faces(
             self._space,
             ends,
             lambda here, face: self._gathered(
-                times[here], partial(summed, self.disturbance.set, face=face), kept="worst" if face is None else ""
+                times[here], partial(self._summed, face=face), kept="worst" if face is None else ""
             ),
         )
+
+    def _summed(self, blocks: Array, face: Array | None) -> Array:
+        return summed(self.disturbance.set, blocks, face, self._monomials, self._space.size)
 
     def deviation(self, start: Array, widths: Array) -> Array:
         """Bounds ``(k, r)``, for times in ``[start, start + width]`` inside one piece, of how far what the blocks
@@ -151,7 +162,7 @@ class DisturbanceSupport:
         uncombined; ``kept``: a name by which sums over the ages of whole pieces are remembered.
         """
         start = self._lifted_rows if rows is None else rows
-        combined = (lambda blocks: blocks) if plain else self._combined
+        combined = (lambda blocks: blocks) if plain else self._side_by_side
         if not self._repeats:
             return np.asarray(of_blocks(combined(self._blocks(times, start))).sum(axis=2))
         grid = self.lifted.grid
@@ -186,6 +197,11 @@ class DisturbanceSupport:
         return within == 0.0 or abs(within - length) <= SAME * length
 
     @cached_property
+    def _asked(self) -> dict[str, tuple[Array, Array]]:
+        """The times that `steepness` was last asked for, and the blocks there, until `at` has used them."""
+        return {}
+
+    @cached_property
     def _sums(self) -> dict[tuple[str, float], Array]:
         return {}
 
@@ -204,8 +220,16 @@ class DisturbanceSupport:
         whole = self._weights(np.eye(self.lifted.row_matrix.shape[0]))
         return Impulses(self.lifted.backward.propagator, whole.reshape(whole.shape[0], -1))
 
-    def _combined(self, blocks: Array) -> Array:
-        return blocks if self.combination is None else self.combination.apply(blocks)
+    def _side_by_side(self, blocks: Array) -> Array:
+        """Coefficients ``(k, r, M, nb, q)`` as those of the polynomials whose sums are taken: of the one of a direction
+        that varies, ``(k, 1, r M, nb, q)``, whose other coefficients are 0."""
+        k, r, size, *each = blocks.shape
+        return blocks if self.combination is None else blocks.reshape(k, 1, r * size, *each)
+
+    @cached_property
+    def _monomials(self) -> np.ndarray:
+        """Of which monomials of the space `_side_by_side` has the coefficients, that of the centre first."""
+        return np.arange(self._space.size) if self.combination is None else self.combination.targets.reshape(-1)
 
     def _reaches(self, blocks: Array) -> Array:
         """How much any one disturbance can make of every Taylor coefficient of every block, ``(k, r, nb, M)``."""
@@ -348,16 +372,28 @@ def over_faces(
     return coefficients, excess
 
 
-def summed(bound: ConvexSet, blocks: Array, face: Array | None) -> Array:
+def summed(
+    bound: ConvexSet, blocks: Array, face: Array | None, monomials: np.ndarray | None = None, size: int = 0
+) -> Array:
     """Per block in ``bound``: the polynomial under the centre's worst point, and the excess as one more entry; from
-    Taylor coefficients ``(k, r, M, nb, q)``."""
-    blocks = blocks if face is None else np.einsum("ab,krbnq->kranq", face, blocks, optimize=True)
+    Taylor coefficients ``(k, r, M, nb, q)``.
+
+    ``monomials (M,)``: whose they are where these are not all ``size`` of a space; the others are 0, in many
+    dimensions most of them. On a ``face (M', M')`` only monomials of the variables that it leaves are looked at.
+    """
+    k, r, given, count, width = blocks.shape
+    kept = np.arange(given) if monomials is None else monomials
+    if face is not None:
+        onto = face[:, kept]
+        kept = np.flatnonzero(onto.any(axis=1))  # with the constant, which a face leaves where it is
+        blocks = (onto[kept] @ blocks.reshape(k, r, given, count * width)).reshape(k, r, kept.size, count, width)
+    size = given if monomials is None else size
     point = bound.support_point(blocks[:, :, 0])
-    coefficients = np.einsum("krbq,krabq->krba", point, blocks)
-    excess = np.zeros(coefficients.shape[:3])
-    if blocks.shape[2] > 1:
-        excess = bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
-    return np.concatenate([coefficients, excess[..., None]], axis=3)
+    polynomials = np.zeros((k, r, count, size + 1))
+    polynomials[..., kept] = np.einsum("krbq,krabq->krba", point, blocks)
+    if kept.size > 1:
+        polynomials[..., -1] = bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
+    return polynomials
 
 
 def _row_norms(coefficients: Array, starts: np.ndarray) -> Array:

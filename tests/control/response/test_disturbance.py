@@ -11,8 +11,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from sparserob_core.control.enclosures.combination import combination
+from sparserob_core.control.enclosures.polynomial import face_matrix
+from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.response.disturbance import disturbance_model
+from sparserob_core.control.response.disturbance_support import summed
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.errors import InputError
@@ -170,3 +174,24 @@ def test_an_l1_ball_of_an_asymmetric_box_is_refused():
 def test_fewer_functions_than_pieces_need_a_flat_set():
     with pytest.raises(InputError, match="flat sides"):
         model_of("piecewise_constant", NormBall(p=2.0, radius=1.0, dimension=2), walsh(4, HORIZON, 3))
+
+
+@pytest.mark.parametrize("ends", [None, [0.0, 1.0, 0.0, 0.0], [-1.0, 1.0, 0.0, -1.0], [1.0, 1.0, -1.0, 1.0]])
+@pytest.mark.parametrize("name", ["box", "triangle", "one channel"])
+def test_coefficients_that_are_0_are_left_out_and_change_nothing(name, ends):
+    """Of functionals in two uncertain directions beside two parameters, on a face or not."""
+    rng, space = np.random.default_rng(5), TaylorSpace(2, 2)
+    larger = combination(space, 2)
+    blocks = rng.normal(size=(3, 3, space.size, 4, 2)) * 0.3 ** space.degrees[:, None, None]
+    face = None if ends is None else face_matrix(larger.space, np.array(ends))
+    dense = larger.apply(blocks)
+    whole = summed(BOUNDS[name], dense, face)
+    few = summed(BOUNDS[name], blocks.reshape(3, 1, -1, 4, 2), face, larger.targets.reshape(-1), larger.space.size)
+    np.testing.assert_allclose(few, whole, rtol=1e-13, atol=1e-13)
+    onto = dense if face is None else np.einsum("ab,krbnq->kranq", face, dense)
+    s = rng.uniform(-1.0, 1.0, (50, 4))
+    s = s if ends is None else np.where(np.array(ends) != 0.0, ends, s)
+    powers = np.prod(s[:, None] ** larger.space.exponents, axis=2)
+    height = BOUNDS[name].support(np.einsum("sa,kranq->skrnq", powers, onto))
+    model = np.einsum("sa,krna->skrn", powers, few[..., :-1]) + few[..., -1]
+    assert (height <= model + 1e-12).all(), "the model is not above the support function on the cell"

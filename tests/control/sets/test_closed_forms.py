@@ -329,3 +329,16 @@ def test_no_point_is_farther_than_a_polytope_reaches_and_bounds_from_the_dual_si
         assert direction @ point == pytest.approx(height)
         assert polytope.contains(point, 1e-7)
     assert polytope._maximise(np.zeros(d))[0] == 0.0
+
+
+@pytest.mark.parametrize("width", [1, 3, 7, 8])
+@pytest.mark.parametrize("centred", [True, False])
+def test_few_sides_of_a_box_add_up_to_what_all_at_once_do(width, centred):
+    """To the last bit, whatever the axes of the directions are."""
+    rng = np.random.default_rng(width)
+    upper = rng.uniform(0.1, 2.0, width)
+    box = Box(-upper if centred else upper - rng.uniform(0.0, 3.0, width), upper)
+    for directions in (rng.normal(size=(5, 4, width)), rng.normal(size=(width, 6)).T, rng.normal(size=width)):
+        plain = np.maximum(directions * box.upper, directions * box.lower).sum(axis=-1)
+        np.testing.assert_array_equal(box.support(directions), plain)
+        np.testing.assert_array_equal(box.reach(directions), np.maximum(plain, box.support(-directions)))
