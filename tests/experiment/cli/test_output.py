@@ -30,6 +30,7 @@ class Loud(sr.DictionaryFactory, sr.Options):
     def build(self, horizon):
         print("loud: printed")
         sys.stdout.write("loud: written\\n")
+        sys.__stdout__.write("loud: to the first stream\\n")
         sys.stdout.buffer.write(b"loud: bytes\\n")
         os.write(1, b"loud: by descriptor\\n")
         os.system("echo loud: by a child")
@@ -53,7 +54,7 @@ problem:
 dictionaries: {control: loud}
 plugins: [./loud.py]
 """
-WAYS = {"at import", "printed", "written", "bytes", "by descriptor", "by a child", "at exit"}
+WAYS = {"at import", "printed", "written", "to the first stream", "bytes", "by descriptor", "by a child", "at exit"}
 
 
 @pytest.fixture

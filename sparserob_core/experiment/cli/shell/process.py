@@ -184,6 +184,8 @@ def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.Tex
     encoding, errors = stream.encoding, stream.errors
     line_buffering, write_through = stream.line_buffering, stream.write_through
     buffer = stream.detach()
+    if stream is sys.__stdout__:  # a component that keeps to the first stream would meet one without a buffer
+        sys.__stdout__ = sys.stderr  # type: ignore[misc]
     if kind is Output and _descriptor(buffer) == 1:
         buffer.flush()
         buffer = open(_own_descriptor(), "wb")  # noqa: SIM115
