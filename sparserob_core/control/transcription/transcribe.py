@@ -80,6 +80,12 @@ def transcribe(
     return model.program
 
 
+def _require_dictionary(name: str, given: object) -> None:
+    if not isinstance(given, Dictionary):
+        expected = "a Dictionary, such as sr.Dictionary.indicators(times); sr.solve takes one by its name too"
+        raise InputError(path=name, expected=expected, got=type(given).__name__)
+
+
 def prepare(
     problem: OptimalControlProblem,
     control: Dictionary,
@@ -92,9 +98,7 @@ def prepare(
     and for a policy that does not say what it answers, or answers what it cannot know; one that answers nothing is an
     open loop, as none is."""
     for name, dictionary in (("control", control), ("disturbance", disturbance)):
-        if not isinstance(dictionary, Dictionary):
-            expected = "a Dictionary, such as sr.Dictionary.indicators(times); sr.solve takes one by its name too"
-            raise InputError(path=name, expected=expected, got=type(dictionary).__name__)
+        _require_dictionary(name, dictionary)
         if abs(dictionary.horizon - problem.horizon) > 1e-12 * problem.horizon:
             raise InputError(
                 f"{name} dictionary: ends at {dictionary.horizon:g}, expected the horizon {problem.horizon:g}"

@@ -138,6 +138,11 @@ class AskTell:
         self._other = _Other(search)
         self._finalizer = weakref.finalize(self, self._other.close)
 
+    def __repr__(self) -> str:
+        """How far it is; nothing is asked of the search for it."""
+        best = f"{'least' if self._about['minimise'] else 'best'} value {self.best_value:.9g}"
+        return f"AskTell: {self.evaluations} of {self._about['budget']} evaluations, {best}"
+
     @property
     def done(self) -> bool:
         """Whether the search has ended: nothing is left to ask for. Raises what the maximiser has raised."""

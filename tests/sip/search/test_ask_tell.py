@@ -420,3 +420,10 @@ def test_initial_points_are_asked_for_first():
 def test_a_box_without_bounds_is_refused():
     with pytest.raises(sr.InputError, match="expected a bounded box"):
         sr.ask_tell(sr.Box([0.0], [np.inf]), "sequool")
+
+
+def test_a_search_says_how_far_it_is_and_is_not_moved_by_it():
+    search = sr.ask_tell(sr.Box([0.0], [1.0]), "sobol", budget=8, minimise=True)
+    assert repr(search) == "AskTell: 0 of 8 evaluations, least value inf"
+    search.tell(search.ask(1), [0.25])
+    assert repr(search) == "AskTell: 1 of 8 evaluations, least value 0.25"

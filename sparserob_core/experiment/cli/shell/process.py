@@ -185,7 +185,7 @@ def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.Tex
     line_buffering, write_through = stream.line_buffering, stream.write_through
     buffer = stream.detach()
     if stream is sys.__stdout__:  # a component that keeps to the first stream would meet one without a buffer
-        sys.__stdout__ = sys.stderr  # type: ignore[misc]
+        sys.__stdout__ = sys.stderr  # type: ignore[misc, assignment]
     if kind is Output and _descriptor(buffer) == 1:
         buffer.flush()
         buffer = open(_own_descriptor(), "wb")  # noqa: SIM115
