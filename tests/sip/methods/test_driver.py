@@ -4,8 +4,6 @@ imposed; a driver ends with the first result, or with what is known."""
 from __future__ import annotations
 
 import signal
-import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,25 +20,11 @@ from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.working import ledger, securing, working
+from tests.support.entered import CORE, entered
 from tests.support.problems import spring
 
-SHARED = {str(Path(str(module.__file__))): module.__name__ for module in (driver, exchange, ledger, securing, working)}
+SHARED = [str(Path(str(module.__file__)).relative_to(CORE)) for module in (driver, exchange, ledger, securing, working)]
 RESULT = Result(status="undecided", message="", counts={}, seconds=0.0)
-
-
-def passed(call: Callable[[], Any]) -> tuple[Any, set[str]]:
-    """What a call returns, and the functions of the shared modules that it enters."""
-    entered: set[str] = set()
-
-    def note(frame: Any, event: str, _: object) -> None:
-        if event == "call" and frame.f_code.co_filename in SHARED and "<" not in frame.f_code.co_name:
-            entered.add(f"{SHARED[frame.f_code.co_filename]}.{frame.f_code.co_qualname}")
-
-    sys.setprofile(note)
-    try:
-        return call(), entered
-    finally:
-        sys.setprofile(None)
 
 
 def case(policy: str) -> tuple[sr.SemiInfiniteProgram, Tools]:
@@ -54,14 +38,14 @@ def case(policy: str) -> tuple[sr.SemiInfiniteProgram, Tools]:
 def test_a_run_with_feedback_and_one_without_pass_the_same_functions_of_the_driver() -> None:
     cases = [case(policy) for policy in ("open_loop", "affine")]
     assert [program.spread is None for program, _ in cases] == [True, False]
-    results, entered = zip(*[passed(partial(Exchange().solve, *each)) for each in cases], strict=True)
+    results, passed = zip(*[entered(partial(Exchange().solve, *each), *SHARED) for each in cases], strict=True)
     assert [result.status for result in results] == ["certified", "certified"]
     # what secures a decision is asked for that by the course of a run, which is not the same
-    met = [{one for one in each if not one.startswith(f"{securing.__name__}._")} for each in entered]
+    met = [{one for one in each if not one.startswith("sip.working.securing._")} for each in passed]
     assert met[0] == met[1]
-    steps = {f"{exchange.__name__}.Rounds.{name}" for name in ("step", "_ending", "_earlier")}
-    assert steps | {f"{driver.__name__}.drive", f"{securing.__name__}.proofs_of"} <= entered[0]
-    assert {f"{working.__name__}.Working.pay", f"{ledger.__name__}.Ledger.tell"} <= entered[0]
+    steps = {f"sip.methods.exchange.Rounds.{name}" for name in ("step", "_ending", "_earlier")}
+    assert steps | {"sip.methods.driver.drive", "sip.working.securing.proofs_of"} <= passed[0]
+    assert {"sip.working.working.Working.pay", "sip.working.ledger.Ledger.tell"} <= passed[0]
 
 
 def test_the_first_step_with_a_result_is_the_last() -> None:

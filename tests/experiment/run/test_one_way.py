@@ -1,0 +1,92 @@
+"""Guards that a run with feedback and one without go one way, from transcription to `check`: they enter the same
+functions, but for what answers are, and for what is claimed of one of them alone."""
+
+from __future__ import annotations
+
+import copy
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+import sparserob_core as sr
+from tests.support.entered import entered
+from tests.support.problems import spring
+
+PLACES = (
+    "sip/methods/",
+    "control/transcription/",
+    "experiment/directory/certificate.py",
+    "experiment/run/journal.py",
+    "experiment/run/run.py",
+    "checker/claims/",
+)
+# how few pieces can act is claimed of a control that answers nothing; a policy's units are made where its answers are
+ALONE = {
+    "checker.claims.activity.",
+    "checker.claims.claims._at_least",
+    "checker.claims.claims._fewest",
+    "checker.claims.claims._other",
+    "checker.claims.constraints.tubes",
+    "checker.claims.duality.Duality.nothing",
+    "control.transcription.transcribe._in_own_units",
+    "sip.methods.fewest.",
+}
+# answers, the deviations that they answer, the policy itself, and the bound against every causal policy
+ANSWERING = {
+    "checker.claims.answers.",
+    "checker.claims.case.Case.answers",
+    "checker.claims.case.Case.unloaded",
+    "checker.claims.case.written_policy",
+    "checker.claims.causal.",
+    "checker.claims.claims._causal",
+    "checker.claims.claims._policy",
+    "checker.claims.claims._without_nominal",
+    "checker.claims.claims.derived_causal_bound",
+    "checker.claims.duality.Duality.pushed",
+    "control.transcription.feedback.",
+    "control.transcription.record.Transcription.",
+    "control.transcription.transcribe._answering",
+    "experiment.directory.certificate._admissible",
+    "experiment.directory.certificate._deviation",
+    "experiment.directory.certificate._inside",
+    "experiment.directory.certificate._runs",
+    "experiment.directory.certificate.causal_data",
+}
+
+
+def whole(policy: str, place: Path) -> None:
+    """A run, and its check."""
+    config = {
+        "problem": spring(0.05, since=0.5),
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+        "policy": {"name": policy},
+        "observers": [],
+    }
+    assert sr.run(copy.deepcopy(config), out=place, quiet=True, figures=False).status == "certified"
+    assert sr.check(place).status == "verified"
+
+
+def beyond(functions: set[str], named: set[str]) -> list[str]:
+    """Those that none of the names is the beginning of."""
+    return sorted(one for one in functions if not one.startswith(tuple(named)))
+
+
+@pytest.mark.slow
+def test_a_run_with_feedback_and_one_without_go_one_way(tmp_path: Path) -> None:
+    whole("open_loop", tmp_path / "first")  # whatever is done once in a process
+    plain, answering = (
+        entered(partial(whole, policy, tmp_path / policy), *PLACES)[1] for policy in ("open_loop", "affine")
+    )
+    assert beyond(plain - answering, ALONE) == []
+    assert beyond(answering - plain, ANSWERING) == []
+    shared = plain & answering
+    assert len(shared) > 0.9 * len(plain)
+    for one in (
+        "sip.methods.driver.drive",
+        "sip.methods.exchange.Rounds.step",
+        "control.transcription.transcribe.prepare",
+        "checker.claims.multipliers._undisturbed",
+        "checker.claims.constraints.bounded",
+    ):
+        assert one in shared, sorted(shared)
