@@ -1014,8 +1014,7 @@ def unique_rows(rows: Float[Array, "k n"]) -> tuple[Float[Array, "u n"], Int[np.
     if rows.shape[1] == 0 or rows.shape[0] == 1:
         return rows[:1], np.zeros(rows.shape[0], dtype=int)
     apart: dict[bytes, int] = {}
-    keys = np.ascontiguousarray(rows + 0.0).view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))  # one zero
-    met = np.array([apart.setdefault(key, len(apart)) for key in keys.ravel().tolist()], dtype=int)
+    met = np.array([apart.setdefault(row.tobytes(), len(apart)) for row in rows + 0.0], dtype=int)  # of zeros one
     first = np.empty(len(apart), dtype=int)
     first[met[::-1]] = np.arange(met.size)[::-1]
     unique, which = np.unique(rows[first], axis=0, return_inverse=True)
