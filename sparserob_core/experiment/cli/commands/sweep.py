@@ -146,6 +146,5 @@ def _print_outline(planned: Outline, quiet: bool, as_json: bool) -> None:
     elif not quiet:
         print_table(data["title"], *planned.shown())
         ended = sum(row["finished"] for row in data["points"])
-        say(
-            f"{len(data['points'])} point{'s' * (len(data['points']) != 1)}, {ended} finished; nothing was run or written"
-        )
+        count = len(data["points"])
+        say(f"{count} point{'s' * (count != 1)}, {ended} finished; nothing was run or written")
