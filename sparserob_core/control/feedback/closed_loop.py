@@ -262,7 +262,7 @@ class ClosedLoop:
         support function of a chord lies below the chord of the support functions.
         """
         pieces = self.grid.locate((lower + upper) / 2)
-        ends = [self.states(x, times, pieces) for times in (lower, upper)]
+        ends = np.split(self.states(x, np.concatenate([lower, upper]), np.tile(pieces, 2)), 2)
         along = [H @ end for end in ends]
         radii = np.concatenate([[1.0], self.spread.radii])
         late = self._late(x, H, lower, upper - lower, pieces, ends[0])
