@@ -11,9 +11,9 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.answers import PEAK, WORST, Named, answers_of
-from sparserob_core.checker.claims.case import EQUALS, STEP, Case, before, listed, number, numbers
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
 from sparserob_core.checker.claims.constraints import followed, follows
-from sparserob_core.checker.claims.duality import EFFORT, Row
+from sparserob_core.checker.claims.duality import EFFORT, Row, before
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known
@@ -172,7 +172,8 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
     worst, problem, delay = followed(case, c), case.problem, case.problem.system.delay
     m, begins = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
     state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
-    constant = sum((w * x for w, x in zip(state, balls(problem.initial_state), strict=True)), arb(0)) - limit
+    begun = balls(np.asarray(problem.initial_state, dtype=float))
+    constant = sum((w * x for w, x in zip(state, begun, strict=True)), arb(0)) - limit
     if problem.system.c is not None:  # a drift is an input that is 1
         constant = constant + worst.weights(time, np.zeros(1), np.full(1, np.inf))[0][m]
     if delay > 0.0:
