@@ -398,13 +398,13 @@ class WorstCase:
     def measurable(self) -> MeasurableSupport | None:
         """The support of measurable disturbances, ``None`` where there are none; the ``shared`` one where it is of this
         system and set."""
-        from sparserob_core.control.response.measurable import MeasurableSupport
-
         bound, given = None if self.disturbance is None else self.disturbance.measurable, self.shared
         if bound is None:
             return None
         if given and given.response.propagator is self.response.propagator and given.bound is bound:
             return given
+        from sparserob_core.control.response.measurable import MeasurableSupport
+
         return MeasurableSupport(self.response, bound)
 
     @shaped
