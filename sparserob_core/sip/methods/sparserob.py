@@ -3,14 +3,15 @@ indices.
 
 Its theorem (the paper's, after Das, Aravind, Cherukuri and Chatterjee 2022, theorem 1): with as many indices as
 decision variables the maximum of ``g`` over tuples is the value of the semi-infinite program, and its optimiser there
-an optimiser. A search that has not met the maximum leaves constraints violated; so every decision is proven or refuted
-like any other, and the lower bound comes from multipliers.
+an optimiser. A search that has not met the maximum leaves constraints violated: by a little that tightened rows pay
+for, so that a decision beside it is proven, or by more, so that it is refuted. The lower bound comes from multipliers.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -22,7 +23,7 @@ from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forwarded, frozen, ignore
 from sparserob_core.sip.evidence import Dual
-from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, Method, Tools
+from sparserob_core.sip.method import GAP_TOLERANCE, GRACE, Deadline, Method, OutOfTime, Tools
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -34,7 +35,13 @@ from sparserob_core.sip.result import Result, SearchTrace
 from sparserob_core.sip.rules import InnerStop, Metropolis, OptimisersSettle, OuterStep, OuterStop, Schedule, Selection
 from sparserob_core.sip.search.search import Rules, Target, maximise
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import Answer, Ledger, prover_of
+from sparserob_core.sip.working.ledger import Answer, Found, Ledger, prover_of
+from sparserob_core.sip.working.plain import PlainRows
+from sparserob_core.sip.working.securing import back_off
+
+# Of a limit, what a search leaves to the proof of what it has found, a second at most. With a tenth of it a limit of
+# some seconds leaves nothing proven; ten times as much is no search.
+RESERVED = 0.1
 
 
 class SparseRob(Method, Options):
@@ -81,8 +88,8 @@ class SparseRob(Method, Options):
         raise InputError(expected="the name of a rule, a mapping with a name, or a function", got=repr(rule))
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        """`certified`, `verified` or, as a rule, `refuted` with the uncertainty that breaks the decision; `infeasible`
-        where ``g`` is infinite."""
+        """`certified`, `verified`, or `refuted` with the uncertainty that breaks the decision of a search that ends too
+        far from the maximum to be backed off; `infeasible` where ``g`` is infinite."""
         if tools.maximiser is None:
             raise InputError("maximiser: expected one, got none; the method sparserob is a search")
         if not program.families:
@@ -128,6 +135,7 @@ class _Outer:
         self.steps.append(OuterStep(j, epsilon, value, program.cost(x), ledger.lower, x))
         if np.isfinite(value):
             found = separate(program, x, tools, number=number)
+            _secured(ledger, answer, found, tools)
             ledger.tell(number, answer, found, np.inf, kept=int((answer.multipliers > 0).sum()))
 
         # No optimiser: g is infinite where nothing meets the constraints at the tuple.
@@ -146,7 +154,23 @@ class _Outer:
             ledger.improve(ledger.relaxed.lower_bound(answer.rows, plain))
         proofs = prove(program, x, tools.notify, deadline=tools.deadline)
         found = separate(program, x, tools)
-        return ledger.judged(answer, worst_of(found), as_bad_as_found(proofs, found), tools.deadline.reason)
+        result = ledger.judged(answer, worst_of(found), as_bad_as_found(proofs, found), tools.deadline.reason)
+        if result.status not in ("refuted", "undecided") or ledger.proven is None:
+            return result
+        secured, found, proofs = ledger.proven
+        which = f"is that of an earlier weight, epsilon = {secured.epsilon:g}"
+        if secured.epsilon == answer.epsilon:
+            which = "keeps away from the constraints by as much as that of the search misses them by"
+        ending = f"the decision {which} ({result.message})"
+        return ledger.judged(secured, worst_of(found), proofs, tools.deadline.reason or ending)
+
+
+def _secured(ledger: Ledger, answer: Answer, found: Found, tools: Tools) -> None:
+    """Keep an answer, and prove it or one that is backed off by the little that it misses the constraints by."""
+    ledger.keep(answer, found)
+    idle = np.zeros(answer.rows.h.size, dtype=int)
+    working = PlainRows(ledger.program, rows=answer.rows, epsilon=answer.epsilon, idle=idle)
+    back_off(working, ledger, prover_of(ledger.program, tools), answer, found)
 
 
 def _searched(
@@ -154,7 +178,7 @@ def _searched(
 ) -> Array:
     """The best tuple that one search for the maximum of ``g`` finds from ``point``; of every value that is the best so
     far the multipliers are turned into a lower bound. An interrupt leaves the optimiser of the best tuple with the
-    ledger, and goes on."""
+    ledger, proven or backed off where it can be, and goes on; so the search ends a little before a limit."""
     tools, began = ledger.tools, time.perf_counter() - ledger.started
     proven: list[float] = []
     g.epsilon = epsilon
@@ -180,12 +204,25 @@ def _searched(
     rules = Rules(method.sc2, method.slcr or Metropolis(), tools.polish)
     target = Target(values, g.domain, g.gradient, g.block, g.linear, g.acting)
     notify = forwarded(tools.notify, EvaluationsFinished, completed)
+    soon = tools.deadline.sooner(min(GRACE, RESERVED * (tools.deadline.seconds or 0.0)))
+    ledger.relaxed.deadline = soon
     report = maximise(target, tools.maximiser, tools.budget, tools.rng, rules, notify, point)
+    ledger.relaxed.deadline = tools.deadline
     parts.append(SearchTrace.of(j, epsilon, report.trace, np.array(proven[: report.evaluations]), began))
     if report.interrupted:
-        ledger.relaxed.deadline, time_is_over = Deadline(), ledger.relaxed.deadline  # one last program
-        if np.isfinite(report.best_value) and np.isfinite(g.at(report.best_point)):
-            ledger.keep(Answer(g.solution, g.rows(), epsilon, report.best_value))
-        ledger.relaxed.deadline = time_is_over
-        raise KeyboardInterrupt(report.stopped)
+        _at_interrupt(g, ledger, report.best_point, report.best_value, epsilon)
+        raise (OutOfTime if soon.passed else KeyboardInterrupt)(report.stopped)  # of which only one was pressed
     return report.best_point
+
+
+def _at_interrupt(g: TupleValue, ledger: Ledger, point: Array, value: float, epsilon: float) -> None:
+    """Leave the optimiser of the best tuple with the ledger, proven or backed off if that takes no more than a moment,
+    in which another interrupt ends it."""
+    ledger.relaxed.deadline = Deadline()  # one last program
+    if np.isfinite(value) and np.isfinite(g.at(point)):
+        answer, grace = Answer(g.solution, g.rows(), epsilon, value), Deadline(GRACE)
+        ledger.keep(answer)
+        tools, ledger.relaxed.deadline = replace(ledger.tools, deadline=grace), grace
+        with suppress(KeyboardInterrupt), grace.enforced():
+            _secured(ledger, answer, separate(ledger.program, answer.solution.x, tools), tools)
+    ledger.relaxed.deadline = ledger.tools.deadline

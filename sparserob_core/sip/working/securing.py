@@ -5,6 +5,7 @@ is sought and proven; for every working set alike, which says how its rows are s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -103,6 +104,29 @@ def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Ans
     return _secure(working, ledger, prover, answer, missed, violated)
 
 
+def back_off(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found) -> None:
+    """Prove the answer of a search, or, where it misses the constraints by so little that keeping away from them costs
+    no more than securing does, a decision that keeps away by that much. What misses more is left as it is, for it is
+    not what the search has found. The lower bound of the ledger stays that of the search: what is imposed to back off
+    is not."""
+    x, program = answer.solution.x, ledger.program
+    missed, violated = [Missed.most(*one) for one in found if not one[0].defines], [above(*one) for one in found]
+    if not ledger.cheaper(answer) or not _is_near(working, program, answer, missed):
+        return
+    if not any(rows.size for _, rows, _ in violated):
+        proofs = prover(x, GLANCE)
+        if ledger.prove(answer, found, proofs):
+            return
+        missed, violated = left_open(program, proofs), witnesses(program, proofs)
+        if not missed or not _is_near(working, program, answer, missed):
+            return
+    aside = replace(ledger)
+    _secure(working, aside, prover, answer, missed, violated, ledger.tolerance)
+    if aside.proven is not None and aside.proven is not ledger.proven:
+        secured, looked, proofs = aside.proven
+        ledger.prove(replace(secured, value=answer.value), looked, proofs)
+
+
 def or_proven(ledger: Ledger, result: Result) -> Result:
     """The result, or that of the decision that is proven where the result is not."""
     if result.status not in ("refuted", "undecided") or ledger.proven is None:
@@ -118,16 +142,17 @@ def _secure(
     answer: Answer,
     missed: Sequence[Missed],
     violated: Violated,
+    spared: float = SPARED,
 ) -> bool:
     """Prove a decision that keeps away from the constraints, so that there is an upper bound while the proof of a
     better one goes on: the optimum of the imposed rows and of those that are ``violated``, all of them tightened by as
-    much as `SPARED` of the cost of ``answer`` pays for and by more than what it ``missed``, and again by what that
-    proof leaves open. What it missed is kept away from only as long as something is that far away, and what is imposed
-    for it not for ever; where nothing is as far away as is spared, a hundredth of that is tried, and where nothing is
-    as far away as large cells ask for, smaller cells at what is `DEAR` or a part of it. Nothing is claimed where
-    nothing keeps away at all. Whether anything was imposed.
+    much as the share ``spared`` of the cost of ``answer`` pays for and by more than what it ``missed``, and again by
+    what that proof leaves open. What it missed is kept away from only as long as something is that far away, and what
+    is imposed for it not for ever; where nothing is as far away as is spared, a hundredth of that is tried, and where
+    nothing is as far away as large cells ask for, smaller cells at what is `DEAR` or a part of it. Nothing is claimed
+    where nothing keeps away at all. Whether anything was imposed.
     """
-    program, margin, spared, imposed = ledger.program, working.margin, SPARED, 0
+    program, margin, imposed = ledger.program, working.margin, 0
     near: tuple[Answer, Found] | None = None  # of which a glance left cells open, and no search finds a violation
     tiny = np.finfo(float).tiny
     cells, dear = GLANCE, DEAR * abs(program.cost(answer.solution.x)) / max(working.priced(answer), tiny)

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.sip.method import GRACE
+from sparserob_core.sip.methods import sparserob
+from sparserob_core.sip.relaxed.tuples import TupleValue
 from sparserob_core.sip.rules import Progress
 from tests.support.places import CONFIGS
 
@@ -77,6 +80,61 @@ def test_a_literal_search_is_refuted_by_a_disturbance_that_breaks_it(exact, tmp_
     excess = np.abs(state) - (0.7, np.inf) if worst.constraint == "path" else np.abs(state) - (0.3, 0.3)
     assert excess.max() == pytest.approx(worst.violation, abs=1e-9)
     assert f"{worst.constraint} is violated by {worst.violation:.4g}" in result.message
+
+
+# Two searches whose polish leaves the path violated by 6e-8.
+NEAR = ({"indices": 8, "sc1": {"name": "iterations", "count": 2}}, {"name": "simulated_annealing", "budget": 100})
+FEW = {"dictionaries.control.pieces": 20, "dictionaries.disturbance.pieces": 20}
+
+
+def test_what_misses_the_constraints_by_little_is_backed_off_by_as_much_and_proven(tmp_path, monkeypatch):
+    result = experiment1(tmp_path / "run", *NEAR, **FEW).result
+    assert result.status == "verified"
+    assert "misses them by (path is violated by" in result.message
+    assert result.cost == result.upper_bound
+    assert all(proof.verdict == "proven" for proof in result.proofs)
+    assert sr.check(tmp_path / "run").status == "verified"
+
+    monkeypatch.setattr(sparserob, "back_off", lambda *_: None)
+    refuted = experiment1(tmp_path / "refuted", *NEAR, **FEW).result  # the same search, of which nothing is proven
+    assert refuted.status == "refuted" and refuted.upper_bound == np.inf
+    assert 0.0 < refuted.worst.violation < 1e-5
+    np.testing.assert_array_equal(refuted.trace.value, result.trace.value)
+    np.testing.assert_array_equal(refuted.trace.bound, result.trace.bound)
+    # That of g, but for rounding: what is imposed to back off is not of the tuple.
+    assert result.lower_bound == pytest.approx(refuted.lower_bound, rel=1e-11)
+    assert result.value == refuted.value
+    assert abs(result.cost - refuted.cost) < 1e-4 * refuted.cost
+
+
+def test_an_interrupted_search_returns_what_it_has_proven(tmp_path, monkeypatch):
+    evaluated = TupleValue.at
+
+    def interrupted(g, point):
+        interrupted.left -= 1
+        if interrupted.left == 0:
+            raise KeyboardInterrupt
+        return evaluated(g, point)
+
+    monkeypatch.setattr(TupleValue, "at", interrupted)
+    for left, status in ((30, "refuted"), (150, "verified")):  # far from the maximum, and within the second search
+        interrupted.left = left
+        result = experiment1(tmp_path / status, *NEAR, **FEW).result
+        assert result.status == status, left
+        assert result.stopped == "interrupted from the keyboard"
+        assert np.isfinite(result.upper_bound) == (status == "verified")
+
+
+def test_a_search_at_its_limit_returns_what_it_has_proven_and_was_not_interrupted(tmp_path):
+    method, maximiser = {"indices": 8}, {"name": "simulated_annealing", "budget": 60}
+    limits = FEW | {"continuation": {"factor": 0.99999, "stop": 1e-6}, "limits.seconds": 0.8}
+    outcome = experiment1(
+        tmp_path / "run", method | {"sc1": {"name": "iterations", "count": 10**6}}, maximiser, **limits
+    )
+    assert outcome.status == "verified"
+    assert "the limit of 0.8 s is reached" in outcome.result.message
+    assert not outcome.interrupted
+    assert outcome.result.seconds < 0.8 + GRACE
 
 
 def simulated(outcome, disturbance, time):
