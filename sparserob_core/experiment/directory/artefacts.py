@@ -23,7 +23,7 @@ from sparserob_core.sip.events import RoundFinished
 
 def write_whole(file: Path, content: bytes) -> None:
     """Write a file whole, under a temporary name first, which is then replaced; raises `SparseRobError` when the disk
-    refuses."""
+    refuses, which says what stands under the file's name then: nothing, or what was written before."""
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -32,7 +32,15 @@ def write_whole(file: Path, content: bytes) -> None:
     except OSError as error:
         with suppress(OSError):
             temporary.unlink()
-        raise SparseRobError(f"{file}: cannot be written: {error.strerror}; nothing of it was kept") from error
+        left = "the one that is there is what was written before" if _stands(file) else "nothing of it was kept"
+        raise SparseRobError(f"{file}: cannot be written: {error.strerror}; {left}") from error
+
+
+def _stands(file: Path) -> bool:
+    try:
+        return file.exists()
+    except OSError:  # of a disk that refuses everything
+        return False
 
 
 def require_room(directory: Path) -> None:

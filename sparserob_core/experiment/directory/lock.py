@@ -33,9 +33,18 @@ class Lock:
                 if self._taken_over():
                     return
             else:
-                self.file.write_text(_me(), encoding="utf-8")
+                self._sign()
                 return
         raise self._held("")
+
+    def _sign(self) -> None:
+        """Write the owner into a lock that was just created; where the disk is full it goes again: one without an
+        owner would keep everybody out."""
+        try:
+            self.file.write_text(_me(), encoding="utf-8")
+        except OSError:
+            self.file.unlink(missing_ok=True)
+            raise
 
     def release(self) -> None:
         """Let go of it; nothing happens where it is somebody else's, or gone."""

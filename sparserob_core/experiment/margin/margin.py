@@ -79,7 +79,9 @@ def margin(
             broadcast(_opening(search, Path()))
             found = search.margin(int(curve))
         else:
-            with _directory(out, loaded, str(of)) as directory:
+            with create_directory(out, f"{name_of(loaded)}-margin", loaded.config.digest()) as directory:
+                heading = f"The experiment whose margin of {of} was sought."
+                directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
                 broadcast(_opening(search, directory.path))
                 found = search.margin(int(curve))
                 found = _written(directory, found, None if isinstance(search, HorizonSearch) else search.scaling)
@@ -236,14 +238,6 @@ def _method(loaded: Loaded) -> Exchange:
     entry = loaded.config.method
     built = loaded.registry.build("method", entry.name, entry.options)
     return built if isinstance(built, Exchange) else Exchange()
-
-
-def _directory(out: str | Path | None, loaded: Loaded, of: str) -> RunDirectory:
-    directory = create_directory(out, f"{name_of(loaded)}-margin", loaded.config.digest())
-    directory.write_text(
-        "config.yaml", write_yaml(loaded.config.plain(), f"The experiment whose margin of {of} was sought.")
-    )
-    return directory
 
 
 def _written(directory: RunDirectory, found: Margin, varied: Scaling | None) -> Margin:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
-from sparserob_core.errors import InputError, named
+from sparserob_core.errors import InputError, SparseRobError, named
 from sparserob_core.experiment.assemble import Anew, ControlExperiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
@@ -133,6 +133,8 @@ def _run(
             control, summary, remarks = journal.finish(result, figures and complete, certify=complete, notify=broadcast)
             return Outcome(result, directory.path, experiment, control, summary, remarks, deadline.pressed)
         except BaseException as error:
+            if result is not None and isinstance(error, SparseRobError):  # found, and not to be written down
+                error.add_note(f"the run itself came to its end, {result.status}: {result.message}")
             error.add_note(f"what was done until then is in {directory.path}")
             if result is None or not isinstance(error, KeyboardInterrupt):
                 ending = RunFinished(status="failed", message=_said(error), seconds=time.perf_counter() - started)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import rmtree
 from string import Template
 
 from sparserob_core.errors import InputError
@@ -30,7 +31,8 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
     ``out``; return its folder.
 
     Nothing is overwritten. Raises `InputError` for an unknown kind, for a name that is no name, or is taken by an
-    installed component, plugin or module, and for a folder that exists.
+    installed component, plugin or module, and for a folder that exists, or cannot be written: nothing of the package
+    is left then.
     """
     spelt = {one.replace("_", "-"): one for one in kinds()}
     if kind.replace("_", "-") not in spelt:
@@ -58,7 +60,9 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
             place.parent.mkdir(parents=True, exist_ok=True)
             place.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
-        raise InputError(path="out", expected="a folder that can be written to", got=f"{out}: {error}") from error
+        rmtree(folder, ignore_errors=True)
+        got = f"{out}: {error.strerror}"
+        raise InputError(path="out", expected="a folder that can be written to", got=got) from error
     return folder
 
 

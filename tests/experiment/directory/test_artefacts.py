@@ -67,10 +67,25 @@ def test_a_full_disk_leaves_the_old_file_and_no_half_of_the_new_one(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(sr.SparseRobError, match=r"result\.json: cannot be written: No space left on device"):
+    refused = r"json: cannot be written: No space left on device; "
+    with pytest.raises(sr.SparseRobError, match=f"{refused}the one that is there is what was written before"):
         directory.write_json("result.json", {"status": "new"})
+    with pytest.raises(sr.SparseRobError, match=f"{refused}nothing of it was kept"):
+        directory.write_json("certificate.json", {})
     assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
     assert json.loads((tmp_path / "result.json").read_text()) == {"status": "old"}
+
+
+def test_a_lock_that_cannot_be_signed_keeps_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, *_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", full)
+        with pytest.raises(sr.InputError, match=r"cannot be written to: No space left on device"):
+            create_directory(tmp_path / "out", "demo", "0123abcd")
+    with create_directory(tmp_path / "out", "demo", "0123abcd") as directory:  # there is room again
+        directory.write_text("config.yaml", "")
 
 
 def test_json_says_null_where_a_number_is_not_finite() -> None:

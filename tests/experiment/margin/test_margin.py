@@ -13,6 +13,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.margin.margin import margin_rows
 from sparserob_core.experiment.margin.scaling import scaling
 
@@ -230,6 +231,16 @@ def test_the_directory_holds_the_numbers_and_the_picture(tmp_path):
     assert ("status", f"certified: {found.message}") in margin_rows(found)
     with pytest.raises(sr.InputError, match="new or an empty"):
         sr.margin(config(disturbance={"box": 0.1}), out=tmp_path / "out")
+
+
+def test_a_margin_that_cannot_be_written_lets_go_of_its_directory(tmp_path, monkeypatch):
+    def full(directory, name, text):
+        raise sr.SparseRobError(f"{name}: cannot be written: No space left on device")
+
+    monkeypatch.setattr(RunDirectory, "write_text", full)
+    with pytest.raises(sr.SparseRobError, match=r"config\.yaml: cannot be written"):
+        sr.margin(config(disturbance={"box": 0.1}), out=tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_the_command_ends_with_the_status_of_what_it_found(command, tmp_path):

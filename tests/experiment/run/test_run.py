@@ -11,6 +11,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.transcription import provable
+from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.run.events import Broadcast, Event
 
 KEYS = {
@@ -115,6 +116,20 @@ class Clumsy(sr.Observer):
 
     def receive(self, event: Event) -> None:
         raise ValueError("oh")
+
+
+def test_a_disk_that_is_full_at_the_end_does_not_take_what_was_found(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(directory: RunDirectory, name: str, arrays: object) -> None:
+        raise sr.SparseRobError(f"{name}: cannot be written: No space left on device")
+
+    monkeypatch.setattr(RunDirectory, "write_arrays", full)
+    with pytest.raises(sr.SparseRobError, match=r"solution\.npz: cannot be written") as caught:
+        sr.run(config, out=tmp_path / "out", figures=False)
+    ended, place = caught.value.__notes__
+    assert ended.startswith("the run itself came to its end, certified: ")
+    assert place == f"what was done until then is in {tmp_path / 'out'}"
 
 
 def test_an_observer_that_fails_is_detached_with_one_warning(caplog: pytest.LogCaptureFixture) -> None:

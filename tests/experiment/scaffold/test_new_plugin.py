@@ -3,6 +3,7 @@ written; and nothing of anybody's is overwritten."""
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -108,6 +109,23 @@ def test_a_folder_that_cannot_be_written_to_is_an_error_of_the_input(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(sr.InputError, match="out: expected a folder that can be written to"):
         new_plugin("set", "trial", tmp_path / "file")
+
+
+def test_a_disk_that_is_full_leaves_no_half_of_a_package(tmp_path, monkeypatch):
+    written = []
+
+    def full(path, text, **options):
+        written.append(path)
+        if len(written) == 3:
+            path.touch()
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return len(text)
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(sr.InputError, match=r"can be written to, got .*: No space left on device$"):
+        new_plugin("set", "mine", tmp_path)
+    assert len(written) == 3
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_says_where_the_package_is_and_how_to_go_on(tmp_path, capsys):
