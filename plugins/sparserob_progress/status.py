@@ -23,7 +23,7 @@ class Status:
         self.proving: sr.ProofProgress | None = None
         self.study: sr.StudyProgress | None = None
         self.lower, self.upper, self.gap, self.proven = -math.inf, math.inf, math.inf, math.inf
-        self.phase = ""
+        self.phase = "relax"  # with a relaxed program every method begins
         self.result: sr.Result | None = None
 
     @property
@@ -95,7 +95,7 @@ class Status:
     def line(self) -> str:
         """All of it in one line."""
         said = "; ".join(f"{label} {text}".strip() for label, text in self.parts())
-        return f"{duration(self.elapsed)}  {said or 'no event yet'}"
+        return f"{duration(self.elapsed)}  {said}"
 
 
 def duration(seconds: float) -> str:

@@ -55,6 +55,13 @@ def forwarded(notify: Notify, kind: type[T], complete: Callable[[T], Event]) -> 
     return lambda event: notify(complete(event) if isinstance(event, kind) else event)
 
 
+def proofs_only(notify: Notify) -> Notify:
+    """A listener that passes on how proofs go on, of a program beside the one whose rounds are told."""
+    if notify is ignore:
+        return ignore
+    return lambda event: notify(event) if isinstance(event, ProofProgress) else None
+
+
 def frozen(array: Array) -> Array:
     """A view of an array that cannot be written to."""
     view = np.asarray(array).view()

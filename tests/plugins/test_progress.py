@@ -116,6 +116,7 @@ def test_the_phase_is_named_and_what_is_proven(monkeypatch: pytest.MonkeyPatch) 
     from sparserob_progress.status import Status
 
     status, said = Status("a title"), []
+    assert status.line().endswith("phase relax")
     figures = sr.StudyProgress(text="figures: the worst cases", phase=True)
     study = sr.StudyProgress(text="3 of 7 loops", done=3, total=7)
     for event in (ROUND, PROOF, SEARCH, finished_round(3, proven=0.5), figures, study):

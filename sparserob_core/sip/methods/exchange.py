@@ -143,7 +143,7 @@ class Rounds:
         if self.ledger.tools.deadline.passed:
             return self.ledger.tools.deadline.reason
         if last:
-            return f"the {self.method.rounds} rounds of the method are used up"
+            return f"the {self.method.rounds} rounds of the method (method.rounds) are used up"
         if self.method.exact:
             return ""
         return f"the decision is optimal for the regularised problem, epsilon = {answer.epsilon:g}"

@@ -17,7 +17,7 @@ from pydantic import Field
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import ignore
+from sparserob_core.sip.events import ignore, proofs_only
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
@@ -120,7 +120,8 @@ def on_support(
     acts = np.abs(base.image(x)) > DUST * np.where(np.isfinite(reach), reach, 1.0)
     off = ~acts & (prices > 0.0)
     lower, upper = np.where(off, 0.0, base.lower), np.where(off, 0.0, base.upper)
-    narrow, quiet = replace(program, lower=lower, upper=upper, twin=None), replace(tools, notify=ignore)
+    narrow = replace(program, lower=lower, upper=upper, twin=None)
+    quiet = replace(tools, notify=proofs_only(tools.notify))
     return exchange.close(narrow, quiet, prover_of(program, quiet), imposed_cuts(known))
 
 

@@ -43,6 +43,8 @@ from sparserob_core.sip.working.securing import back_off
 # some seconds leaves nothing proven; ten times as much is no search.
 RESERVED = 0.1
 
+MORE_EVALUATIONS = "more evaluations (maximiser.budget) or indices (method.indices) would help"
+
 
 class SparseRob(Method, Options):
     """Maximise ``g(epsilon; xi^1, ..., xi^D)`` for smaller and smaller ``epsilon``.
@@ -154,7 +156,9 @@ class _Outer:
             ledger.improve(ledger.relaxed.lower_bound(answer.rows, plain))
         proofs = prove(program, x, tools.notify, deadline=tools.deadline)
         found = separate(program, x, tools)
-        result = ledger.judged(answer, worst_of(found), as_bad_as_found(proofs, found), tools.deadline.reason)
+        proofs = as_bad_as_found(proofs, found)
+        short = MORE_EVALUATIONS if any(proof.verdict == "refuted" for proof in proofs) else ""
+        result = ledger.judged(answer, worst_of(found), proofs, tools.deadline.reason or short)
         if result.status not in ("refuted", "undecided") or ledger.proven is None:
             return result
         secured, found, proofs = ledger.proven

@@ -19,7 +19,7 @@ from pydantic import Field, field_validator
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import RoundFinished, forwarded, ignore
+from sparserob_core.sip.events import RoundFinished, forwarded, ignore, proofs_only
 from sparserob_core.sip.evidence import Cut, Leaf, Sparsest
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.branching import Branching, proposed
@@ -117,7 +117,8 @@ class SparsestMethod(Method, Options):
         """An optimum of the program's own cost, to compare with; none with an alphabet."""
         if self.alphabet is not None:
             return None
-        return Exchange(tolerance=self.tolerance, rounds=self.rounds).solve(program, replace(tools, notify=ignore))
+        tools = replace(tools, notify=proofs_only(tools.notify))
+        return Exchange(tolerance=self.tolerance, rounds=self.rounds).solve(program, tools)
 
 
 @dataclass(eq=False)
@@ -351,6 +352,8 @@ class _Search:
         assert self.tree is not None
         program, unit = self.program, self.program.cost_unit
         ending = self.ending or self.tools.deadline.reason
+        if self.best is None and self.plain is not None and ending == self.plain.stopped:
+            ending = ""  # the plain program's message says so
         counts = {"relaxed_programs": self.relaxed.solves, "rounds": len(self.rounds), "nodes": len(self.tree.nodes)}
         letters = None if self.method.alphabet is None else tuple(self.method.alphabet)
         tree, history, seconds = tuple(self.tree.nodes), tuple(self.rounds), time.perf_counter() - self.started

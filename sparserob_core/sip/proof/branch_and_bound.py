@@ -106,7 +106,13 @@ def prove_family(
             return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
     except KeyboardInterrupt as error:
         time_left.interrupt(error)
-        return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: its proof had begun only; {MORE}")
+        reason = f"{family.name}: its proof had begun only; {more(time_left)}"
+        return Proof(family.name, "undecided", np.inf, reason=reason)
+
+
+def more(deadline: Deadline) -> str:
+    """What would help where the time was over: more of the limit, or, where a key was pressed, to wait."""
+    return MORE if deadline.bounded and not deadline.pressed else "more time would help"
 
 
 @dataclass(eq=False)
@@ -164,7 +170,7 @@ class Course:
         """What hinders the proof, and what would help: at the worst cell, in the user's units."""
         advice = "" if self.family.hindrance is None else self.family.hindrance(lower, upper)
         if self.deadline.passed:
-            advice = f"there was no time to halve it; {MORE}, or a larger method.tolerance"
+            advice = f"there was no time to halve it; {more(self.deadline)}, or a larger method.tolerance"
         known = self.family.index_units
         lower, upper = (lower, upper) if known is None or known.size != lower.size else (lower * known, upper * known)
         allowed = bound * (1.0 if self.family.row_units is None else float(self.family.row_units.max()))

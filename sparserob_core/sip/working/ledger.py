@@ -23,7 +23,7 @@ from sparserob_core.sip.program import (
     Separation,
     WorstConstraint,
 )
-from sparserob_core.sip.proof.branch_and_bound import CELLS, prove
+from sparserob_core.sip.proof.branch_and_bound import CELLS, more, prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
@@ -187,6 +187,8 @@ class Ledger:
         if wrong:
             status, message = "failed", wrong
         message = f"{message}; {ending}" if ending and status != "certified" else message
+        if ending and ending == self.tools.deadline.reason and status == "refuted":
+            message = f"{message}; {more(self.tools.deadline)}"
         result = self.result(status, message, answer, witness(self.program, worst, proofs))
         return replace(result, proofs=tuple(proofs), stopped=ending if ending == self.tools.deadline.reason else "")
 
@@ -208,7 +210,7 @@ class Ledger:
         if self.best is None:
             return Result(
                 status="undecided",
-                message=f"{reason}, before there was a decision; more seconds (limits.seconds) would help",
+                message=f"{reason}, before there was a decision; {more(self.tools.deadline)}",
                 lower_bound=self.lower,
                 counts=self._counts(0),
                 solved_by=dict(self.relaxed.solved_by),

@@ -132,6 +132,28 @@ def test_where_cells_are_dear_and_no_farther_one_will_do_a_tenth_of_the_cost_is_
     assert 1.09 <= result.upper_bound <= 1.11
 
 
+def test_what_is_refuted_when_the_time_is_over_says_what_would_help():
+    def endless(seconds):
+        looked = []
+
+        def worst(x):  # another index each time, so that the rounds go on
+            looked.append(1.0 / (len(looked) + 2.0))
+            time.sleep(0.01)
+            if seconds is None and len(looked) > 3:
+                raise KeyboardInterrupt
+            at = np.array([[looked[-1]]])
+            return sr.Separation(at, np.zeros(1, dtype=int), at[:, 0] + 1.0)
+
+        family = replace(slow_family(), enclosure=None, worst=worst)
+        program = sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=9.0, families=[family])
+        return sr.solve(program, method="exchange", solver="piqp", seconds=seconds)
+
+    limited, pressed = endless(0.3), endless(None)
+    assert (limited.status, pressed.status) == ("refuted", "refuted")
+    assert limited.message.endswith("the limit of 0.3 s is reached; more seconds (limits.seconds) would help")
+    assert pressed.message.endswith("interrupted from the keyboard; more time would help")
+
+
 def test_an_interrupt_returns_the_decision_that_was_proven_before():
     looked = []
 
@@ -335,7 +357,7 @@ def test_refuted_where_the_rounds_ran_out_says_so(tmp_path):
     overrides = {"observers": [], "dictionaries.control.pieces": 40, "method": {"name": "exchange", "rounds": 1}}
     result = sr.run(CONFIGS / "experiment1_repaired.yaml", overrides, out=tmp_path / "run", figures=False).result
     assert result.status == "refuted"
-    assert result.message.endswith("the 1 rounds of the method are used up")
+    assert result.message.endswith("the 1 rounds of the method (method.rounds) are used up")
 
 
 def box_program():

@@ -80,6 +80,7 @@ def test_a_literal_search_is_refuted_by_a_disturbance_that_breaks_it(exact, tmp_
     excess = np.abs(state) - (0.7, np.inf) if worst.constraint == "path" else np.abs(state) - (0.3, 0.3)
     assert excess.max() == pytest.approx(worst.violation, abs=1e-9)
     assert f"{worst.constraint} is violated by {worst.violation:.4g}" in result.message
+    assert result.message.endswith("more evaluations (maximiser.budget) or indices (method.indices) would help")
 
 
 # Two searches whose polish leaves the path violated by 6e-8.
