@@ -373,12 +373,21 @@ class ConvexSet(ABC):
         ``centre + sum_j s_j spread_j``, ``|s_j| <= 1``.
 
         ``spread (..., J, d)``; returns ``(...,)``, proven upper bounds of ``h(y) - w'y`` with ``w`` the support point
-        of the centre (0 where the same point stays the maximiser). This default follows from sublinearity of ``h``;
-        sets override it with a tighter one.
+        of the centre (0 where the same point stays the maximiser). This default follows from sublinearity of ``h``:
+        with shares ``sum_j a_j <= 1`` of the centre, ``y`` is the sum of the ``a_j centre + s_j spread_j``, each convex
+        in ``s_j``. Of a smooth set it is of second order; sets override it with a tighter one.
         """
         point = self.support_point(centre)[..., None, :]
         along = (point * spread).sum(axis=-1)
-        excess: Array = np.maximum(self.support(spread) - along, self.support(-spread) + along).sum(axis=-1)
+        first = np.maximum(self.support(spread) - along, self.support(-spread) + along)  # with no share of the centre
+        total = first.sum(axis=-1, keepdims=True)
+        if not (total > 0.0).any() or not np.isfinite(total).all():
+            return np.asarray(total[..., 0])
+        shares = first / np.where(total > 0.0, total, 1.0)
+        begun = shares[..., None] * np.asarray(centre)[..., None, :]
+        ahead, back = self.support(begun + spread) - along, self.support(begun - spread) + along
+        gains = np.maximum(ahead, back) - (point * begun).sum(axis=-1)
+        excess: Array = np.minimum(np.maximum(gains, 0.0), first).sum(axis=-1)
         return excess
 
     @shaped

@@ -22,6 +22,7 @@ from sparserob_core.control.sets.sets import (
     intersection,
 )
 from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import ConvexSet
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -117,6 +118,50 @@ def test_the_linearisation_excess_of_a_round_set_is_of_second_order() -> None:
     for member in (Ellipsoid(np.ones(2), np.diag([1.0, 4.0])), NormBall(2.0, 3.0, dimension=2)):
         centre, spread = np.array([[1.0, 1.0]]), np.array([[[0.1, -0.3]]])
         assert member.linearisation_excess(centre, spread / 10)[0] < member.linearisation_excess(centre, spread)[0] / 80
+
+
+class ByItsSupport(ConvexSet):
+    """A set of which no more is known than its support function: what a stranger writes."""
+
+    def __init__(self, base: ConvexSet) -> None:
+        self.base = base
+
+    @property
+    def dimension(self) -> int:
+        return self.base.dimension
+
+    def support(self, directions: np.ndarray) -> np.ndarray:
+        return self.base.support(directions)
+
+    def support_point(self, directions: np.ndarray) -> np.ndarray:
+        return self.base.support_point(directions)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(1, 4), st.integers(1, 5))
+def test_the_excess_of_a_set_that_is_known_by_its_support_function_is_a_bound(seed: int, d: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    for base in every_set(rng, d):
+        member = ByItsSupport(base)
+        centre = rng.normal(size=(3, d)) * rng.integers(0, 2, size=(3, 1))  # 0 among them: every point is its best
+        spread = rng.uniform(0.01, 1.0) * rng.normal(size=(3, count, d)) * rng.integers(0, 2, size=(1, count, 1))
+        shifts = np.vstack([rng.uniform(-1, 1, (50, count)), rng.choice([-1.0, 1.0], (50, count))])
+        around = centre + np.einsum("sj,kjd->skd", shifts, spread)
+        truth = member.support(around) - (around * member.support_point(centre)).sum(axis=-1)
+        excess = member.linearisation_excess(centre, spread)
+        along = np.einsum("kd,kjd->kj", member.support_point(centre), spread)
+        first = np.maximum(member.support(spread) - along, member.support(-spread) + along).sum(axis=-1)
+        assert (truth.max(axis=0) <= excess + 1e-9).all()
+        assert (excess <= first + 1e-12).all()
+
+
+def test_the_excess_of_a_smooth_set_that_is_known_by_its_support_function_is_of_second_order() -> None:
+    ball = NormBall(3.0, 2.0, dimension=3)
+    member, centre = ByItsSupport(ball), np.array([1.0, -0.7, 0.4])
+    spread = np.array([[0.1, -0.3, 0.2], [0.05, 0.1, 0.1], [0.0, 0.0, 0.0]])
+    wide, narrow = (member.linearisation_excess(centre, scale * spread) for scale in (0.1, 0.01))
+    assert narrow < wide / 80
+    assert wide < 4.0 * ball.linearisation_excess(centre, 0.1 * spread)  # twice the closed form of two steps, each
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
