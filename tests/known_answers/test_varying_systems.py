@@ -114,8 +114,8 @@ def test_a_system_that_is_changed_afterwards_is_found(change: tampering.Change, 
     ("changes", "said"),
     [
         (
-            {"disturbance": {"box": 0.1}, "disturbance_class": "measurable"},
-            "disturbance_class: expected piecewise_constant where the system changes with time",
+            {"disturbance": {"norm": {"p": 2, "radius": 0.1}}, "disturbance_class": "measurable"},
+            "disturbance: expected a box where the system changes with time and disturbances are measurable",
         ),
         ({"system": {"A": [["t + p"]], "B": [[1]], "parameters": {"p": [0, 1]}}}, r"system\.parameters: expected none"),
         ({"system": {"A": [["a"]], "B": [[1]], "define": {"a": "b*t", "b": "a"}}}, r"system\.define\.a: .*circle"),

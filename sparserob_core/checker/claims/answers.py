@@ -24,6 +24,7 @@ from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along
 from sparserob_core.control.problem.disturbances import apart
+from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -91,7 +92,9 @@ class Answers:
         case = self.case
         if case.problem.system.parameter_count:
             raise Unchecked("the checker knows feedback and measurable disturbances of known systems only")
-        if case.answering and case.measurable and (case.problem.system.delay or case.problem.system.switches):
+        system = case.problem.system
+        one = isinstance(system, LinearSystem) and not system.delay
+        if case.answering and case.measurable and not one:
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
         if case.answering and case.several:
             raise Unchecked("the checker knows feedback under disturbances of one class")

@@ -30,7 +30,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import Accumulated, MixedConstraint, OptimalControlProblem, Return
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
-from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
+from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, Product, product
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -88,8 +88,8 @@ class Case:
     @property
     def looped(self) -> bool:
         """Whether the state is followed block by block of what deviates: where the control answers, and under
-        measurable disturbances."""
-        return self.answering or self.measurable
+        measurable disturbances of a system that does not change with time."""
+        return self.answering or (self.measurable and not isinstance(self.problem.system, VaryingSystem))
 
     @property
     def charge(self) -> Cost:
@@ -286,7 +286,7 @@ class Case:
             self.grid,
             [inputs[k] for k in which],
             [float(v) for v in np.asarray(self.problem.initial_state)],
-            None if changes is None else self.problem.disturbance,
+            None if changes is None else self.held,
             changes or [],
             self.problem.initial_set,
             tuple(float(t) for t in self.problem.system.switches),
@@ -294,10 +294,53 @@ class Case:
 
     def beside(self, window: Window, basis: Array, gains: Array) -> Beside | None:
         """What stands beside the state in the rows of a constraint; ``None``: nothing."""
-        if window.reference is None and not window.is_mixed and self.execution is None:
+        delivered = tuple(one for one in (self.execution, self.strayed) if one is not None)
+        if window.reference is None and not window.is_mixed and not delivered:
             return None
         ends = self.control.breakpoints.tolist()
-        return Beside(window, basis, gains, self.scene, ends, self.pieces, self.execution)
+        return Beside(window, basis, gains, self.scene, ends, self.pieces, delivered)
+
+    @cached_property
+    def held(self) -> ConvexSet | None:
+        """The set of the disturbances of which every one stays the same between `changes`: of a system that changes
+        with time, measurable ones are in the middle of their box, and `strayed` says how far they may be from that."""
+        bound, classes = self.problem.disturbance, self.problem.disturbance_class
+        if self.looped or not self.measurable or bound is None:
+            return bound
+        parts, kinds = ((bound,), (classes,)) if isinstance(classes, str) else (self._parts(bound), classes)
+        middles = [
+            one if kind != "measurable" else Box(*2 * (_middle(one),)) for one, kind in zip(parts, kinds, strict=True)
+        ]
+        found = product(middles)
+        return None if isinstance(classes, str) and not _middle(found).any() else found
+
+    @staticmethod
+    def _parts(bound: ConvexSet) -> Sequence[ConvexSet]:
+        if not isinstance(bound, Product):
+            raise Unchecked("of disturbances of several classes, the checker knows lists of sets only")
+        return bound.parts
+
+    @cached_property
+    def strayed(self) -> VaryingExecution | None:
+        """What measurable disturbances of a system that changes with time do beside the middle of their box: a command
+        of 1 through the columns of ``E`` that is missed by half the widths. ``None`` where there are none."""
+        bound = self.problem.measurable
+        if bound is None or self.looped or self.changing is None:
+            return None
+        if not bound.is_box:
+            raise Unchecked(
+                "of a system that changes with time, the checker knows measurable disturbances in boxes only"
+            )
+        box, middle, system = bound.bounding_box(), _middle(bound), self.problem.system
+        sides, single = np.stack([box.upper - middle, middle - box.lower]), box.upper == box.lower
+        most = np.where(single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
+        least = np.where(single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
+        half, ends = least + (most - least) / 2.0, np.array([0.0, self.grid[-1]])
+        off = np.nextafter(np.maximum(most - half, half - least), np.inf)
+        first = system.controls + (system.c is not None)
+        return VaryingExecution(
+            self.changing, half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off
+        )
 
     @cached_property
     def execution(self) -> Execution | VaryingExecution | None:
@@ -378,7 +421,12 @@ class Case:
 
     @cached_property
     def duality(self) -> Duality:
-        return Duality(self.problem, self.control, self.changes, self.changing)
+        return Duality(self.problem, self.control, self.changes, self.changing, self.held)
+
+
+def _middle(bound: ConvexSet) -> Array:
+    box = bound.bounding_box()
+    return np.asarray((box.lower + box.upper) / 2)
 
 
 def numbers(data: object, name: str) -> Array:

@@ -25,7 +25,7 @@ from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
@@ -58,12 +58,14 @@ class Row:
 @dataclass(frozen=True, eq=False)
 class Duality:
     """The data that bounds are derived from. ``changes``: where the disturbance may jump, ``None`` when there is
-    none; ``varying``: the flow of a system that changes with time."""
+    none; ``varying``: the flow of a system that changes with time, and ``held`` the set of what of its disturbance
+    stays the same between these."""
 
     problem: OptimalControlProblem
     control: Dictionary
     changes: list[float] | None
     varying: VaryingFlow | None = None
+    held: ConvexSet | None = None
     _steps: dict[tuple[tuple[float, ...], int, tuple[float, float]], arb_mat] = field(default_factory=dict, repr=False)
 
     @property
@@ -156,9 +158,9 @@ class Duality:
                 pushes[block] = [a + b for a, b in zip(pushes[block], (row * pushed).entries(), strict=True)]
         if disturbed and problem.initial_set is not None:
             constant = constant + known(problem.initial_set).support(free)
-        if disturbed and problem.disturbance is not None:
+        if disturbed and self.held is not None:
             for one in pushes:
-                constant = constant + known(problem.disturbance).support(one)
+                constant = constant + known(self.held).support(one)
         return Row(constant, slope)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:

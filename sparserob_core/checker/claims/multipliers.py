@@ -155,8 +155,10 @@ def _undisturbed(
         row = _along_adjoint(case, c, time, limit)
     else:
         row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.looped)
-        if case.measurable and not case.answering:
+        if case.looped and not case.answering:
             row = replace(row, constant=answers_of(case).disturbed(c, time, limit))
+    if case.strayed is not None:
+        row = replace(row, constant=row.constant + balls([case.strayed.added(c, time)[0]])[0])
     row = replace(row, sizes=None if case.execution is None else case.execution.least(c, time))
     if window is not None and window.is_mixed:
         piece = piece_of(case, window, entry, time)

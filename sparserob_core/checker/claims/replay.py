@@ -112,6 +112,8 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
         if named is not None:
             rows = answers.loop.state(case.piece_at(time), time).tolist()
             value = _along(direction, named, rows if piece is None else rows + answers.commands[piece].tolist())
+        elif case.strayed is not None:
+            value = _farthest(case, window.split(direction), time, piece)
         elif case.measurable:  # the worst is no signal on pieces: how far all of them reach is enclosed instead
             value = answers.farthest(*window.split(direction), time, piece)
         else:
@@ -122,6 +124,21 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
             low, high = case.execution.added(window.split(direction)[0], time)
             value = value + balls([low])[0].union(balls([high])[0])
     return value - limit, slack
+
+
+def _farthest(case: Case, direction: tuple[Array, Array], time: float, piece: int | None) -> arb:
+    """The largest ``c'x(t) + gain'u``, ``u`` the control on a ``piece``, under measurable disturbances of a system that
+    changes with time."""
+    (c, gain), none = direction, balls([0.0])[0]
+    assert case.strayed is not None
+    row = case.duality.row(c, time, [], none)
+    low, high = case.strayed.added(c, time)
+    total = row.constant + balls([low])[0].union(balls([high])[0])
+    for slope, control in zip(row.slope, case.pieces, strict=True):
+        total = total + sum((a * u for a, u in zip(slope, control.entries(), strict=True)), none)
+    if piece is None:
+        return total
+    return total + sum((a * u for a, u in zip(balls(gain), case.pieces[piece].entries(), strict=True)), none)
 
 
 def _along(direction: Array, named: Named | None, rows: Sequence[list[arb]]) -> arb:

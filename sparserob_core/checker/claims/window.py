@@ -101,7 +101,7 @@ class Beside:
     scene: Scene
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
-    delivered: Execution | VaryingExecution | None = None
+    delivered: Sequence[Execution | VaryingExecution] = ()
 
     def added(
         self, found: Sequence[Polynomial], start: float, stop: float, z: Array, piece: int | None = None
@@ -123,12 +123,10 @@ class Beside:
         mid = enclosed.mid @ z.T
         lost = (enclosed.rad + rounding(z.shape[1]) * np.abs(enclosed.mid)) @ np.abs(z).T
         found = [_plus(poly, mid[:, i], float(lost[:, i].sum())) for i, poly in enumerate(found)]
-        if self.delivered is None:
-            return found
-        return [
-            _plus(poly, *self._erring(self.delivered, c, start, stop))
-            for poly, c in zip(found, z @ self.basis, strict=True)
-        ]
+        for one in self.delivered:
+            rows = zip(found, z @ self.basis, strict=True)
+            found = [_plus(poly, *self._erring(one, c, start, stop)) for poly, c in rows]
+        return list(found)
 
     def _erring(
         self, delivered: Execution | VaryingExecution, c: Array, start: float, stop: float

@@ -230,12 +230,11 @@ class OptimalControlProblem:
             step = _checked_set("control_step", self.control_step, self.system.controls, "controls")
             self._set("control_step", None if _restricts_nothing(step) else step)
         self._check_disturbance()
-        if self.measurable is not None and isinstance(self.system, VaryingSystem):
+        if isinstance(self.system, VaryingSystem) and self.measurable is not None and not self.measurable.is_box:
             raise InputError(
-                path="disturbance_class",
-                expected="piecewise_constant where the system changes with time, of which measurable ones are not"
-                " proven",
-                got="measurable",
+                path="disturbance",
+                expected="a box where the system changes with time and disturbances are measurable",
+                got=self.measurable.kind,
             )
         self._set("measurements", self._measured())
         self._check_names()

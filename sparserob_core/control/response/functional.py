@@ -27,7 +27,7 @@ from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
-    from sparserob_core.control.response.measurable import Execution, MeasurableSupport
+    from sparserob_core.control.response.measurable import Execution, MeasurableSupport, VaryingMeasurable
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
@@ -69,7 +69,7 @@ class WorstCase:
     response: Response
     dictionary: Dictionary
     disturbance: DisturbanceModel | None
-    shared: MeasurableSupport | None = field(default=None, repr=False)
+    shared: MeasurableSupport | VaryingMeasurable | None = field(default=None, repr=False)
     names: Names = UNNAMED
     initial: ConvexSet | None = None
     execution: Execution | None = None
@@ -334,19 +334,26 @@ class WorstCase:
         where there is neither; raises `NotEnclosable` where no bound of it is proven."""
         rows = H @ lifted.transform
         found: list[Support] = []
-        model = self.disturbance
+        model, measurable = self.disturbance, self.measurable
+        by_block = None if model is None else model.on_blocks
         if isinstance(lifted, VaryingMotion):
-            found += [] if model is None else [VaryingSupport.of_disturbance(lifted, model, rows, joined)]
+            from sparserob_core.control.response.measurable import VaryingMeasurable
+
+            found += [] if by_block is None else [VaryingSupport.of_disturbance(lifted, by_block, rows, joined)]
+            if isinstance(measurable, VaryingMeasurable):
+                if joined is not None:
+                    raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
+                found += measurable.over(H, lifted)
             found += [] if self.initial is None else [VaryingSupport.of_initial(lifted, self.initial, rows, joined)]
             return Supports(tuple(found)) if found else None
-        by_block, measurable = None if model is None else model.on_blocks, self.measurable
         if by_block is not None:
             found.append(DisturbanceSupport(lifted, by_block, rows, joined))
         if measurable is not None:
             if lifted.space.nu or joined is not None:
                 raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
-            from sparserob_core.control.response.measurable import MeasurableCellSupport
+            from sparserob_core.control.response.measurable import MeasurableCellSupport, MeasurableSupport
 
+            assert isinstance(measurable, MeasurableSupport)
             found.append(MeasurableCellSupport(measurable, H, lifted))
         if self.initial is not None:
             found.append(InitialSupport(lifted, self.initial, rows, joined))
@@ -395,7 +402,7 @@ class WorstCase:
         return self.initial.support_point(self.response.weights(times, directions, parameters).free)
 
     @cached_property
-    def measurable(self) -> MeasurableSupport | None:
+    def measurable(self) -> MeasurableSupport | VaryingMeasurable | None:
         """The support of measurable disturbances, ``None`` where there are none; the ``shared`` one where it is of this
         system and set."""
         bound, given = None if self.disturbance is None else self.disturbance.measurable, self.shared
@@ -403,9 +410,9 @@ class WorstCase:
             return None
         if given and given.response.propagator is self.response.propagator and given.bound is bound:
             return given
-        from sparserob_core.control.response.measurable import MeasurableSupport
+        from sparserob_core.control.response.measurable import measurable_support
 
-        return MeasurableSupport(self.response, bound)
+        return measurable_support(self.response, bound)
 
     @shaped
     def given(self, weights: Float[Array, "k L mc"]) -> Float[Array, " k"]:

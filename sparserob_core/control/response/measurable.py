@@ -29,12 +29,13 @@ from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.flows import Leaps, products
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import Carried, carried
 from sparserob_core.control.response.initial_support import InitialSupport, Support
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
-from sparserob_core.control.response.varying_motion import OUTWARD, VaryingMotion
+from sparserob_core.control.response.varying_motion import OUTWARD, VaryingMotion, VaryingSupport
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
@@ -671,8 +672,10 @@ class ExecutionCellSupport(KnownCellSupport):
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingExecution(Execution):
-    """`Execution` of a system that changes with time."""
+    """`Execution` of a system that changes with time; ``disturbing``: what is commanded enters through ``E``, all of
+    it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do."""
 
+    disturbing: bool = False
     _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion) -> Support:
@@ -684,6 +687,21 @@ class VaryingExecution(Execution):
     def motion(self) -> VaryingMotion:
         """That of the response."""
         return VaryingMotion(self.response.propagator, self.response.initial_state)
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """The columns of ``[B E]`` through which errors enter."""
+        first = self.motion.expansion.channels[0] if self.disturbing else 0
+        return np.arange(first, first + self.shares.size)
+
+    @cached_property
+    def acting(self) -> np.ndarray:
+        """The piece of the command that acts between marks, ``(K,)``."""
+        grid = self.motion.grid
+        if not self.disturbing:
+            return grid.control_piece
+        middles = (grid.breakpoints[:-1] + grid.breakpoints[1:]) / 2
+        return np.clip(np.searchsorted(self.breakpoints, middles) - 1, 0, self.breakpoints.size - 2)
 
     @cached_property
     def kernel(self) -> Kernel:
@@ -742,7 +760,7 @@ class VaryingExecution(Execution):
         pieces that are not ``wanted (m, K)``."""
         found = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1, 2))
         asked = np.logical_and(wanted, self.shares[:, None] > 0.0)
-        acting = self.motion.grid.control_piece
+        acting = self.acting
         pieces = np.flatnonzero(asked[:, acting].any(axis=0))
         if not pieces.size or not times.size:
             return found
@@ -772,23 +790,23 @@ class VaryingExecution(Execution):
             row = row @ steps[k]
         who, which = np.nonzero(pieces < place[:, None])
         piece = pieces[which]
-        yield who, piece, self._along(self.kernel, piece, rows[who, :, piece], asked[:, grid.control_piece[piece]])
+        yield who, piece, self._along(self.kernel, piece, rows[who, :, piece], asked[:, self.acting[piece]])
         here = np.flatnonzero(np.isin(place, pieces) & np.greater(times, grid.breakpoints[place]))
         kernel = motion.expansion.kernel(distinct[1], until)
         piece = place[here]
-        yield here, piece, self._along(kernel, where[here], directions[here], asked[:, grid.control_piece[piece]])
+        yield here, piece, self._along(kernel, where[here], directions[here], asked[:, self.acting[piece]])
 
     def _along(self, kernel: Kernel, which: np.ndarray, rows: Array, asked: np.ndarray) -> Array:
         """Bounds ``(q, m, 2)`` of what intervals ``which (q,)`` of a kernel make of ``rows (q, d)`` on their ends, of
         channels that are ``asked (m, q)``."""
-        m, units = self.shares.size, self.motion.expansion.units
-        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., :m]).sum(axis=1)[which])
-        lost = (np.abs(rows) @ units * kernel.error[which])[:, None] * kernel.sizes[which, :m]
+        m, units, columns = self.shares.size, self.motion.expansion.units, self.columns
+        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which])
+        lost = (np.abs(rows) @ units * kernel.error[which])[:, None] * kernel.sizes[which][:, columns]
         lost = lost + rounding(rows.shape[1] + 2 * kernel.terms.shape[1] + HALVINGS) * sizes
         bounds = np.zeros((which.size, m, 2))
         for j, share in enumerate(self.shares):
             mine = np.flatnonzero(asked[j])
-            terms = np.einsum("qd,qpd->qp", rows[mine], kernel.terms[which[mine], :, :, j])[..., None]
+            terms = np.einsum("qd,qpd->qp", rows[mine], kernel.terms[which[mine], :, :, columns[j]])[..., None]
             accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes[mine, j], TINY)
             found = integrated(UNIT, terms, np.ones(mine.size), accuracy)
             found = found + lost[mine, j, None] * [-1.0, 1.0]
@@ -821,13 +839,15 @@ class VaryingExecutionCellSupport(KnownCellSupport):
         ``-|c'B'| - |c'A B| - int |g_tt| ds``, and ``g_tt = c'(A' + A^2) Phi B``: where ``g`` changes its sign the slope
         jumps upwards only. All of it is bounded at the start, and how much it changes within the cell.
         """
-        motion, d, m = self.motion, self.motion.states, self.execution.shares.size
+        motion, d, columns = self.motion, self.motion.states, self.execution.columns
         pieces = np.minimum(motion.place(start), motion.origin.size - 1)
         (law, slope), width = motion.law(start, pieces), widths[:, None]
-        most, second, third = (one[pieces][:, :, : d + m] for one in (motion.most, motion.second, motion.third))
+        entering = np.append(np.arange(d), d + columns)
+        law, slope = law[:, :, entering], slope[:, :, entering]
+        most, second, third = (one[pieces][:, :, entering] for one in (motion.most, motion.second, motion.third))
         begun, pushed = self._sizes(start), self._sizing[pieces]
         exact = np.abs(self.rows @ (slope[:, :, :d] + law[:, :, :d] @ law[:, :, :d]))
-        now = np.abs(self.rows @ slope[:, :, d : d + m]) + np.abs(self.rows @ law[:, :, :d] @ law[:, :, d : d + m])
+        now = np.abs(self.rows @ slope[:, :, d:]) + np.abs(self.rows @ law[:, :, :d] @ law[:, :, d:])
         entered = width * np.einsum("kim,km->ki", most[:, :, d:], pushed)
         grown = motion.grown(pieces, widths, begun + entered)
         turned = np.einsum("kij,kj->ki", third[:, :, :d], grown) + np.einsum("kim,km->ki", third[:, :, d:], pushed)
@@ -840,22 +860,23 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     @cached_property
     def neglected(self) -> Array:
         """What is off in the transitions, on every piece: ``(r, K)``."""
-        motion, m = self.motion, self.execution.shares.size
-        total = motion.left_out(self._at_marks[:-1], motion.flow.sizes[:, :m] * self._sizing)
+        motion = self.motion
+        total = motion.left_out(self._at_marks[:-1], motion.flow.sizes[:, self.execution.columns] * self._sizing)
         return product(np.abs(self.rows), total.T)
 
     @cached_property
     def reached(self) -> Array:
         """As in `VaryingSupport`, ``(K, d)``."""
-        motion, m, lengths = self.motion, self.execution.shares.size, self.motion.grid.lengths
-        entered = np.einsum("kim,km->ki", motion.most[:, :, motion.states : motion.states + m], self._sizing)
+        motion, lengths = self.motion, self.motion.grid.lengths
+        columns = motion.states + self.execution.columns
+        entered = np.einsum("kim,km->ki", motion.most[:, :, columns], self._sizing)
         return motion.grown(motion.every, lengths, self._at_marks[:-1] + lengths[:, None] * entered)
 
     @cached_property
     def _sizing(self) -> Array:
         """How large errors may be on every piece between marks, ``(K, m)``."""
         size = self.execution.shares[:, None] * np.abs(self.control)
-        return np.asarray(size[:, self.motion.grid.control_piece].T * OUTWARD)
+        return np.asarray(size[:, self.execution.acting].T * OUTWARD)
 
     @cached_property
     def _at_marks(self) -> Array:
@@ -866,3 +887,66 @@ class VaryingExecutionCellSupport(KnownCellSupport):
         d = self.motion.states
         every = np.repeat(times, d), np.tile(np.eye(d), (times.size, 1))
         return np.asarray(self.execution.enclosed(self.control, *every)[:, 1].reshape(-1, d) * OUTWARD)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class VaryingMeasurable:
+    """`MeasurableSupport` of a system that changes with time, for a box: what stays in the middle of the box, and the
+    errors, through the columns of ``E``, of a command that is 1 and may be missed by half the widths."""
+
+    response: Response
+    bound: ConvexSet
+
+    @shaped
+    def __call__(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> Float[Array, " k"]:
+        """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``; there are no parameters."""
+        found = np.array(self.errors.sampled(self.command, times, directions))
+        several = max(1, AT_ONCE // self.response.numbers(0))
+        for first in range(0, 0 if self.resting is None else times.size, several):
+            part = slice(first, first + several)
+            weights = self.response.weights(times[part], directions[part], parameters[part])
+            found[part] += self.resting.support(weights.disturbance)
+        return found
+
+    @cached_property
+    def middle(self) -> Array:
+        """That of the box, ``(mw,)``."""
+        box = self.bound.bounding_box()
+        return np.asarray((box.lower + box.upper) / 2)
+
+    @cached_property
+    def errors(self) -> VaryingExecution:
+        """How far disturbances may be from the middle: rounded outwards where that is not 0."""
+        box = self.bound.bounding_box()
+        far = np.maximum(box.upper - self.middle, self.middle - box.lower)
+        far = np.where(self.middle == 0.0, far, np.where(box.upper > box.lower, np.nextafter(far, np.inf), 0.0))
+        ends = self.response.grid.breakpoints[[0, -1]]
+        return VaryingExecution(self.response, ends, far, disturbing=True)
+
+    @property
+    def command(self) -> Array:
+        """The 1 that is missed, ``(mw, 1)``."""
+        return np.ones((self.middle.size, 1))
+
+    @cached_property
+    def resting(self) -> DisturbanceModel | None:
+        """The disturbance that stays in the middle, ``None`` where that is 0."""
+        if not self.middle.any():
+            return None
+        point, pieces = Box(self.middle, self.middle), np.arange(self.response.grid.pieces)
+        return DisturbanceModel("piecewise_constant", point, point, self.response.grid, starts=pieces)
+
+    def over(self, rows: Array, motion: VaryingMotion) -> list[Support]:
+        """What it adds to functionals ``rows (r, d)`` over cells of time, in parts that add up."""
+        found: list[Support] = [self.errors.over(self.command, rows, motion)]
+        if self.resting is not None:
+            found.append(VaryingSupport.of_disturbance(motion, self.resting, rows, None))
+        return found
+
+
+def measurable_support(response: Response, bound: ConvexSet) -> MeasurableSupport | VaryingMeasurable:
+    """The support of measurable disturbances in a set."""
+    return (VaryingMeasurable if response.grid.varying else MeasurableSupport)(response, bound)

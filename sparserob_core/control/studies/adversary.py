@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.flows import Leaps
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.varying_motion import VaryingMotion
 from sparserob_core.control.transcription.record import Feedback
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -121,11 +124,11 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     if model is None or support is None:
         return grid.breakpoints, functionals.worst_disturbance(time, direction, parameter)
     bound = support.bound
-    flow = _Way.of(functionals.response, parameter, time, direction)
+    flow = _way(functionals.response, parameter, time, direction)
     starts = np.concatenate(
         [
             left + (right - left) * np.arange(PARTS) / PARTS
-            for left, right in zip(grid.breakpoints[:-1], grid.breakpoints[1:], strict=True)
+            for left, right in pairwise(functionals.response.propagator.marks if grid.varying else grid.breakpoints)
         ]
     )
     ends = np.append(starts[1:], grid.breakpoints[-1])
@@ -149,7 +152,7 @@ def pushed_by(
     ``direction'x(time)``."""
     ends, values = signal
     past = ends[:-1] < time
-    flow = _Way.of(functionals.response, parameter, time, direction)
+    flow = _way(functionals.response, parameter, time, direction)
     return float((flow.gains(ends[:-1][past], np.minimum(ends[1:][past], time)) * values.T[past]).sum())
 
 
@@ -195,7 +198,56 @@ class _Way:
         return found
 
 
-def _halved(bound: ConvexSet, flow: _Way, parts: tuple[Array, Array], horizon: float) -> tuple[Array, Array]:
+@dataclass(frozen=True, eq=False)
+class _VaryingWay:
+    """`_Way` of a system that changes with time: of the ``row (d,)`` of a functional at its ``time``."""
+
+    motion: VaryingMotion
+    row: Array
+    time: float
+
+    def at(self, times: Array, inside: Array) -> Array:
+        """`_Way.at`."""
+        place = np.minimum(self.motion.place(inside), self.motion.origin.size - 1)
+        inputs = self.motion.law(times, place)[0][:, :, self.motion.states :]
+        return np.asarray((self._rows(times)[:, None] @ inputs)[:, 0, self.motion.expansion.channels[0] :])
+
+    def gains(self, starts: Array, ends: Array) -> Array:
+        """`_Way.gains`."""
+        pushed = self.motion.expansion.flow(starts, ends).disturbance
+        return np.asarray((self._rows(ends)[:, None] @ pushed)[:, 0])
+
+    def _rows(self, times: Array) -> Array:
+        """What the functional is at earlier ``times (k,)``, ``(k, d)``."""
+        ends, rows = self._ahead
+        place = np.minimum(self.motion.place(times), ends.size - 1)
+        state = self.motion.expansion.flow(times, ends[place]).state
+        return np.asarray((rows[place][:, None] @ state)[:, 0])
+
+    @cached_property
+    def _ahead(self) -> tuple[Array, Array]:
+        """Where the pieces between marks end, up to that which holds the time, which is its end, ``(K,)``; and what
+        the functional is there, ``(K, d)``."""
+        motion, marks = self.motion, self.motion.grid.breakpoints
+        last = max(0, int(np.searchsorted(marks, self.time)) - 1)
+        ends, rows = np.append(marks[1 : last + 1], self.time), np.tile(self.row, (last + 1, 1))
+        if last:
+            rows[last - 1] = self.row @ motion.expansion.flow(marks[[last]], np.array([self.time])).state[0]
+        for k in range(last - 2, -1, -1):
+            rows[k] = rows[k + 1] @ motion.flow.state[k + 1]
+        return ends, rows
+
+
+Way: TypeAlias = _Way | _VaryingWay
+
+
+def _way(response: Response, parameter: Array, time: float, direction: Array) -> Way:
+    if response.grid.varying:
+        return _VaryingWay(VaryingMotion(response.propagator, response.initial_state), direction, time)
+    return _Way.of(response, parameter, time, direction)
+
+
+def _halved(bound: ConvexSet, flow: Way, parts: tuple[Array, Array], horizon: float) -> tuple[Array, Array]:
     """The parts, halved wherever the best constant on one is not the best at both of its ends; the most lossy of them
     when they are too many."""
     starts, ends = parts
@@ -216,7 +268,7 @@ def _halved(bound: ConvexSet, flow: _Way, parts: tuple[Array, Array], horizon: f
     return starts[order], ends[order]
 
 
-def _lost(bound: ConvexSet, flow: _Way, starts: Array, ends: Array) -> tuple[Array, float]:
+def _lost(bound: ConvexSet, flow: Way, starts: Array, ends: Array) -> tuple[Array, float]:
     """What the best constant on each part misses at its two ends, times the part's length, ``(k,)``, and the largest
     that is there."""
     best = bound.support_point(flow.gains(starts, ends))

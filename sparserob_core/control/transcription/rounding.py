@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sparserob_core.control.response.measurable import VaryingMeasurable
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
@@ -74,9 +75,19 @@ def _added(model: Transcription, result: Result) -> float:
     if functionals.execution is not None:
         lengths = functionals.execution.lengths(times, directions)
         sizes += lengths @ np.repeat(_far(model.problem.control), model.control.pieces)
-    if model.problem.disturbance is not None:
-        sizes += (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
+    sizes += _disturbing(model, on_noise, times, directions)
     return float(multipliers @ sizes) + besides
+
+
+def _disturbing(model: Transcription, on_noise: Array, times: Array, directions: Array) -> Array:
+    """The numbers ``(k,)`` that are added up to what disturbances do, from the weights ``on_noise (k, L, mw)``."""
+    if model.problem.disturbance is None:
+        return np.zeros(times.size)
+    sizes: Array = (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
+    measurable = model.functionals.measurable
+    if isinstance(measurable, VaryingMeasurable):  # of these, integrals of absolute values
+        sizes += measurable.errors.lengths(times, directions).sum(axis=1)
+    return sizes
 
 
 def _quadratic(model: Transcription, result: Result) -> float:

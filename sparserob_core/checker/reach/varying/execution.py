@@ -34,12 +34,15 @@ TIMES_KEPT = 4096  # times at which what errors make of the states is remembered
 @dataclass(eq=False)
 class VaryingExecution:
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
-    none where only rows are asked for."""
+    none where only rows are asked for. It enters through the columns of ``[B E]`` from the ``first`` one on; the
+    errors are known but for ``off (m,)``."""
 
     law: VaryingFlow
     shares: Array
     breakpoints: Array
     pieces: Sequence[arb_mat]
+    first: int = 0
+    off: Array | None = None
     _kernels: dict[tuple[float, float], Enclosed] = field(default_factory=dict, repr=False)
     _onward: dict[int, Enclosed] = field(default_factory=dict, repr=False)
     _added: dict[tuple[float, bytes], tuple[Array, Array]] = field(default_factory=dict, repr=False)
@@ -59,8 +62,9 @@ class VaryingExecution:
     def sizes(self) -> Enclosed:
         """How large errors may be on every piece of the command, ``(K, m)``."""
         control = Enclosed.all(self.pieces, (len(self.pieces), self.shares.size))
-        size = self.shares * np.abs(control.mid)
-        return Enclosed(size, (self.shares * control.rad + rounding(2) * size) * OUTWARD)
+        size, off = self.shares * np.abs(control.mid), np.zeros(self.shares.size) if self.off is None else self.off
+        lost = off * (np.abs(control.mid) + control.rad)
+        return Enclosed(size, (self.shares * control.rad + lost + rounding(2) * size) * OUTWARD)
 
     def least(self, c: Array, time: float) -> Array:
         """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
@@ -93,10 +97,11 @@ class VaryingExecution:
         size = self.sizes.mid[place] + self.sizes.rad[place]
         if size.any():
             (most, slope), units = self.law.most(start, stop), np.array(self.law.units)
-            A, B = most[:, :d], most[:, d : d + m]
+            entering = slice(d + self.first, d + self.first + m)
+            A, B = most[:, :d], most[:, entering]
             pace = float((A * units / units[:, None]).sum(axis=1).max())
             grown = np.exp(pace * width) * units * ((B @ size) / units).max()
-            second = (slope[:, d : d + m] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ grown
+            second = (slope[:, entering] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ grown
             total += width**2 / 8.0 * float(np.abs(c) @ second)
         return total * OUTWARD * (1.0 + rounding(8 * d * d))
 
@@ -158,7 +163,8 @@ class VaryingExecution:
             m, terms = self.shares.size, self.law.kernel(start, stop)
             half = arb_poly([arb(1) / 2, arb(1) / 2])
             d = terms[0].nrows()
-            every = [[arb_poly([one[i, j] for one in terms])(half).coeffs() for j in range(m)] for i in range(d)]
+            columns = range(self.first, self.first + m)
+            every = [[arb_poly([one[i, j] for one in terms])(half).coeffs() for j in columns] for i in range(d)]
             none = arb(0)
             found = [
                 stacked([[entry[k] if k < len(entry) else none for entry in row] for row in every])

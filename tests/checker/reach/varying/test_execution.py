@@ -148,3 +148,37 @@ def test_bounds_allow_for_what_is_rounded_and_for_the_size_of_the_control() -> N
         thin = made(ROCKET, np.tile([[0.499], [0.0]], (1, 6)))
         assert wide.added(C, 2.9)[1] >= fixed.added(C, 2.9)[0]
         assert wide.added(C, 2.9)[0] <= thin.added(C, 2.9)[1]
+
+
+def entering(system: VaryingSystem, off: float = 0.0) -> VaryingExecution:
+    """A command of 1 through ``E`` that is missed by 0.25."""
+    one, ends = [stacked([[arb(1)]])], np.array([0.0, 3.0])
+    lost = np.array([off])
+    return VaryingExecution(VaryingFlow(system, 3.0), np.array([0.25]), ends, one, system.controls, lost)
+
+
+@pytest.mark.parametrize("time", [0.0, 0.7, 3.0])
+def test_what_enters_by_the_last_columns_is_between_the_bounds_of_the_closed_form(time: float) -> None:
+    # (1 + t) x adds up (1 + s) e^-s
+    truth = 0.25 * (2.0 - (2.0 + time) * np.exp(-time)) / (1.0 + time)
+    with ctx.workprec(128):
+        low, high = entering(FADING).added(np.array([-1.0]), time)
+        assert low <= truth * (1 + 1e-15) and truth * (1 - 1e-15) <= high <= low + 1e-12
+        low, high = entering(FADING, 1e-3).added(np.array([-1.0]), time)
+        assert low <= truth * 0.249 / 0.25 and truth * 0.251 / 0.25 <= high <= low + 1.01e-2 * truth
+
+
+def test_what_enters_by_the_last_columns_bends_as_it_does() -> None:
+    # of the columns, the first one is 0 and would not bend
+    system = VaryingSystem.of([[0, 1], [0, 0]], [[0], [0]], 3.0, [["0*t"], ["1/(4 - t)"]])
+    share, ratios = np.linspace(0.0, 1.0, 7), []
+    with ctx.workprec(128):
+        found = entering(system)
+        for start, stop in pairwise(found.marks):
+            path = np.array([found.added(C, float(t))[1] for t in start + share[:-1] * (stop - start)])
+            path = np.append(path, found.added(C, stop)[1])
+            above = (path - (1 - share) * path[0] - share * path[-1]).max()
+            said = found.bent(C, start, stop)
+            assert above <= said * (1 + 1e-9) + 1e-13
+            ratios.append(above / max(said, 1e-12))
+    assert max(ratios) > 0.1

@@ -1,0 +1,227 @@
+"""Guards known answers: measurable disturbances of plants that change with time, against closed forms, the constant
+system, errors of execution and an independent linear program; forgeries; what is refused beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import linprog
+
+import sparserob_core as sr
+from sparserob_core.control.studies.adversary import pushed_by, worst_signal
+from sparserob_core.experiment.assemble import assemble
+from sparserob_core.experiment.check.check import check
+from sparserob_core.experiment.config.load import load_config
+from tests.known_answers.test_checks import pieces, verified
+from tests.known_answers.test_pairs import BASE, in_turns, of_two_classes, with_drift
+from tests.known_answers.test_varying_systems import FADING
+from tests.support import tampering
+
+Problem = dict[str, Any]
+ANY: Problem = {"disturbance": {"box": 0.1}, "disturbance_class": "measurable"}
+STRAIGHT: Problem = {
+    "name": "linear",
+    "horizon": 2.0,
+    "initial_state": [2.0],
+    "control": {"box": 2.0},
+    "terminal": [{"box": 0.5}],
+}
+HORIZON, PIECES = 2.0, 6
+CART: Problem = {  # pushed through (0.1 t, cos(3 t)), from a middle that is not 0
+    "name": "linear",
+    "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "E": [["0.1*t", 0], ["cos(3*t)", 0.5]]},
+    "horizon": HORIZON,
+    "initial_state": [-1.0, 0.5],
+    "control": {"box": 2.0},
+    "disturbance": {"box": {"lower": [-0.08, 0.0], "upper": [0.12, 0.1]}},
+    "disturbance_class": "measurable",
+    "path": [{"box": [0.45, None], "from": 1.0}],
+    "terminal": [{"box": [0.3, 0.4]}],
+}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the cart."""
+    directory = tmp_path_factory.mktemp("cart") / "run"
+    verified(directory, CART, pieces(PIECES))
+    return directory
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize(
+    ("E", "bound", "cost"),
+    [
+        ("t - 1", {"box": 0.1}, 1.5 + 0.1),  # whose sign changes: one that is constant until 2 does nothing
+        ("t", {"box": {"lower": [-0.2], "upper": [0.1]}}, 1.5 + 0.1 * 2.0),
+        ("exp(-t)", {"box": 0.1}, 1.5 + 0.1 * (1.0 - np.exp(-2.0))),
+        ("t - 1", {"box": {"lower": [0.1], "upper": [0.3]}}, 1.5 + 0.1),
+        ("t", {"box": {"lower": [0.1], "upper": [0.1]}}, 1.5 + 0.1 * 2.0),
+    ],
+)
+def test_an_integrator_that_is_pushed_by_a_function_of_time_is_the_closed_form(
+    E: str, bound: Problem, cost: float, tmp_path: Path
+) -> None:
+    problem = {**STRAIGHT, **ANY, "disturbance": bound, "system": {"A": [[0]], "B": [[1]], "E": [[E]]}}
+    assert verified(tmp_path / "run", problem, pieces(4))["cost"] == pytest.approx(cost, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_a_push_that_may_be_anything_is_a_control_at_one_of_which_anything_may_be_delivered(tmp_path: Path) -> None:
+    plant, end = {**FADING, "initial_state": {"centre": [2.5], "box": 0.2}}, {"terminal": [{"box": 0.2}]}
+    by_hand = {
+        **plant,
+        **end,
+        "system": {"A": [["-1/(1 + t)"]], "B": [[1, "0.1*cos(4*t)"]], "c": ["-0.1*cos(4*t)"]},
+        "control": {"box": {"lower": [-1, 1], "upper": [1, 1]}},
+        "weights": [[0, 1, 0]],
+        "execution": [0, 1],
+    }
+    built = {**plant, **end, **ANY, "system": {"A": [["-1/(1 + t)"]], "B": [[1]], "E": [["cos(4*t)"]]}}
+    costs = [verified(tmp_path / str(k), one, pieces(10))["cost"] for k, one in enumerate((by_hand, built))]
+    assert costs[1] == pytest.approx(costs[0], rel=2e-8)  # as far apart as the bounds of either
+
+
+def independent() -> float:
+    """The cost of the cart by a linear program, whose rows are sums over fine steps at many times."""
+    fine = 300
+    step, n = HORIZON / PIECES / fine, PIECES * fine
+    s = (np.arange(n) + 0.5) * step
+    rows, limits = [], []
+    windows = [(np.array([1.0, 0.0]), 0.45, np.linspace(1.0, HORIZON, 201))]
+    windows += [(np.array([1.0, 0.0]), 0.3, [HORIZON]), (np.array([0.0, 1.0]), 0.4, [HORIZON])]
+    middle, half = np.array([0.02, 0.05]), np.array([0.1, 0.05])
+    for c, wall, times in windows:
+        for t in times:
+            past = s < t
+            row = np.stack([np.full(n, c[0]), c[0] * (t - s) + c[1]])  # c'Phi(t, s)
+            gain = np.where(past, row[1], 0.0).reshape(PIECES, fine).sum(axis=1) * step
+            entering = np.stack([0.1 * s * row[0] + np.cos(3 * s) * row[1], 0.5 * row[1]])
+            moved = float(middle @ np.where(past, entering, 0.0).sum(axis=1)) * step
+            spread = float(half @ np.abs(np.where(past, entering, 0.0)).sum(axis=1)) * step
+            free = c[0] * (-1.0 + 0.5 * t) + 0.5 * c[1]
+            for sign in (1.0, -1.0):
+                rows.append(np.concatenate([sign * gain, -sign * gain]))
+                limits.append(wall - spread - sign * (free + moved))
+    prices = np.full(2 * PIECES, HORIZON / PIECES)
+    return float(linprog(prices, A_ub=rows, b_ub=limits, bounds=(0, 2), method="highs").fun)
+
+
+@pytest.mark.slow
+def test_a_cart_costs_what_an_independent_linear_program_says(finished: Path) -> None:
+    assert tampering.copied(finished).certificate["cost"] == pytest.approx(independent(), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_the_worst_signal_attains_what_is_claimed_and_reaches_the_wall(finished: Path) -> None:
+    model = assemble(load_config(finished / "config.yaml")).transcription
+    functionals, none = model.functionals, np.zeros(0)
+    support = functionals.measurable
+    assert support is not None
+    control = np.array(tampering.copied(finished).decision)
+    highest = []
+    walls = [(HORIZON, c, wall) for c, wall in zip(np.vstack([np.eye(2), -np.eye(2)]), [0.3, 0.4] * 2, strict=True)]
+    for time, direction, wall in (*walls, (1.0, np.array([-1.0, 0.0]), 0.45), (1.37, np.array([-1.0, 0.3]), np.inf)):
+        ends, signal = worst_signal(functionals, time, direction, none)
+        assert signal is not None
+        attained = pushed_by(functionals, time, direction, none, (ends, signal))
+        claimed = float(functionals.offsets(np.array([time]), direction[None], none[None])[0])
+        assert claimed - 1e-12 <= attained <= claimed + 1e-12
+        state = np.array([-1.0, 0.5])
+        for begin, end, w in zip(ends[:-1], ends[1:], signal.T, strict=True):
+            u = float(control[0, min(int((begin + end) / 2 / HORIZON * PIECES), PIECES - 1)])
+
+            def slope(t: float, x: np.ndarray, u: float = u, w: np.ndarray = w) -> list[float]:
+                return [x[1] + 0.1 * t * w[0], u + np.cos(3 * t) * w[0] + 0.5 * w[1]]
+
+            if begin < time:
+                state = solve_ivp(slope, (begin, min(end, time)), state, rtol=1e-11, atol=1e-12).y[:, -1]
+        value = functionals.values(control.ravel(), np.array([time]), direction[None], none[None])
+        assert float(direction @ state) == pytest.approx(float(value[0]), abs=1e-9)
+        highest.append(float(direction @ state) / wall)
+    assert max(highest) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize(
+    "change",
+    [
+        tampering.problem(disturbance={"box": {"lower": [-0.080001, 0.0], "upper": [0.120001, 0.1]}}),
+        tampering.problem(disturbance={"box": {"lower": [-0.08, 0.0], "upper": [0.12, 0.100001]}}),
+        tampering.problem(terminal=[{"box": [0.299999, 0.399999]}], path=[{"box": [0.449999, None], "from": 1.0}]),
+        tampering.times("cost", 0.999999),
+        tampering.problem(disturbance={"box": {"lower": [-0.0799, 0.0], "upper": [0.1199, 0.1]}}),
+        tampering.system(E=[["0.1*t", 0], ["cos(3*t) + 1e-6*t", 0.5001]]),
+        tampering.times("lower_bound", 1.00001),
+    ],
+    ids=["wider", "wider above", "walls", "cost", "narrower", "E", "lower bound"],
+)
+def test_what_is_changed_afterwards_is_found(change: tampering.Change, finished: Path, tmp_path: Path) -> None:
+    assert check(tampering.forged(finished, tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
+def test_more_than_can_be_made_up_for_is_proven_to_be_infeasible(tmp_path: Path) -> None:
+    problem = {**STRAIGHT, **ANY, "disturbance": {"box": 0.501}, "system": {"A": [[0]], "B": [[1]], "E": [["t - 1"]]}}
+    config = {"problem": problem, "dictionaries": {"control": pieces(4)}, "observers": []}
+    assert sr.run(config, out=tmp_path / "run", figures=False).status == "infeasible"
+    assert {one.name: one.verdict for one in check(tmp_path / "run").claims}["infeasibility"] == "holds"
+
+
+@pytest.mark.slow
+def test_a_control_that_is_refuted_shows_by_how_much(tmp_path: Path) -> None:
+    config = {"problem": CART, "dictionaries": {"control": pieces(PIECES)}, "method": {"name": "nominal"}}
+    outcome = sr.run({**config, "observers": []}, out=tmp_path / "run", figures=False)
+    assert outcome.result.status == "refuted"
+    assert {one.name: one.verdict for one in check(tmp_path / "run").claims}["violation"] == "holds"
+    calm = tampering.problem(disturbance={"box": {"lower": [0.02, 0.05], "upper": [0.02, 0.05]}})
+    assert check(tampering.forged(tmp_path / "run", tmp_path / "copy", calm, consistent=True)).status == "refuted"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", ["delay and drift", "initial set and turns", "two classes", "not about 0"])
+def test_a_constant_plant_costs_the_same_as_a_function_of_time(more: str, tmp_path: Path) -> None:
+    costs = []
+    for name in ("plain", "dressed"):
+        config: dict[str, Any] = {"problem": {**BASE["problem"], **ANY, "disturbance": {"box": [0.015, 0.015]}}}
+        config["problem"]["system"] = {"A": [[0, 1], [-1, -0.4]], "B": [[0.2, 0], [0, 1]]}
+        problem = config["problem"]
+        if more == "delay and drift":
+            problem["system"]["delay"] = 0.2
+            with_drift(config)
+        if more == "initial set and turns":
+            problem["initial_state"] = {"centre": [-0.5, 0.5], "box": [0.02, 0.02]}
+            in_turns(config)
+        if more == "two classes":
+            of_two_classes(config)
+            del problem["disturbance_class"]
+            problem["disturbance"][0].update(
+                {"from": 0.4, "to": 2.2, "set": {"box": {"lower": [0.0], "upper": [0.02]}}}
+            )
+        if more == "not about 0":
+            problem["disturbance"] = {"box": {"lower": [0.0, -0.02], "upper": [0.02, 0.01]}}
+        for one in problem["system"].get("pieces", [problem["system"]]) if name == "dressed" else []:
+            one["A"] = [[f"{entry} + 0*t" for entry in row] for row in one["A"]]
+        costs.append(verified(tmp_path / name, problem, pieces(6), pieces(6))["cost"])
+    assert costs[1] == pytest.approx(costs[0], rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"problem": {"disturbance": {"norm": {"p": 1, "radius": 0.1}}}}, r"problem\.disturbance: expected a box"),
+        ({"problem": {"disturbance": {"ellipsoid": {"centre": [0, 0], "shape": [[0.1, 0], [0, 0.1]]}}}},
+         r"problem\.disturbance: expected a box"),
+        ({"policy": {"name": "affine"}}, "a system that stays the same with time under measurable disturbances"),
+        ({"problem": {"execution": 0.1}}, r"problem\.execution.*measurable disturbances"),
+    ],
+    ids=["diamond", "ellipsoid", "feedback", "execution"],
+)  # fmt: skip
+def test_what_is_not_proven_beside_them_is_refused_by_name(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+    config = {"dictionaries": {"control": pieces(4)}, "observers": [], **changes}
+    config["problem"] = {**CART, **changes.get("problem", {})}
+    with pytest.raises(sr.InputError, match=said):
+        sr.run(config, out=tmp_path / "run", figures=False)
