@@ -156,17 +156,22 @@ class _Outer:
             ledger.improve(ledger.relaxed.lower_bound(answer.rows, plain))
         proofs = prove(program, x, tools.notify, deadline=tools.deadline)
         found = separate(program, x, tools)
-        proofs = as_bad_as_found(proofs, found)
-        short = MORE_EVALUATIONS if any(proof.verdict == "refuted" for proof in proofs) else ""
-        result = ledger.judged(answer, worst_of(found), proofs, tools.deadline.reason or short)
-        if result.status not in ("refuted", "undecided") or ledger.proven is None:
-            return result
-        secured, found, proofs = ledger.proven
-        which = f"is that of an earlier weight, epsilon = {secured.epsilon:g}"
-        if secured.epsilon == answer.epsilon:
-            which = "keeps away from the constraints by as much as that of the search misses them by"
-        ending = f"the decision {which} ({result.message})"
-        return ledger.judged(secured, worst_of(found), proofs, tools.deadline.reason or ending)
+        told = as_bad_as_found(proofs, found)
+        short = MORE_EVALUATIONS if any(proof.verdict == "refuted" for proof in told) else ""
+        result = ledger.judged(answer, worst_of(found), told, tools.deadline.reason or short)
+        return _or_backed_off(ledger, result, answer)
+
+
+def _or_backed_off(ledger: Ledger, result: Result, answer: Answer) -> Result:
+    """The result of the last ``answer``, or that of the decision that is proven in its place, with what that one is."""
+    if result.status not in ("refuted", "undecided") or ledger.proven is None:
+        return result
+    secured, found, proofs = ledger.proven
+    which = f"is that of an earlier weight, epsilon = {secured.epsilon:g}"
+    if secured.epsilon == answer.epsilon:
+        which = "keeps away from the constraints by as much as that of the search misses them by"
+    ending = f"the decision {which} ({result.message})"
+    return ledger.judged(secured, worst_of(found), proofs, ledger.tools.deadline.reason or ending)
 
 
 def _secured(ledger: Ledger, answer: Answer, found: Found, tools: Tools) -> None:

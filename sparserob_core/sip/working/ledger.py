@@ -177,7 +177,7 @@ class Ledger:
     def judged(self, answer: Answer, worst: WorstConstraint, proofs: Sequence[Proof], ending: str = "") -> Result:
         """The result with the decision of ``answer``: what the proofs, the gap and the comparison of the bounds allow.
         ``ending``: why the method came to an end, where it was not by its own rules."""
-        x = answer.solution.x
+        x, deadline = answer.solution.x, self.tools.deadline
         status, message = verdict(proofs, self.gap(x), self.tolerance)
         for what, missed, most in self._fixed(x, strictly=status in ("certified", "verified")):
             if missed > most:
@@ -187,10 +187,10 @@ class Ledger:
         if wrong:
             status, message = "failed", wrong
         message = f"{message}; {ending}" if ending and status != "certified" else message
-        if ending and ending == self.tools.deadline.reason and status == "refuted":
-            message = f"{message}; {more(self.tools.deadline)}"
+        if status == "refuted" and ending and ending == deadline.reason and not deadline.pressed:
+            message = f"{message}; {more(deadline)}"
         result = self.result(status, message, answer, witness(self.program, worst, proofs))
-        return replace(result, proofs=tuple(proofs), stopped=ending if ending == self.tools.deadline.reason else "")
+        return replace(result, proofs=tuple(proofs), stopped=ending if ending == deadline.reason else "")
 
     def _fixed(self, x: Array, strictly: bool) -> Iterator[tuple[str, float, float]]:
         """What is no family: a name, by how much ``x (n,)`` misses it, and by how much it may. ``strictly``: as much as

@@ -110,7 +110,8 @@ def back_off(working: Working, ledger: Ledger, prover: Prover, answer: Answer, f
     not what the search has found. The lower bound of the ledger stays that of the search: what is imposed to back off
     is not."""
     x, program = answer.solution.x, ledger.program
-    missed, violated = [Missed.most(*one) for one in found if not one[0].defines], [above(*one) for one in found]
+    missed = [Missed.most(*one) for one in found if not one[0].defines]
+    violated: Violated = [above(*one) for one in found]
     if not ledger.cheaper(answer) or not _is_near(working, program, answer, missed):
         return
     if not any(rows.size for _, rows, _ in violated):
