@@ -60,6 +60,11 @@ class Qpsolvers(sr.Solver, sr.Options):
 
     _chosen: Through = PrivateAttr()
 
+    @property
+    def delegate(self) -> str:
+        """The solver that was chosen."""
+        return self.solver
+
     @field_validator("solver")
     @classmethod
     def _is_there(cls, name: str) -> str:

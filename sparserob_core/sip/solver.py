@@ -146,6 +146,12 @@ class Solver(ABC):
     sparse: ClassVar[bool] = False
     conic: ClassVar[bool] = False
 
+    @property
+    def delegate(self) -> str:
+        """The name of the solver to which it hands every program on; ``""`` unless it is a way to several: tables and
+        messages tell it beside its own."""
+        return ""
+
     @abstractmethod
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """Solve to the absolute residuals ``accuracy``; never raise for a program that is merely hard.
@@ -191,7 +197,7 @@ class Auto(Solver, Options):
     @property
     def called(self) -> str:
         """The name of the ``general`` solver."""
-        return self._called
+        return whole_name(self.general, self._called)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """See `Solver.solve`: the claim of the ``general`` solver."""
@@ -285,7 +291,13 @@ class Asked(Solver):
 
 def named(solver: Solver, name: str, instead: Solver) -> Solver:
     """The solver as one that was `Named`; `Auto` is no solver by name."""
-    return solver if isinstance(solver, Auto | Named | Asked) else Named(solver, name, instead)
+    return solver if isinstance(solver, Auto | Named | Asked) else Named(solver, whole_name(solver, name), instead)
+
+
+def whole_name(solver: object, name: str) -> str:
+    """What a solver of that name is told as: with the one to which it hands its programs on, where that is another."""
+    delegate = solver.delegate if isinstance(solver, Solver) else ""
+    return f"{name} ({delegate})" if delegate else name
 
 
 def quickest(solver: Solver) -> Solver:

@@ -151,6 +151,15 @@ def test_settings_reach_the_solver_and_only_those_given_are_written_down():
     assert sparse.solve(program, 1e-8).status == "solved", "the name of an enumeration's member"
 
 
+def test_who_answered_is_told_with_the_solver_that_was_chosen():
+    program = sr.SemiInfiniteProgram(n=2, q=[-1.0, -1.0], P=np.eye(2), lower=-1.0, upper=0.5)
+    chosen = {"name": "qpsolvers", "solver": "quadprog"}
+    for given, name in ((chosen, "qpsolvers (quadprog)"), ({"name": "quadprog"}, "quadprog")):
+        result = sr.solve(program, solver=given)
+        assert (result.status, set(result.solved_by)) == ("certified", {name})
+    assert REGISTRY.build("solver", "auto", {"general": chosen}).called == "qpsolvers (quadprog)"
+
+
 def test_a_solver_can_be_sent_to_another_process():
     for name in ("osqp", "piqp"):
         sent = pickle.loads(pickle.dumps(solver(name, max_iter=77)))

@@ -7,7 +7,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
-from sparserob_core.brief import brief
+from sparserob_core.brief import ENTRIES, brief
 from sparserob_core.control.problem.names import UNNAMED, Names, measured_in
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
@@ -256,14 +256,20 @@ def explanation(
 
 def combination(direction: Array, names: Names, suffix: str = "", states: int | None = None) -> str:
     """``c'x`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``; the suffix stands behind every state's name. What
-    is beyond the number of ``states`` is the control's, such as ``u1(5)``."""
+    is beyond the number of ``states`` is the control's, such as ``u1(5)``. Of more than `ENTRIES` terms the largest,
+    and how many more there are."""
     last = direction.size if states is None else states
     parts: list[str] = []
-    for state in np.flatnonzero(direction):
+    terms = np.flatnonzero(direction)
+    largest = np.argsort(-np.abs(direction[terms]), kind="stable")[:ENTRIES]
+    for state in terms[np.sort(largest)]:
         size = abs(direction[state])
         sign = "-" if direction[state] < 0 else "+" if parts else ""
         name = names.state(int(state)) if state < last else names.control(int(state) - last)
         parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}{name}{suffix}")
+    left = terms.size - largest.size
+    if left:
+        parts.append(f"+ ... ({left} smaller term{'s' if left > 1 else ''})")
     return " ".join(parts) or "0"
 
 

@@ -146,6 +146,10 @@ class _Solver(Solver):
     def __init__(self, solver: Solver, origin: str) -> None:
         self._solver, self.origin = solver, origin
 
+    @property
+    def delegate(self) -> str:
+        return asked(self.origin, "delegate", lambda: self._solver.delegate, str)
+
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         claim = asked(self.origin, "solve", lambda: self._solver.solve(program, accuracy), Claim)
         if claim.status not in ("solved", "infeasible", "failed"):

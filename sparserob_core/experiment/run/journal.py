@@ -12,7 +12,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import Path, SparseRobError, dotted
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment, build
 from sparserob_core.experiment.config.load import Loaded
 from sparserob_core.experiment.config.run_config import RunConfig
 from sparserob_core.experiment.directory.adversary import FILE as ADVERSARY
@@ -25,7 +25,7 @@ from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Obs
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.solver import AUTO
+from sparserob_core.sip.solver import AUTO, whole_name
 
 
 @final
@@ -177,11 +177,12 @@ def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str,
 
 
 def _on_solver(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
-    name = loaded.config.solver.name
+    chosen = loaded.config.solver.name
+    name = whole_name(build(loaded, "solver", loaded.config.solver), chosen)
     for missed in result.unanswered:
         said = f"{name} did not answer {missed.count} of the {missed.kind} programs, {missed.by} did: {missed.reason}"
         yield from _of(loaded, ("solver",), said)
-    if name != AUTO and not result.counts.get("solver_calls"):
+    if chosen != AUTO and not result.counts.get("solver_calls"):
         yield from _of(loaded, ("solver",), f"{name} was not asked: this run came to its end without a finite program")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sparserob_core.brief import ENTRIES
 from sparserob_core.experiment.terminal.printing import output, printable
 
 KNOWN = {"lower bound", "upper bound", "relative gap"}
@@ -166,12 +167,18 @@ def _worst(worst: Mapping[str, Any], units: Mapping[str, Any], parameters: Seque
     if worst["parameter"] is not None and len(worst["parameter"]):
         values = [f"{value:.6g}" for value in worst["parameter"]]
         named = [f"{name} = {value}" for name, value in zip(parameters, values, strict=False)]
-        at += ", " + (", ".join(named) if len(named) == len(values) else f"p = ({', '.join(values)})")
+        at += ", " + (_listed(named) if len(named) == len(values) else f"p = ({_listed(values)})")
     if worst.get("initial_state") is not None:
         begun = worst["initial_state"]
         measured = zip(begun, states or [""] * len(begun), strict=True)
-        at += ", from (" + ", ".join(_measured(value, one) for value, one in measured) + ")"
+        at += f", from ({_listed([_measured(value, one) for value, one in measured])})"
     return f"{worst['violation']:.2e}{f' {unit}' if unit else ''} in {worst['constraint']}{at}"
+
+
+def _listed(values: Sequence[str]) -> str:
+    """Numbers for a row of a table; of more than `ENTRIES` the first, and how many more ``result.json`` has."""
+    some = list(values) if len(values) <= ENTRIES else [*values[:ENTRIES], f"and {len(values) - ENTRIES} more"]
+    return ", ".join(some)
 
 
 def _measured(value: float, unit: str, form: str = ".6g") -> str:

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from sparserob_core.control.constraints import flat
+from sparserob_core.control.constraints.explanation import combination
 from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.problem.names import UNNAMED
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Ellipsoid, Polytope
@@ -275,3 +277,11 @@ def test_a_bound_at_zero_has_no_sign():
     constraint = FlatConstraint("path", functionals, both, np.array([0.0, 0.0]), 0.0, HORIZON, none)
     below = constraint.explain(np.array([1.5]), 0)
     assert below.statement == "path: x1(1.5) >= 0" and "-0" not in below.bound
+
+
+def test_a_direction_in_words_has_its_largest_terms() -> None:
+    few = np.array([1.0, 0.0, -0.5, 0.1, 0.2, 0.3, 0.4])
+    assert combination(few, UNNAMED, "(5)") == "x1(5) - 0.5 x3(5) + 0.1 x4(5) + 0.2 x5(5) + 0.3 x6(5) + 0.4 x7(5)"
+    words = combination(np.append(few, 0.9), UNNAMED)
+    assert words == "x1 - 0.5 x3 + 0.2 x5 + 0.3 x6 + 0.4 x7 + 0.9 x8 + ... (1 smaller term)"
+    assert combination(np.ones(270), UNNAMED) == "x1 + x2 + x3 + x4 + x5 + x6 + ... (264 smaller terms)"

@@ -16,7 +16,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.comparison.compare import comparison_table
 from sparserob_core.experiment.margin.horizon_figure import draw_horizons
 from sparserob_core.experiment.margin.margin import margin_rows
-from sparserob_core.experiment.terminal.table import result_rows
+from sparserob_core.experiment.terminal.table import _worst, result_rows
 
 NAMES = {
     "states": ["place", "speed"],
@@ -111,6 +111,16 @@ def test_a_parameter_is_told_by_its_name(tmp_path: Path) -> None:
     file.write_text(file.read_text("utf-8").replace('"mass"', '"length"'), "utf-8")
     said = {claim.name: (claim.verdict, claim.text) for claim in sr.check(tmp_path / "run").claims}
     assert said["result.json"] == ("fails", "parameters are ['length'], not ['mass']")
+
+
+def test_of_many_numbers_a_row_of_the_table_has_the_first() -> None:
+    worst = {"violation": 0.5, "constraint": "path", "time": 1.0, "parameter": None, "initial_state": [0.0, 0.5] * 135}
+    said = _worst(worst, {"states": [], "time": "s"}, ())
+    assert said == "5.00e-01 in path at t = 1 s, from (0, 0.5, 0, 0.5, 0, 0.5, and 264 more)"
+    few = {**worst, "initial_state": None, "parameter": [0.25] * 6}
+    assert _worst(few, {}, ()).endswith("p = (0.25, 0.25, 0.25, 0.25, 0.25, 0.25)")
+    many = {**few, "parameter": [0.25] * 8}
+    assert _worst(many, {}, [f"k{i}" for i in range(8)]).endswith("k4 = 0.25, k5 = 0.25, and 2 more")
 
 
 def test_shares_of_several_channels_say_of_what_they_are(outcome: sr.Outcome) -> None:
