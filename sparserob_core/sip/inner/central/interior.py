@@ -20,13 +20,13 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.inner.central.elimination import Eliminated, Left, State, cholesky, eliminate
 from sparserob_core.sip.inner.central.layout import Block, Layout
 from sparserob_core.sip.inner.simplex.counterpart import RobustAnswer
 
 STEPS = 80  # Newton steps of one solve at most
 CORRECTIONS = 2  # of a step at most (Gondzio 1996)
 SHARE = 0.995  # of the way to the boundary
-GREATER = 1e-14  # by which a diagonal is enlarged, relative to itself
 PROXIMAL = 1e-9  # weight of the distance from the last iterate: directions that change nothing have no length
 FIRST = 0.1  # products that the method begins with, in units of the largest cost
 AROUND, ROOM = 5.0, 1.0  # slacks that it begins with: times the largest violation, at least
@@ -85,7 +85,8 @@ class Interior:
             self._extend(margin)
         first = self._limits.size
         self._h[first:] = self._layout.h - self._layout.rest - margin
-        self._floor = 0.1 * accuracy / (self._y.size + 2 * self._plus.size)
+        # half of the gap that is small enough: one that only tends to it is met by chance
+        self._floor = 0.5 * SPENT * accuracy / (self._y.size + 2 * self._plus.size)
         with np.errstate(all="ignore"):
             for _ in range(STEPS):
                 gap, lost, missed = self._residuals()
@@ -254,39 +255,21 @@ class Interior:
         self._weight = (4.0 * e * b + PROXIMAL * both) / self._both
         lean = self._lean * L.radius
         S = np.diag(np.bincount(L.part, L.radius**2 / self._both, L.parts))
-        self._factors: list[tuple[Block, Array, Array, np.ndarray]] = []
+        diagonal = PROXIMAL + L.squares @ self._weight
+        self._eliminated: list[tuple[Block, Eliminated, np.ndarray]] = []
         for group in L.groups:
-            total = np.zeros((group.parts.size, group.parts.size))
+            left = Left(group.parts.size)
             for block in group.blocks:
-                factor, X = self._eliminated(block, group.parts.size, lean)
-                total += X.T @ X
-                self._factors.append((block, factor, X, group.parts))
-            S[np.ix_(group.parts, group.parts)] += total
+                found = eliminate(block, diagonal[block.first : block.last], self._weight, lean, left)
+                self._eliminated.append((block, found, group.parts))
+            S[np.ix_(group.parts, group.parts)] += left.total()
         self._D = self._y / self._s
         W = (L.scale[:, None] * S[np.ix_(L.of, L.of)]) * L.scale
         W.reshape(-1)[:: L.of.size + 1] += 1.0 / self._D[first:]
-        self._W = _cholesky(W)
+        self._W = cholesky(W)
         self._Y, _ = lapack.dtrtrs(self._W, self._g.toarray(), lower=1)
         table = (self._plain.T @ diags_array(self._D[:first]) @ self._plain).toarray()
-        self._K = _cholesky(table + self._Y.T @ self._Y)
-
-    def _eliminated(self, block: Block, parts: int, lean: Array) -> tuple[Array, Array]:
-        """The Cholesky factor of one block, and what it makes of the coupling to the parts."""
-        from scipy.linalg import lapack
-
-        n, A = block.last - block.first, block.A
-        scaled = A * np.sqrt(self._weight[block.at])[:, None]
-        M = scaled.T @ scaled
-        M.reshape(-1)[:: n + 1] += PROXIMAL + np.bincount(block.of, block.value**2 * self._weight[block.single], n)
-        factor = _cholesky(M)
-        B = np.zeros((n, parts), order="F")
-        if block.once:
-            B[:, block.mixed] = (A * lean[block.at][:, None]).T
-        else:
-            np.add.at(B.T, block.mixed, A * lean[block.at][:, None])
-        np.add.at(B, (block.of, block.columns), block.value * lean[block.single])
-        X, _ = lapack.dtrtrs(factor, B, lower=1, overwrite_b=1)
-        return factor, X
+        self._K = cholesky(table + self._Y.T @ self._Y)
 
     def _direction(self, rows: Array, over: Array, under: Array) -> Direction:
         """The Newton direction for these changes of the products of slacks and multipliers: of ``z``, ``f``, and the
@@ -298,11 +281,11 @@ class Interior:
         pull = -self._rt + kp + km
         rhs = -self._rf - L.C.T @ (kp - km - self._lean * pull)
         kappa = np.bincount(L.part, L.radius * pull / self._both, L.parts)
-        reduced = []
-        for block, factor, X, parts in self._factors:
-            one, _ = lapack.dtrtrs(factor, rhs[block.first : block.last], lower=1)
-            reduced.append(one)
-            kappa[parts] += X.T @ one
+        states = list[State]()
+        for block, eliminated, parts in self._eliminated:
+            state, found = eliminated.forward(rhs[block.first : block.last])
+            states.append(state)
+            kappa[parts] += found
         lifted, _ = lapack.dtrtrs(self._W, self._rp[first:] + L.scale * kappa[L.of] + k[first:] / D[first:], lower=1)
         right = self._rz + self._plain.T @ (D[:first] * self._rp[:first] + k[:first]) + self._Y.T @ lifted
         dz, _ = lapack.dpotrs(self._K, -right, lower=1)
@@ -311,8 +294,8 @@ class Interior:
         dy[first:], _ = lapack.dtrtrs(self._W, self._Y @ dz + lifted, lower=1, trans=1)
         deta = self._Phi.T @ dy[first:]
         df = np.empty(self._f.size)
-        for (block, factor, X, parts), one in zip(self._factors, reduced, strict=True):
-            df[block.first : block.last], _ = lapack.dtrtrs(factor, one - X @ deta[parts], lower=1, trans=1)
+        for (block, eliminated, parts), state in zip(self._eliminated, states, strict=True):
+            df[block.first : block.last] = eliminated.back(state, deta[parts])
         da = L.C @ df
         dt = (pull - L.radius * deta[L.part]) / self._both + self._lean * da
         dplus, dminus = dt - da, dt + da
@@ -368,17 +351,3 @@ def _back(value: Array, price: Array, dvalue: Array, dprice: Array, primal: floa
     """What brings products that a longer step would make far from ``aim`` back to its neighbourhood."""
     product = (value + primal * dvalue) * (price + dual * dprice)
     return np.clip(np.clip(product, 0.1 * aim, 10.0 * aim) - product, -10.0 * aim, 10.0 * aim)
-
-
-def _cholesky(M: Array) -> Array:
-    """The lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
-    from scipy.linalg import lapack
-
-    diagonal, grown = M.reshape(-1)[:: M.shape[0] + 1], GREATER
-    while grown < 1e-6:
-        diagonal *= 1.0 + grown
-        factor, info = lapack.dpotrf(M, lower=1, clean=1)
-        if not info:
-            return np.asarray(factor)
-        grown *= 100.0
-    raise np.linalg.LinAlgError

@@ -30,7 +30,8 @@ class Block:
     """The answering variables ``first`` to ``last``; the absolute values in which one of them is (``single``, by
     number) and those in which several are: numbers ``at (k,)`` and coefficients ``A (k, n)``. Of the single ones the
     variable ``of``, counted from ``first``, and its ``value``. Where the parts of both kinds are among those of the
-    group: ``columns`` and ``mixed``; ``once``: no two of ``mixed`` are the same."""
+    group: ``columns`` and ``mixed``; ``once``: no two of ``columns`` and no two of ``mixed`` are the same; ``alone
+    (n,)``: the variables of one single absolute value at most."""
 
     first: int
     last: int
@@ -42,6 +43,7 @@ class Block:
     columns: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     mixed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     once: bool = True
+    alone: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
 
 @final
@@ -58,9 +60,10 @@ class Layout:
     """The rows that were added, taken apart.
 
     Absolute values ``j``: ``entry``, ``part``, ``radius`` and ``offset (J,)``, and ``a = C f + offset`` of the
-    answering variables ``f``, whose numbers are ``answering``. Rows: coefficients ``g (r, z)`` of the joint variables,
-    whose numbers are ``joint``; ``of (r,)`` their part, ``scale (r,)`` its weight, ``h (r,)`` their limits and
-    ``rest (r,)`` the worst case of entries that no variable enters, with ``at_rest (p, Q)`` these entries of it.
+    answering variables ``f``, whose numbers are ``answering``; ``squares (n, J)`` of what is in ``C`` where a variable
+    stands alone. Rows: coefficients ``g (r, z)`` of the joint variables, whose numbers are ``joint``; ``of (r,)`` their
+    part, ``scale (r,)`` its weight, ``h (r,)`` their limits and ``rest (r,)`` the worst case of entries that no
+    variable enters, with ``at_rest (p, Q)`` these entries of it.
     """
 
     def __init__(self, program: FiniteProgram, spread: Spread) -> None:
@@ -113,6 +116,10 @@ class Layout:
             self._partition(row, variable)
         self.C = csr_array((value, (row, self._place[variable])), shape=(self.count, self.answering.size))
         self._blocks()
+        alone = np.concatenate([block.single for block in self.blocks])
+        at = self.C.indptr[alone]
+        place = (self.C.data[at] ** 2, (self.C.indices[at], alone))
+        self.squares = csr_array(place, shape=(self.answering.size, self.count))
         self.of, self.scale, self.h = (
             np.concatenate(one) for one in ([rows[i] for rows in self._rows] for i in (1, 2, 3))
         )
@@ -190,7 +197,8 @@ class Layout:
             block.of, block.value = self.C.indices[places] - block.first, self.C.data[places]
             block.columns = np.searchsorted(parts, self.part[block.single])
             block.mixed = np.searchsorted(parts, self.part[block.at])
-            block.once = bool(np.unique(block.mixed).size == block.mixed.size)
+            block.once = all(np.unique(one).size == one.size for one in (block.columns, block.mixed))
+            block.alone = np.bincount(block.of, minlength=block.last - block.first) <= 1
         self.groups.append(Group(tuple(blocks), parts))
 
     def fits(self) -> bool:
