@@ -904,13 +904,14 @@ class VaryingMeasurable:
     ) -> Float[Array, " k"]:
         """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``; there are no parameters."""
         found = np.array(self.errors.sampled(self.command, times, directions))
-        if self.resting is None:
+        resting = self.resting
+        if resting is None:
             return found
         several = max(1, AT_ONCE // self.response.numbers(0))
         for first in range(0, times.size, several):
             part = slice(first, first + several)
             weights = self.response.weights(times[part], directions[part], parameters[part])
-            found[part] += self.resting.support(weights.disturbance)
+            found[part] += resting.support(weights.disturbance)
         return found
 
     @cached_property
