@@ -23,6 +23,7 @@ from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
 from sparserob_core.sip.inner.central.elimination import Eliminated, Left, State, cholesky, eliminate
 from sparserob_core.sip.inner.central.layout import Block, Layout
 from sparserob_core.sip.inner.simplex.counterpart import RobustAnswer
+from sparserob_core.workers import one_thread
 
 STEPS = 80  # Newton steps of one solve at most
 CORRECTIONS = 2  # of a step at most (Gondzio 1996)
@@ -87,7 +88,7 @@ class Interior:
         self._h[first:] = self._layout.h - self._layout.rest - margin
         # half of the gap that is small enough: one that only tends to it is met by chance
         self._floor = 0.5 * SPENT * accuracy / (self._y.size + 2 * self._plus.size)
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), one_thread():  # threads for thousands of small matrices wait for each other
             for _ in range(STEPS):
                 gap, lost, missed = self._residuals()
                 close = gap + lost <= accuracy or gap <= SPENT * accuracy

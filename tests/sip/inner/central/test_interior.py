@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
@@ -176,3 +177,19 @@ def test_a_policy_found_in_the_middle_is_certified_and_checked(
     assert value <= outcome.result.lower_bound * (1 + 1e-9)
     assert outcome.result.cost == pytest.approx(value, rel=6e-6)
     assert check(outcome.directory).status == "verified"
+
+
+def test_linear_algebra_has_one_thread_while_it_solves(monkeypatch: pytest.MonkeyPatch) -> None:
+    central, rng, threads = Interior(program(), spread()), np.random.default_rng(0), list[int]()
+    for block in [answering(k, k) for k in range(EACH)] + [rows(rng, 2.0) for _ in range(6)]:
+        central.add(block)
+    step = Interior._step
+
+    def counted(self: Interior) -> bool:
+        threads.extend(one["num_threads"] for one in threadpool_info())
+        return step(self)
+
+    monkeypatch.setattr(Interior, "_step", counted)
+    with threadpool_limits(limits=2):
+        assert central.solve(0.0, 1e-9).solved
+    assert threads and set(threads) == {1}
