@@ -33,7 +33,7 @@ STRAIGHT: Problem = {
 HORIZON, PIECES = 2.0, 6
 CART: Problem = {  # pushed through (0.1 t, cos(3 t)), from a middle that is not 0
     "name": "linear",
-    "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "E": [["0.1*t", 0], ["cos(3*t)", 0.5]]},
+    "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "c": [0, 0.1], "E": [["0.1*t", 0], ["cos(3*t)", 0.5]]},
     "horizon": HORIZON,
     "initial_state": [-1.0, 0.5],
     "control": {"box": 2.0},
@@ -103,7 +103,7 @@ def independent() -> float:
             entering = np.stack([0.1 * s * row[0] + np.cos(3 * s) * row[1], 0.5 * row[1]])
             moved = float(middle @ np.where(past, entering, 0.0).sum(axis=1)) * step
             spread = float(half @ np.abs(np.where(past, entering, 0.0)).sum(axis=1)) * step
-            free = c[0] * (-1.0 + 0.5 * t) + 0.5 * c[1]
+            free = c[0] * (-1.0 + 0.5 * t + 0.05 * t**2) + c[1] * (0.5 + 0.1 * t)
             for sign in (1.0, -1.0):
                 rows.append(np.concatenate([sign * gain, -sign * gain]))
                 limits.append(wall - spread - sign * (free + moved))
@@ -136,7 +136,7 @@ def test_the_worst_signal_attains_what_is_claimed_and_reaches_the_wall(finished:
             u = float(control[0, min(int((begin + end) / 2 / HORIZON * PIECES), PIECES - 1)])
 
             def slope(t: float, x: np.ndarray, u: float = u, w: np.ndarray = w) -> list[float]:
-                return [x[1] + 0.1 * t * w[0], u + np.cos(3 * t) * w[0] + 0.5 * w[1]]
+                return [x[1] + 0.1 * t * w[0], 0.1 + u + np.cos(3 * t) * w[0] + 0.5 * w[1]]
 
             if begin < time:
                 state = solve_ivp(slope, (begin, min(end, time)), state, rtol=1e-11, atol=1e-12).y[:, -1]

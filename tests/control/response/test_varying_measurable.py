@@ -25,6 +25,7 @@ BOX = sr.Box([-0.1, 0.02], [0.1, 0.05])
 A, B, E = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.2], [1.0]]), np.array([[0.1, 1.0], [1.0, -0.7]])
 MATHIEU = [[0, 1], ["-(1.5 - 0.8*cos(2*t))", -0.1]], [["t"], [1]], [["0.2*sin(t)", 0], [1, "-0.7 + t/4"]]
 WILD = [["-t", 2], [-1, "t"]], [[0], [1]], [["t^2", 0], ["cos(9*t)", 1]]
+ALONE = [[0, 1], ["-1 + 0*t", 0]], [[0], [0]], [["1 + t", 0], [1, "cos(3*t)"]]  # which no control enters
 H = np.array([[1.0, -0.4], [0.3, 1.0], [-1.0, -0.2]])
 NONE = np.zeros(0)
 
@@ -94,7 +95,11 @@ def test_the_worst_signal_attains_it() -> None:
         assert attained == pytest.approx(values(support(), np.array([time]), H[:1])[0, 0], abs=1e-13)
 
 
-@pytest.mark.parametrize("plant", [MATHIEU, pytest.param(WILD, marks=pytest.mark.slow)], ids=["mathieu", "wild"])
+@pytest.mark.parametrize(
+    "plant",
+    [ALONE, *(pytest.param(one, marks=pytest.mark.slow) for one in (MATHIEU, WILD))],
+    ids=["alone", "mathieu", "wild"],
+)
 def test_it_is_nowhere_above_its_chord_by_more_than_is_said_and_hardly_less(plant: tuple[list, list, list]) -> None:
     found, share, ratios = support(plant), np.linspace(0.0, 1.0, 25), []
     motion = found.errors.motion
