@@ -15,6 +15,7 @@ from sparserob_core.control.response.measurable import Execution, VaryingExecuti
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 from sparserob_core.sip.convex_set import Array
+from tests.support.enclosed import assert_bounded_on_cells
 
 HORIZON, PIECES = 3.0, 6
 SHARES = np.array([0.1, 0.03])
@@ -228,15 +229,4 @@ def test_the_bound_of_a_constraint_holds_on_every_cell_and_closes() -> None:
     one = model(VaryingSystem.of(*MATHIEU, HORIZON)).constraints[0]
     assert isinstance(one, FlatConstraint)
     x = np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()])
-    lower, upper = one.cells
-    for halvings in range(3):
-        bounds = one.enclosure(x, lower, upper).bounds
-        for low, high, bound in zip(lower[:, 0], upper[:, 0], bounds, strict=True):
-            highest = one.at(x, np.linspace(low, high, 5)[:, None]).max()
-            assert highest <= bound + 1e-12
-            assert bound <= highest + 0.03 or halvings < 2
-        middle = (lower + upper) / 2
-        lower, upper = np.vstack([lower, middle]), np.vstack([middle, upper])
-    indices = np.array([[0.4], [0.9], [1.7], [3.0]])
-    G, h = one.rows(indices)
-    np.testing.assert_allclose(G @ x - h, one.at(x, indices), atol=1e-13)
+    assert_bounded_on_cells(one, x)

@@ -1,0 +1,25 @@
+"""What holds of the bounds on cells of a flat constraint in time, whatever pushes it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.sip.convex_set import Array
+
+
+def assert_bounded_on_cells(one: FlatConstraint, x: Array) -> None:
+    """No violation at a decision is above the bound of its cell, bounds close as cells are halved, and rows at single
+    times say the same violations."""
+    lower, upper = one.cells
+    for halvings in range(3):
+        bounds = one.enclosure(x, lower, upper).bounds
+        for low, high, bound in zip(lower[:, 0], upper[:, 0], bounds, strict=True):
+            highest = one.at(x, np.linspace(low, high, 5)[:, None]).max()
+            assert highest <= bound + 1e-12
+            assert bound <= highest + 0.03 or halvings < 2
+        middle = (lower + upper) / 2
+        lower, upper = np.vstack([lower, middle]), np.vstack([middle, upper])
+    indices = np.array([[0.4], [0.9], [1.7], [3.0]])
+    G, h = one.rows(indices)
+    np.testing.assert_allclose(G @ x - h, one.at(x, indices), atol=1e-13)
