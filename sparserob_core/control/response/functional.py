@@ -336,27 +336,16 @@ class WorstCase:
         found: list[Support] = []
         model, measurable = self.disturbance, self.measurable
         by_block = None if model is None else model.on_blocks
-        if isinstance(lifted, VaryingMotion):
-            from sparserob_core.control.response.measurable import VaryingMeasurable
-
-            found += [] if by_block is None else [VaryingSupport.of_disturbance(lifted, by_block, rows, joined)]
-            if isinstance(measurable, VaryingMeasurable):
-                if joined is not None:
-                    raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
-                found += measurable.over(H, lifted)
-            found += [] if self.initial is None else [VaryingSupport.of_initial(lifted, self.initial, rows, joined)]
-            return Supports(tuple(found)) if found else None
-        if by_block is not None:
-            found.append(DisturbanceSupport(lifted, by_block, rows, joined))
         if measurable is not None:
-            if lifted.space.nu or joined is not None:
+            if joined is not None or (isinstance(lifted, LiftedSystem) and lifted.space.nu):
                 raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
-            from sparserob_core.control.response.measurable import MeasurableCellSupport, MeasurableSupport
-
-            assert isinstance(measurable, MeasurableSupport)
-            found.append(MeasurableCellSupport(measurable, H, lifted))
-        if self.initial is not None:
-            found.append(InitialSupport(lifted, self.initial, rows, joined))
+            found += measurable.over(H, lifted)
+        if isinstance(lifted, VaryingMotion):
+            found += [] if by_block is None else [VaryingSupport.of_disturbance(lifted, by_block, rows, joined)]
+            found += [] if self.initial is None else [VaryingSupport.of_initial(lifted, self.initial, rows, joined)]
+        else:
+            found += [] if by_block is None else [DisturbanceSupport(lifted, by_block, rows, joined)]
+            found += [] if self.initial is None else [InitialSupport(lifted, self.initial, rows, joined)]
         return Supports(tuple(found)) if found else None
 
     @shaped

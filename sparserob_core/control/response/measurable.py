@@ -127,6 +127,15 @@ class MeasurableSupport:
             result[here] = self._at(times[here], directions[here], parameter, self.is_enclosed).mean(axis=1)
         return result
 
+    def over(self, rows: Array, leg: LiftedSystem | VaryingMotion) -> list[Support]:
+        """What it adds to functionals ``rows (r, d)`` over cells of time, in parts that add up."""
+        assert isinstance(leg, LiftedSystem)
+        return [MeasurableCellSupport(self, rows, leg)]
+
+    def integrated_sizes(self, times: Array, directions: Array) -> Array:
+        """The numbers ``(k,)`` that are added up to integrals beside what enters by pieces: none."""
+        return np.zeros(times.size)
+
     @property
     def is_enclosed(self) -> bool:
         """Whether `enclosed` is close: the set is flat."""
@@ -942,12 +951,17 @@ class VaryingMeasurable:
         point, pieces = Box(self.middle, self.middle), np.arange(self.response.grid.pieces)
         return DisturbanceModel("piecewise_constant", point, point, self.response.grid, starts=pieces)
 
-    def over(self, rows: Array, motion: VaryingMotion) -> list[Support]:
-        """What it adds to functionals ``rows (r, d)`` over cells of time, in parts that add up."""
-        found: list[Support] = [self.errors.over(self.command, rows, motion)]
+    def over(self, rows: Array, leg: LiftedSystem | VaryingMotion) -> list[Support]:
+        """`MeasurableSupport.over`."""
+        assert isinstance(leg, VaryingMotion)
+        found: list[Support] = [self.errors.over(self.command, rows, leg)]
         if self.resting is not None:
-            found.append(VaryingSupport.of_disturbance(motion, self.resting, rows, None))
+            found.append(VaryingSupport.of_disturbance(leg, self.resting, rows, None))
         return found
+
+    def integrated_sizes(self, times: Array, directions: Array) -> Array:
+        """`MeasurableSupport.integrated_sizes`: integrals of absolute values."""
+        return np.asarray(self.errors.lengths(times, directions).sum(axis=1))
 
 
 def measurable_support(response: Response, bound: ConvexSet) -> MeasurableSupport | VaryingMeasurable:

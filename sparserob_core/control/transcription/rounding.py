@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.control.response.measurable import VaryingMeasurable
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
@@ -85,9 +84,7 @@ def _disturbing(model: Transcription, on_noise: Array, times: Array, directions:
         return np.zeros(times.size)
     sizes: Array = (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
     measurable = model.functionals.measurable
-    if isinstance(measurable, VaryingMeasurable):  # of these, integrals of absolute values
-        sizes += measurable.errors.lengths(times, directions).sum(axis=1)
-    return sizes
+    return sizes if measurable is None else sizes + measurable.integrated_sizes(times, directions)
 
 
 def _quadratic(model: Transcription, result: Result) -> float:

@@ -226,12 +226,12 @@ def _searched(
 
 def _at_interrupt(g: TupleValue, ledger: Ledger, point: Array, value: float, epsilon: float) -> None:
     """Leave the optimiser of the best tuple with the ledger, proven or backed off if that takes no more than a moment,
-    in which another interrupt ends it."""
+    in which nothing is told and another interrupt ends it."""
     ledger.relaxed.deadline = Deadline()  # one last program
     if np.isfinite(value) and np.isfinite(g.at(point)):
         answer, grace = Answer(g.solution, g.rows(), epsilon, value), Deadline(GRACE)
         ledger.keep(answer)
-        tools, ledger.relaxed.deadline = replace(ledger.tools, deadline=grace), grace
+        tools, ledger.relaxed.deadline = replace(ledger.tools, deadline=grace, notify=ignore), grace
         with suppress(KeyboardInterrupt), grace.enforced():
             _secured(ledger, answer, separate(ledger.program, answer.solution.x, tools), tools)
     ledger.relaxed.deadline = ledger.tools.deadline
