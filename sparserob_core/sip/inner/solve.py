@@ -37,7 +37,7 @@ from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers,
 from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
 from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
-from sparserob_core.sip.inner.vertex import many, sifted
+from sparserob_core.sip.inner.vertex import many, sifted, simplex
 from sparserob_core.sip.solver import Asked, Claim, QuadraticProgram, Solver
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
@@ -50,6 +50,9 @@ DIRECTIONS, PATIENCE = 60, 12
 # From a gap of this share of the value, and again from such a share of that gap, Newton's method is tried for so many
 # steps, on blocks whose norm is more than this share of the largest.
 NEARLY, NEWTON, SMALLEST = 0.03, 6, 1e-7
+# Steps of the simplex method for each row and variable, at most, where another method lacks digits: an ordinary program
+# takes one to three. With a third of them some are given up; ten times as many take longer than what they replace.
+TURNS = 10
 CRUDE = 1e-6  # a residual of an answer whose gap says something
 
 ADVICE = "try another solver, or state the problem in units in which its numbers are of one size"
@@ -259,7 +262,7 @@ def _tried(case: _Case) -> FiniteSolution:
             if believed is not None:
                 return believed
         if (form, factor) == attempts[0] and proof is None:
-            believed = _more_digits(case, claim)
+            believed = _at_a_vertex(case) or _more_digits(case, claim)
             if believed is not None:
                 return believed
         if case.blunt is not None:
@@ -269,6 +272,26 @@ def _tried(case: _Case) -> FiniteSolution:
         if proof is not None:
             return proof
     return _failed(case)
+
+
+def _at_a_vertex(case: _Case) -> FiniteSolution | None:
+    """The answer of the simplex method to a linear program, if it is believed and sharp: where an interior-point method
+    lacks digits, as with rows that are nearly parallel, a vertex is a system of equations. Nothing where a solver was
+    named."""
+    program = case.program
+    if HIGHS not in case.solver.quick or program.P is not None or program.blocks is not None:
+        return None
+    corner = simplex(program, TURNS * (program.n + program.h.size + program.b.size))
+    if corner.status != "optimal":
+        return None
+    offers = [(corner.y, corner.mu)]
+    if program.S is None:
+        offers.append(vertex_multipliers(program, corner.x, corner.y, corner.mu))
+    for y, mu in offers:
+        believed = case.judge(measure(program, corner.x, y, mu, corner.z, message="simplex method"), "a vertex", HIGHS)
+        if believed is not None:
+            return believed
+    return None
 
 
 def _more_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:

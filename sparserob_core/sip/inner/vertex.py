@@ -106,8 +106,8 @@ def _on(program: FiniteProgram, near: np.ndarray, far: Array) -> FiniteProgram:
     )
 
 
-def simplex(program: FiniteProgram) -> Corner:
-    """The program without its quadratic cost, by the dual simplex method of HiGHS."""
+def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
+    """The program without its quadratic cost, by the dual simplex method of HiGHS, in at most so many ``turns``."""
     from scipy.optimize import linprog
 
     n, k, r = program.n, program.weights.size, program.h.size
@@ -120,7 +120,8 @@ def simplex(program: FiniteProgram) -> Corner:
         b_eq=columns["right"],
         bounds=columns["bounds"],
         method="highs-ds",
-        options={"primal_feasibility_tolerance": ACCURACY, "dual_feasibility_tolerance": ACCURACY},
+        options={"primal_feasibility_tolerance": ACCURACY, "dual_feasibility_tolerance": ACCURACY}
+        | ({} if turns is None else {"maxiter": turns}),
     )
     if found.status != 0 or found.x is None:
         none = np.zeros(0)

@@ -7,10 +7,13 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+import sparserob_core as sr
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner import vertex as module
 from sparserob_core.sip.inner.duality import dual_bound
+from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.inner.vertex import sifted, simplex
+from sparserob_core.sip.solver import named
 
 
 def program(rng: np.random.Generator, number: int) -> FiniteProgram:
@@ -46,3 +49,41 @@ def test_few_entries_give_the_same_optimum_as_all_of_them(number: int) -> None:
     assert np.count_nonzero((found.x != 0.0) & (found.x > made.lower) & (found.x < made.upper)) <= (
         made.h.size + made.b.size
     )
+
+
+def resting(pieces: int, instants: int, largest: float) -> FiniteProgram:
+    """Keep an oscillator, pushed by ``1.5 cos t + t/3``, as near to 0 as a control of at most ``largest`` can: rows of
+    instants next to each other are nearly parallel."""
+    ends, t = np.linspace(0.0, 2.0 * np.pi, pieces + 1), np.linspace(1.0, 2.0 * np.pi, instants)
+    G = np.diff(np.cos(t[:, np.newaxis] - np.minimum(ends, t[:, np.newaxis])), axis=1)
+    push, one = 1.5 * np.cos(t) + t / 3.0, np.ones((instants, 1))
+    return FiniteProgram(
+        q=np.eye(pieces + 1)[pieces],
+        weights=np.zeros(pieces + 1),
+        lower=np.append(np.full(pieces, -largest), -1e4),
+        upper=np.append(np.full(pieces, largest), 1e4),
+        G=np.block([[G, -one], [-G, -one]]),
+        h=np.concatenate([-push, push]),
+        A=np.zeros((0, pieces + 1)),
+        b=np.zeros(0),
+    )
+
+
+def test_a_linear_program_for_which_digits_lack_is_answered_at_a_vertex() -> None:
+    asked = sr.load_registry().build("solver", "piqp")
+    given = resting(40, 60, 10.0)
+    found = solve_finite(given, asked)
+    assert (found.status, found.by) == ("optimal", "highs")
+    assert found.residual <= 1e-14  # seen: 5e-16, and 1e-10 from what has more digits
+    assert any("PIQP" in said for said in found.attempts)  # who was asked first
+
+
+def test_no_vertex_is_sought_where_a_solver_was_named() -> None:
+    registry = sr.load_registry()
+    piqp = registry.build("solver", "piqp")
+    found = solve_finite(resting(40, 60, 10.0), named(piqp, "piqp", registry.build("solver", "auto")))
+    assert (found.status, found.by) == ("optimal", "piqp")
+
+
+def test_the_simplex_method_gives_up_after_so_many_turns() -> None:
+    assert simplex(resting(40, 60, 10.0), 3).status == "failed"
