@@ -107,9 +107,18 @@ def _on(program: FiniteProgram, near: np.ndarray, far: Array) -> FiniteProgram:
 
 
 def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
-    """The program without its quadratic cost, by the dual simplex method of HiGHS, in at most so many ``turns``."""
+    """The program without its quadratic cost, by the dual simplex method of HiGHS, in at most so many ``turns``. Rows
+    whose right-hand side is infinite ask for nothing."""
     from scipy.optimize import linprog
 
+    asks = program.h < np.inf
+    if not asks.all():
+        found = simplex(replace(program, G=program.G[asks], h=program.h[asks]), turns)
+        if found.status != "optimal":
+            return found
+        y = np.zeros(program.h.size)
+        y[asks] = found.y
+        return replace(found, y=y)
     n, k, r = program.n, program.weights.size, program.h.size
     columns = _separable(program) if program.S is None else _images(program)
     found = linprog(

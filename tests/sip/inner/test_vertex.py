@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -83,6 +84,14 @@ def test_no_vertex_is_sought_where_a_solver_was_named() -> None:
     piqp = registry.build("solver", "piqp")
     found = solve_finite(resting(40, 60, 10.0), named(piqp, "piqp", registry.build("solver", "auto")))
     assert (found.status, found.by) == ("optimal", "piqp")
+
+
+def test_rows_that_ask_for_nothing_have_no_multiplier() -> None:
+    given = resting(8, 12, 2.0)
+    h, r = np.append(given.h, np.inf), given.h.size
+    found = simplex(replace(given, G=np.vstack([given.G, np.ones(given.n)]), h=h))
+    assert found.status == "optimal" and found.y.size == r + 1 and found.y[r] == 0.0
+    assert given.objective(found.x) == pytest.approx(given.objective(simplex(given).x), abs=1e-12)
 
 
 def test_the_simplex_method_gives_up_after_so_many_turns() -> None:
