@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.explanation import Source, TimedExplanation, of_gauge
 from sparserob_core.control.constraints.local_maxima import climb
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.units import Units
 from sparserob_core.control.sets.directions import across, on_surface, sampled, unit
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
@@ -101,7 +102,7 @@ def before(problem: OptimalControlProblem) -> Array | None:
 
 
 @dataclass(frozen=True, eq=False)
-class ControlConstraint:
+class ControlConstraint(Source):
     """What the control does at ``places`` in a curved set. The index is ``(t, z)`` with ``z`` in ``[-1, 1]^m`` a
     direction, not normalised.
 
@@ -144,6 +145,10 @@ class ControlConstraint:
         G = np.einsum("kc,kn->kcn", directions, self.values[:, places].toarray().T).reshape(indices.shape[0], 1, -1)
         G = np.pad(G, ((0, 0), (0, 0), (0, self.beside)))
         return G, (self.set.support(directions) - (directions * self.places.offset[places]).sum(axis=1))[:, None]
+
+    def normals_in(self, units: Units) -> tuple[Array, Array]:
+        """That of a gauge."""
+        return of_gauge()
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
         """The derivative ``(k, 1 + m)`` of ``row x - rhs`` in the index: 0 in time, since the control is constant on

@@ -7,10 +7,11 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.explanation import Source, TimedExplanation
 from sparserob_core.control.constraints.feedback import not_linear, told
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
 from sparserob_core.control.feedback.effort import Effort, largest_effort
+from sparserob_core.control.problem.units import Units
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
@@ -18,7 +19,7 @@ from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation,
 
 @final
 @dataclass(frozen=True, eq=False)
-class FeedbackEffort:
+class FeedbackEffort(Source):
     """``sum_k prices_k |u_k| <= c`` for every deviation, ``c`` the variable number ``bound``; ``prices (m K,)`` of the
     nominal control's entries.
 
@@ -31,6 +32,14 @@ class FeedbackEffort:
     prices: Array
     bound: int
     _known: dict[bytes, Effort] = field(default_factory=dict, repr=False)
+
+    def normals_in(self, units: Units) -> tuple[Array, Array]:
+        """Its rows are costs, whatever the deviations."""
+        return np.ones((2, 1)), np.array([units.cost])
+
+    def index_units(self, units: Units) -> Array:
+        """None: signs have no unit."""
+        return np.zeros(0)
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""

@@ -1,7 +1,9 @@
-"""One constraint of a control problem for people: what is bounded, when, and what the uncertainty does to it."""
+"""One constraint of a control problem for people: what is bounded, when, and what the uncertainty does to it; and how a
+constraint in own units is told in the user's."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, final
 
@@ -9,11 +11,31 @@ import numpy as np
 
 from sparserob_core.brief import ENTRIES, brief
 from sparserob_core.control.problem.names import UNNAMED, Names, measured_in
+from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Explanation, WorstConstraint, told_apart
 
 SAME = 1e-12  # of the largest coefficient of a combination, one that is rounding
+
+
+class Source(ABC):
+    """A constraint on states or controls, of a control that answers or of one that does not, as the source of a family:
+    the same constraint in other units has the same rows but for their factors."""
+
+    @abstractmethod
+    def normals_in(self, units: Units) -> tuple[Array, Array]:
+        """The normals of its rows, ``(r, q)``, and what one of each of their coordinates ``(q,)`` is in the user's
+        units, where its own are ``units``."""
+
+    def index_units(self, units: Units) -> Array:
+        """What one of the first coordinates of a reduced index is in the user's units; further ones have none."""
+        return np.array([units.time])
+
+
+def of_gauge() -> tuple[Array, Array]:
+    """The one row of a curved set of controls, which is in multiples of its gauge in any units."""
+    return np.ones((1, 1)), np.ones(1)
 
 
 @final

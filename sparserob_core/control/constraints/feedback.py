@@ -9,11 +9,12 @@ from typing import Protocol, final
 import numpy as np
 
 from sparserob_core.control.constraints.control import Places
-from sparserob_core.control.constraints.explanation import TimedExplanation, combination
+from sparserob_core.control.constraints.explanation import Source, TimedExplanation, combination
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop, shared
 from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.problem.units import Units
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
@@ -103,7 +104,7 @@ def indexed(constraint: Uncertain, index_set: Box, start: Array, source: object)
 
 @final
 @dataclass(frozen=True, eq=False)
-class FeedbackConstraint:
+class FeedbackConstraint(Source):
     """``H (x(t) - r(t)) + G u(t) <= h`` for all times of a window and every disturbance, with the control that it
     causes; the index is ``(t,)``, or with the deviations of the disturbance ``(t, w)``. ``flat``: the same constraint
     without feedback, which has every row of a mixed constraint twice, for both values of a control that jumps."""
@@ -122,6 +123,10 @@ class FeedbackConstraint:
     def measured(self) -> tuple[str, ...]:
         """The unit of every row, empty where it has none that is known."""
         return self.flat.measured
+
+    def normals_in(self, units: Units) -> tuple[Array, Array]:
+        """Those without feedback."""
+        return self.flat.normals_in(units)
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
@@ -350,7 +355,7 @@ def rows_at(
 
 @final
 @dataclass(frozen=True, eq=False)
-class FeedbackControl:
+class FeedbackControl(Source):
     """``H a <= h`` of what the control does at ``places`` for every disturbance: of its value on every piece, or its
     change at every step; with ``bound``, the first of the variables ``p (m, K)``, ``H u_k <= p_k`` instead. An index is
     the time of a place, or with the deviations ``(t, w)``."""
@@ -361,6 +366,10 @@ class FeedbackControl:
     H: Array
     h: Array
     bound: int | None = None
+
+    def normals_in(self, units: Units) -> tuple[Array, Array]:
+        """Its sides, and the units of controls."""
+        return self.H, units.controls
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""

@@ -16,10 +16,11 @@ import numpy as np
 
 from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.curved import STEP, CurvedConstraint
-from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.explanation import Source, TimedExplanation, of_gauge
 from sparserob_core.control.constraints.feedback import STATES, FeedbackConstraint, acting, indexed, rows_at, told
 from sparserob_core.control.constraints.local_maxima import climb, highest_at, ridden, turns
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
+from sparserob_core.control.problem.units import Units
 from sparserob_core.control.sets.directions import faces, neighbours, on_surface, sampled, unit
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.finite import UncertainRows
@@ -282,12 +283,16 @@ class FeedbackCurved(Turning):
 
 @final
 @dataclass(frozen=True, eq=False)
-class FeedbackCurvedControl(Turning):
+class FeedbackCurvedControl(Turning, Source):
     """What the control does at ``places``, on every piece or at every step, in a curved set for every disturbance."""
 
     convex: ConvexSet
     called: str
     places: Places
+
+    def normals_in(self, units: Units) -> tuple[Array, Array]:
+        """That of a gauge."""
+        return of_gauge()
 
     @property
     def name(self) -> str:

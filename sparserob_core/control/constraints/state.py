@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import Source
 from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
@@ -15,7 +17,7 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
 
-class StateConstraint(ABC):
+class StateConstraint(Source):
     """``c'(x(t) - r(t)) + g'u(t) <= h(c)`` for all ``t`` in ``[start, stop]``, parameters and disturbances, and for the
     normals ``c`` of a convex set, ``r`` its ``reference`` where it moves; ``g = 0`` but for mixed constraints. A
     terminal constraint is the window ``[T, T]``.
@@ -134,6 +136,15 @@ class StateConstraint(ABC):
         ``(r, d + m)``."""
         directions, gains = self.functionals_at(index[None])[1], self.gains
         return directions if gains is None else np.hstack([directions, gains])
+
+    def normals_in(self, units: Units) -> tuple[Array, Array]:
+        """Those of any index, and the units of states, and of controls where they are mixed."""
+        coordinates = units.states if self.gains is None else np.concatenate([units.states, units.controls])
+        return self.normals_at(self.index_set.lower), coordinates
+
+    def index_units(self, units: Units) -> Array:
+        """Those of a time and a parameter."""
+        return np.concatenate([[units.time], units.parameters])
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -30,6 +30,13 @@ def power_of_two(sizes: Array) -> Array:
     return np.where(usable, np.ldexp(1.0, exponent - lower), 1.0)
 
 
+def ratios(theirs: Array, ours: Array, units: Array) -> Array:
+    """The powers of two ``(r,)`` that rows ``theirs (r, d)`` are of ``ours``, in coordinates with ``units (d,)``."""
+    largest = np.abs(ours).argmax(axis=1)[:, None]
+    shares = np.take_along_axis(theirs * units, largest, axis=1) / np.take_along_axis(ours, largest, axis=1)
+    return np.asarray(np.exp2(np.rint(np.log2(shares[:, 0]))))
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Units:

@@ -13,7 +13,6 @@ from sparserob_core.control.constraints.effort import FeedbackEffort
 from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
 from sparserob_core.control.constraints.flat import FlatConstraint
-from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
 from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
@@ -30,10 +29,11 @@ from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.objective import objective
 from sparserob_core.control.transcription.own_units import extent, reaches, units_of_sides
 from sparserob_core.control.transcription.record import Feedback, Transcription
+from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread
-from sparserob_core.sip.program import ConstraintFamily, OwnUnits, SemiInfiniteProgram
+from sparserob_core.sip.program import OwnUnits, SemiInfiniteProgram
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
 EQUALS = "equals"  # the name of that of the terminal equalities
@@ -84,10 +84,8 @@ def with_feedback(
 
     charge = policy.charge
     mine, theirs = in_users(model, charge), in_own(own, charge)
-    told = [
-        _told_by(family, other, units, deviations, own)
-        for family, other in zip(theirs[0].families, mine[0].families, strict=True)
-    ]
+    telling = Telling(units, deviations=deviations)
+    told = [telling.family(family, other) for family, other in zip(theirs[0].families, mine[0].families, strict=True)]
     scaled_program = replace(theirs[0], families=told, cost_unit=units.cost)
     decision = np.concatenate(
         [
@@ -304,51 +302,8 @@ def _begins_anew(model: Transcription) -> bool:
     return problem.control_step is not None and bool(problem.repeat) and problem.initial_set is not None
 
 
-def _told_by(
-    family: ConstraintFamily, theirs: ConstraintFamily, units: Units, deviations: Array, own: Transcription
-) -> ConstraintFamily:
-    """A family in own units, in both of its forms, that is explained as the user's is."""
-    literal, other = family.literal, theirs.literal
-    assert literal is not None and other is not None
-    index: Array = np.append(units.time, np.ones(family.index_set.dimension - 1))  # directions are the same
-    if isinstance(family.source, FeedbackEffort):
-        index = np.ones(family.index_set.dimension)
-        rows: Array | None = np.full(2, units.cost)
-    elif isinstance(family.source, StateConstraint):
-        rows = own.family(family.source).row_units
-    elif isinstance(family.source, FeedbackConstraint) and isinstance(theirs.source, FeedbackConstraint):
-        rows = _shares(family.source.flat.H, theirs.source.flat.H * units.states)
-    elif isinstance(family.source, FeedbackCurvedControl):
-        rows = np.ones(1)
-    else:
-        mine, others = family.source, theirs.source
-        assert isinstance(mine, FeedbackControl) and isinstance(others, FeedbackControl)
-        rows = _shares(mine.H, others.H * units.controls)
-
-    def told(one: ConstraintFamily, scale: Array) -> ConstraintFamily:
-        said = other.explain
-        assert said is not None
-        return replace(
-            one,
-            explain=lambda index, row: said(index * scale, row),
-            row_units=rows,
-            index_units=scale,
-            measured=other.measured,
-            along=other.along,
-        )
-
-    reduced = told(family, index)
-    return replace(reduced, literal=replace(told(literal, np.concatenate([index, deviations])), reduced=reduced))
-
-
 def _divided(problem: OptimalControlProblem, H: Array, h: Array, step: ConvexSet) -> tuple[Array, Array]:
     """The sides ``H a <= h`` of the control's steps, every row divided by its own unit."""
     far = 2.0 * np.abs(H) @ extent(problem.control)
     unit = units_of_sides(H, h, np.minimum(step.reach(H), far), far)
     return H / unit[:, None], h / unit
-
-
-def _shares(mine: Array, theirs: Array) -> Array:
-    """What every row ``(r,)`` of one is of the other's, at its largest entry."""
-    at = np.abs(mine).argmax(axis=1)[:, None]
-    return np.asarray((np.take_along_axis(theirs, at, axis=1) / np.take_along_axis(mine, at, axis=1))[:, 0])

@@ -24,7 +24,7 @@ from sparserob_core.control.problem.problem import (
 )
 from sparserob_core.control.problem.representable import require_representable
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.problem.units import Units, power_of_two
+from sparserob_core.control.problem.units import Units, power_of_two, ratios
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -46,6 +46,7 @@ from sparserob_core.control.transcription.own_units import (
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import RowUnits, Transcription
 from sparserob_core.control.transcription.steps import Steps, paired, refuse_without_steps
+from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, OwnUnits, SemiInfiniteProgram
@@ -270,11 +271,10 @@ def _scaled(model: Transcription, shares: Array) -> tuple[Transcription, Units]:
     scaled = units.of_problem(problem)
     far = scaled.control if ranged is problem else units.of_problem(ranged).control
     own = _assembled(scaled, control, disturbance, model.formulation, own=far)
+    disturbed = own.functionals.disturbance
+    telling = Telling(units, blocks=np.zeros(0) if disturbed is None else _block_units(disturbed, units))
     families = [
-        _told_by(family, theirs, row, units, own)
-        for family, theirs, row in zip(
-            own.program.families, model.program.families, _rows_in_users(model, own, units), strict=True
-        )
+        telling.family(one, theirs) for one, theirs in zip(own.program.families, model.program.families, strict=True)
     ]
     return replace(own, program=replace(own.program, families=families, cost_unit=units.cost)), units
 
@@ -296,10 +296,10 @@ def _in_own_units(model: Transcription, wide: bool = False) -> OwnUnits:
     rows = own.rows
     assert rows is not None
     theirs, ours = slanted(model.problem.control)[0], slanted(own.problem.control)[0]
-    sides = _ratio(theirs, ours / rows.sides[:, None], units.controls)
+    sides = ratios(theirs, ours / rows.sides[:, None], units.controls)
     steps, mine = Steps.of(model.problem, model.control), Steps.of(own.problem, own.control).divided(rows.steps)
     pieces = np.repeat(np.concatenate([units.controls, sides]), own.control.pieces)
-    image = np.concatenate([pieces, np.repeat(_ratio(steps.H, mine.H, units.controls), steps.times.size)])
+    image = np.concatenate([pieces, np.repeat(ratios(steps.H, mine.H, units.controls), steps.times.size)])
     decision = np.repeat(units.controls, own.control.functions)
     if own.functionals.execution is not None:
         sizes = np.repeat(units.controls, own.control.pieces)
@@ -344,74 +344,7 @@ def _step_units(problem: OptimalControlProblem) -> Array:
 def _shares(one: StateConstraint, other: StateConstraint) -> Array:
     """What the rows ``(r,)`` of a constraint are of those of another one, whose directions are the same."""
     theirs, ours = (each.normals_at(each.index_set.lower) for each in (one, other))
-    largest = np.abs(ours).argmax(axis=1)[:, None]
-    shares = np.take_along_axis(theirs, largest, axis=1) / np.take_along_axis(ours, largest, axis=1)
-    return np.asarray(shares[:, 0] if one.sides is not None else shares[:1, 0])
-
-
-def _rows_in_users(model: Transcription, own: Transcription, units: Units) -> list[Array]:
-    """What a violation of 1 of every row of every family of the program in own units is in the user's: the same index,
-    whose directions are the same, gives the same rows but for their factors."""
-    found = []
-    for theirs, ours in zip(model.constraints, own.constraints, strict=True):
-        rows = [one.normals_at(one.index_set.lower) for one in (theirs, ours)]
-        mine = units.states if theirs.gains is None else np.concatenate([units.states, units.controls])
-        found.append(_ratio(rows[0], rows[1], mine))
-    return found + [np.ones(1)] * (len(own.program.families) - len(found))
-
-
-def _ratio(theirs: Array, ours: Array, units: Array) -> Array:
-    """The powers of two ``(r,)`` that rows ``theirs (r, d)`` are of ``ours``, in coordinates with ``units (d,)``."""
-    largest = np.abs(ours).argmax(axis=1)[:, None]
-    shares = np.take_along_axis(theirs * units, largest, axis=1) / np.take_along_axis(ours, largest, axis=1)
-    return np.asarray(np.exp2(np.rint(np.log2(shares[:, 0]))))
-
-
-def _told_by(
-    family: ConstraintFamily, theirs: ConstraintFamily, rows: Array, units: Units, own: Transcription
-) -> ConstraintFamily:
-    """A family in own units, in all its forms, that is explained as the user's is."""
-    uncertain, model = own.constraint(family) is not None, own.functionals.disturbance
-    parameters = units.parameters if uncertain else np.zeros(0)
-    blocks = np.zeros(0) if model is None or not uncertain else _block_units(model, units)
-    of_index = {
-        "reduced": np.concatenate([[units.time], parameters]),
-        "nominal": np.array([units.time]),
-        "literal": np.concatenate([[units.time], blocks, parameters]),
-        "sampled": np.array([units.time, 1.0]),
-    }
-
-    def told(one: ConstraintFamily, other: ConstraintFamily) -> ConstraintFamily:
-        known = of_index[one.formulation]
-        scale = np.append(known, np.ones(one.index_set.dimension - known.size))  # directions are the same
-        said, hindered = other.explain, other.hindrance
-        return replace(
-            one,
-            explain=None if said is None else (lambda index, row: said(index * scale, row)),
-            hindrance=None if hindered is None else (lambda low, high: hindered(low * scale, high * scale)),
-            row_units=rows,
-            index_units=scale,
-            measured=other.measured,
-            along=other.along,
-        )
-
-    draw = family.sample
-
-    def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
-        assert draw is not None
-        found = draw(count, rng)
-        return told(found, found if found.formulation == "sampled" else theirs)
-
-    def form(one: ConstraintFamily | None, other: ConstraintFamily | None) -> ConstraintFamily | None:
-        return None if one is None or other is None else told(one, other)
-
-    return replace(
-        told(family, theirs),
-        nominal=form(family.nominal, theirs.nominal),
-        literal=form(family.literal, theirs.literal),
-        reduced=form(family.reduced, theirs.reduced),
-        sample=None if draw is None else sample,
-    )
+    return ratios(theirs, ours, np.ones(ours.shape[1]))
 
 
 def _block_units(model: DisturbanceModel, units: Units) -> Array:
