@@ -16,7 +16,6 @@ import numpy as np
 
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.transcription.feedback import made_again
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state
 from sparserob_core.errors import InputError
@@ -56,11 +55,8 @@ class InitialPlane:
     @cached_property
     def free(self) -> InitialPlane:
         """The same plane where nothing has a price that needs variables of its own."""
-        feedback = self.model.feedback
-        if feedback is None or feedback.charge.cost == "nominal":
-            return self
-        model = made_again(self.model, replace(feedback.charge, cost="nominal", among=None))
-        return InitialPlane(model, self.states, self.centre, self.radius)
+        model = self.model.acting.free(self.model)
+        return self if model is self.model else InitialPlane(model, self.states, self.centre, self.radius)
 
     def point(self, z: Array) -> Array:
         """The two coordinates ``(..., 2)`` of the initial state."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
+from typing import final
 
 import numpy as np
 
@@ -24,125 +25,203 @@ from sparserob_core.control.problem.problem import MixedConstraint, OptimalContr
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.measurable import MISSED
-from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Equality
-from sparserob_core.control.transcription.objective import objective
-from sparserob_core.control.transcription.own_units import extent, reaches, units_of_sides
-from sparserob_core.control.transcription.record import Feedback, Transcription
+from sparserob_core.control.transcription.own_units import added_up, fixed, units_of_steps
+from sparserob_core.control.transcription.program import ranges, transcribed
+from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread
-from sparserob_core.sip.program import OwnUnits, SemiInfiniteProgram
+from sparserob_core.sip.program import Formulation
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
 EQUALS = "equals"  # the name of that of the terminal equalities
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
-def with_feedback(
-    problem: OptimalControlProblem,
-    model: Transcription,
-    own: Transcription,
-    units: Units,
-    policy: Policy,
-    mask: np.ndarray,
-    wider: Callable[[], OwnUnits] | None = None,
-) -> tuple[Transcription, Transcription]:
-    """The program of a problem under a policy that answers what ``mask (K, K)`` says, from its transcription ``model``
-    without feedback and without terminal equalities, and the same in its ``own`` ``units``: the user's and the own
-    one."""
+@final
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a control sees and answers, in one set of units: the coordinates of its ``answers``; the ``pieces`` on which
+    measurable disturbances are the deviations, and the ``observer`` of outputs, where there are such; the terminal
+    equalities, ``fixed``, as rows ``H x(T) <= h``, the second half of them the opposites of the first.
+
+    In own units ``deviations (Q,)``, what one of each is in the user's, and ``steps (r,)``, what the rows of the
+    control's steps are divided by.
+    """
+
+    answers: Answers
+    pieces: MeasurablePieces | None
+    observer: Observer | None
+    fixed: tuple[Array, Array]
+    deviations: Array | None = None
+    steps: Array | None = None
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Answering(Acting):
+    """A control that answers what it measures by a ``policy``, which answers what ``mask (K, K)`` says and is charged
+    ``charge``: its constraints, and terminal equalities, hold for every deviation that is ``seen`` or not."""
+
+    policy: Policy
+    mask: np.ndarray
+    charge: Charge
+    seen: Seen
+    first: tuple[Posed, Seen]
+    """The problem in the own units in which this was seen first, and what was seen there."""
+    formulation: Formulation = "reduced"
+
+    def in_own(self, theirs: Posed, own: Posed, units: Units) -> Answering:
+        """With what is seen in own units."""
+        seen = self.first[1] if own is self.first[0] else _seen(self.mask, theirs, own, units)[0]
+        return replace(self, seen=seen)
+
+    def from_state(self, model: Transcription, begun: Posed) -> Transcription:
+        """With what is seen shared."""
+        made = transcribed(begun, self)
+        named = {family.name: family for family in model.program.families}
+        families = [
+            replace(
+                one,
+                explain=told.explain,
+                row_units=told.row_units,
+                index_units=told.index_units,
+                measured=told.measured,
+                along=told.along,
+            )
+            for one, told in ((one, named.get(one.name, one)) for one in made.program.families)
+        ]
+        return replace(made, program=replace(made.program, families=families, cost_unit=model.program.cost_unit))
+
+    def free(self, model: Transcription) -> Transcription:
+        """Charged the nominal control alone."""
+        if self.charge.cost == "nominal":
+            return model
+        charge = replace(self.charge, cost="nominal", among=None)
+        return replace(replace(self, charge=charge).from_state(model, model), given=model.given)
+
+    def telling(self, own: Posed, units: Units) -> Telling:
+        """With the deviations, which a literal index holds."""
+        assert self.seen.deviations is not None
+        return Telling(units, deviations=self.seen.deviations)
+
+    def units_beside(self, own: Posed, units: Units) -> Array:
+        """Those of the gains and of what is charged."""
+        answers, deviations = self.seen.answers, self.seen.deviations
+        assert deviations is not None
+        peaks = np.repeat(units.controls, own.control.pieces)
+        charged = {"nominal": peaks[:0], "peak": peaks, "worst": np.full(1, units.cost)}[self.charge.cost]
+        return np.concatenate([units.controls[answers.channel] / deviations[answers.entry], charged])
+
+    def part(self, posed: Posed) -> Part:
+        """Families that hold for every deviation, gains, and what bounds the charge."""
+        functionals, problem, pieces = posed.functionals, posed.problem, posed.control.pieces
+        seen, known, charge = self.seen, self.seen.answers, self.charge
+        nominal, first = functionals.variables, functionals.variables + known.variables
+        size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
+        loop = ClosedLoop(
+            functionals, known, _spread(posed, seen.pieces), size, seen.pieces, seen.observer, anew=_begins_anew(posed)
+        )
+        families = [of_state(constraint, loop).family() for constraint in posed.constraints]
+        settled: list[Callable[[Array], Array]] = []
+        if seen.fixed[1].size:
+            ends = (problem.horizon, problem.horizon)
+            equal = FeedbackConstraint(
+                FlatConstraint(EQUALS, functionals, *seen.fixed, *ends, posed.parameters), loop, exact=True
+            )
+            families.append(equal.family())
+            settled.append(equal.met)
+        breakpoints = posed.control.breakpoints
+        for name, convex, places in held_at(problem, breakpoints, answering=True):
+            flat = convex.halfspaces()
+            if flat is None:
+                families.append(FeedbackCurvedControl(loop, convex, name, places).family())
+                continue
+            H, h = flat
+            if places.steps and seen.steps is not None:
+                H, h = H / seen.steps[:, None], h / seen.steps
+            families.append(FeedbackControl(name, loop, places, H, h).family())
+        axes, (low, high) = np.eye(problem.system.controls), ranges(problem.control)
+        most = (high - low)[known.channel] / loop.spread.chords[known.entry]
+        far = np.repeat(np.maximum(np.abs(low), np.abs(high)), pieces)
+        lower, upper, weights, largest = -most, most, None, None
+        prices, peak = problem.prices(breakpoints).ravel(), replace(self, charge=replace(charge, cost="peak"))
+        guide, among = None, None
+        if charge.cost == "peak":
+            both, every = np.vstack([axes, -axes]), Places.of_values(breakpoints, len(axes))
+            peaks = FeedbackControl(PEAK, loop, every, both, np.zeros(len(both)), first)
+            families.append(peaks.family())
+            settled.append(peaks.settled)
+            weights = np.concatenate([np.zeros(first), prices])
+            lower, upper = np.append(lower, np.zeros(nominal)), np.append(upper, far)
+        elif charge.cost == "worst":
+            effort = FeedbackEffort(EFFORT, loop, prices, first)
+            families.append(effort.family())
+            settled.append(effort.settled)
+            guide = (transcribed(posed, peak).program, first)
+            weights = np.append(np.zeros(first), 1.0)
+            largest = float(prices @ far)
+            lower, upper = np.append(lower, 0.0), np.append(upper, 2.0 * largest)
+        elif charge.among == "peak" and problem.cost.is_linear:
+            among = (transcribed(posed, peak).program, first)
+        return Part(
+            families=families,
+            lower=lower,
+            upper=upper,
+            weights=weights,
+            largest=largest,
+            spread=loop.spread,
+            settle=None if not settled else lambda x: reduce(lambda at, settle: settle(at), settled, x),
+            guide=guide,
+            among=among,
+            feedback=Feedback(self.policy, self.mask, charge, loop),
+        )
+
+
+def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units: Units) -> Answering:
+    """How a control acts by a policy in the user's units, from what it sees in its ``own`` ones."""
+    scaled, outputs = _seen(mask, posed, own, units)
+    assert scaled.deviations is not None
+    pieces, observer = scaled.pieces, scaled.observer
+    seen = Seen(
+        answers=_in_users(scaled.answers, outputs, scaled.deviations),
+        pieces=None if pieces is None else pieces.in_units_of(posed.functionals, units.states, units.disturbances),
+        observer=None if observer is None else observer.in_units(units.states, outputs),
+        fixed=_equal(*fixed(posed.problem)),
+    )
+    return Answering(policy, mask, policy.charge, seen, (own, scaled))
+
+
+def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Seen, Array]:
+    """What a control sees in ``own`` units, of a problem that is ``theirs`` in the user's, and what one of each of its
+    outputs is in these."""
+    problem, disturbance, begins = own.problem, own.functionals.disturbance, own.problem.initial_set is not None
     pieces = measurable_pieces(own.functionals)
     spread = _spread(own, pieces)
-    begins = own.problem.initial_set is not None
-    blocks = 0 if own.functionals.disturbance is None else own.functionals.disturbance.block_count
-    deviations = np.tile(units.disturbances[: own.problem.system.disturbances], blocks)
+    blocks = 0 if disturbance is None else disturbance.block_count
+    deviations = np.tile(units.disturbances[: problem.system.disturbances], blocks)
     deviations = deviations if pieces is None else np.ones(pieces.size)
-    seen = innovations_seen(own.response, own.control, own.functionals.disturbance, begins, pieces)
-    outputs, observed, theirs_observed, begun = units.states, None, None, units.states[: len(units.states) * begins]
-    if problem.measurements is not None and own.problem.measurements is not None:
-        outputs = problem.measurements.units(units.states)
+    seen = innovations_seen(own.response, own.control, disturbance, begins, pieces)
+    outputs, observer, begun = units.states, None, units.states[: len(units.states) * begins]
+    if problem.measurements is not None and theirs.problem.measurements is not None:
+        outputs = theirs.problem.measurements.units(units.states)
         radii = np.delete(spread.radii, np.arange(deviations.size, spread.size - begun.size))
-        observed = Observer.of(own.problem.measurements, seen, between(own.response, own.control), radii)
-        theirs_observed = observed.in_units(units.states, outputs)
-        deviations = np.append(deviations, np.tile(outputs, own.control.pieces if observed.noisy else 0))
+        observer = Observer.of(problem.measurements, seen, between(own.response, own.control), radii)
+        deviations = np.append(deviations, np.tile(outputs, own.control.pieces if observer.noisy else 0))
     anew = _begins_anew(own)
     deviations = np.concatenate([deviations, begun, *[begun] * anew])
-    seen = innovations_of(seen, begun.size, observed, anew) * (spread.chords > 0.0)  # else not answered
-    scaled = answers(seen, mask, own.problem.system.controls)
-    known = _in_users(scaled, outputs, deviations)
-
-    acting = None if pieces is None else pieces.in_units_of(model.functionals, units.states, units.disturbances)
-    fixed = _fixed(problem, own, units)
-    repeated = own.control.pieces
-
-    def in_users(one: Transcription, charge: Charge) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-        return _program(one, charge, known, (acting, theirs_observed), fixed[0], own=False)
-
-    def in_own(one: Transcription, charge: Charge) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-        return _program(one, charge, scaled, (pieces, observed), fixed[1], own=True)
-
-    charge = policy.charge
-    mine, theirs = in_users(model, charge), in_own(own, charge)
-    telling = Telling(units, deviations=deviations)
-    told = [telling.family(family, other) for family, other in zip(theirs[0].families, mine[0].families, strict=True)]
-    scaled_program = replace(theirs[0], families=told, cost_unit=units.cost)
-    decision = np.concatenate(
-        [
-            np.repeat(units.controls, repeated),
-            units.controls[scaled.channel] / deviations[scaled.entry],
-            np.full(1, units.cost) if charge.cost == "worst" else np.repeat(units.controls, repeated),
-        ]
-    )[: scaled_program.n]
-    program = mine[0].mirrored(lambda _: OwnUnits(scaled_program, decision, decision, np.zeros(0), units.cost, wider))
-    scaled_problem = units.of_problem(problem)
-    return (
-        replace(model, problem=problem, program=program, feedback=Feedback(policy, mask, charge, mine[1], in_users)),
-        replace(
-            own,
-            problem=scaled_problem,
-            program=scaled_program,
-            feedback=Feedback(policy, mask, charge, theirs[1], in_own),
-        ),
-    )
+    seen = innovations_of(seen, begun.size, observer, anew) * (spread.chords > 0.0)  # else not answered
+    known, (H, h) = answers(seen, mask, problem.system.controls), fixed(problem)
+    small = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
+    ends = _equal(H / small[:, None], h / small)
+    return Seen(known, pieces, observer, ends, deviations, _step_units(problem)), outputs
 
 
-def made_again(model: Transcription, charge: Charge) -> Transcription:
-    """The transcription with the program that belongs to its initial state, and to a policy that is charged something
-    else."""
-    assert model.feedback is not None
-    program, loop = model.feedback.made(model, charge)
-    named = {family.name: family for family in model.program.families}
-    families = [
-        replace(
-            one,
-            explain=told.explain,
-            row_units=told.row_units,
-            index_units=told.index_units,
-            measured=told.measured,
-            along=told.along,
-        )
-        for one, told in ((one, named.get(one.name, one)) for one in program.families)
-    ]
-    program = replace(program, families=families, cost_unit=model.program.cost_unit)
-    return replace(model, program=program, feedback=replace(model.feedback, charge=charge, loop=loop))
-
-
-def _fixed(
-    problem: OptimalControlProblem, own: Transcription, units: Units
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """The terminal equalities as rows ``H x(T) <= h``, the second half of them the opposites of the first: in the
-    user's units, and in own ones divided by a small part of the numbers that are added up."""
-    ends = [(state, end.values[state]) for end in problem.terminal if isinstance(end, Equality) for state in end.fixed]
-    states = np.array([state for state, _ in ends], dtype=int)
-    H, h = np.eye(problem.system.states)[states], np.array([value for _, value in ends])
-    if not h.size:
-        return (H, h), (H, h)
-    horizon, values = np.array([own.problem.horizon]), h / units.states[states]
-    _, added = reaches(own.functionals, ParameterIndex(None), own.problem.control, H, horizon)
-    small = FINER * power_of_two(np.maximum(added, np.abs(values)))
-    scaled, both = H / small[:, None], values / small
-    return (np.vstack([H, -H]), np.append(h, -h)), (np.vstack([scaled, -scaled]), np.append(both, -both))
+def _equal(H: Array, h: Array) -> tuple[Array, Array]:
+    """Equalities as twice as many rows."""
+    return np.vstack([H, -H]), np.append(h, -h)
 
 
 def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, cost: str) -> None:
@@ -207,103 +286,24 @@ def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
     return replace(own, effect=effect, gain=gain)
 
 
-def _program(
-    model: Transcription,
-    charge: Charge,
-    known: Answers,
-    acting: tuple[MeasurablePieces | None, Observer | None],
-    fixed: tuple[Array, Array],
-    own: bool,
-) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-    """The program of one transcription, in its units; ``fixed``: the rows of its terminal equalities; ``own``: whether
-    rows of steps are divided by their units."""
-    functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
-    nominal, first = functionals.variables, functionals.variables + known.variables
-    size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
-    loop = ClosedLoop(functionals, known, _spread(model, acting[0]), size, *acting, anew=_begins_anew(model))
-    families = [of_state(constraint, loop).family() for constraint in model.constraints]
-    settled: list[Callable[[Array], Array]] = []
-    if fixed[1].size:
-        ends = (problem.horizon, problem.horizon)
-        equal = FeedbackConstraint(
-            FlatConstraint(EQUALS, functionals, *fixed, *ends, model.parameters), loop, exact=True
-        )
-        families.append(equal.family())
-        settled.append(equal.met)
-    breakpoints = model.control.breakpoints
-    for name, convex, places in held_at(problem, breakpoints, answering=True):
-        flat = convex.halfspaces()
-        if flat is None:
-            families.append(FeedbackCurvedControl(loop, convex, name, places).family())
-            continue
-        H, h = _divided(problem, *flat, convex) if own and places.steps else flat
-        families.append(FeedbackControl(name, loop, places, H, h).family())
-    axes = np.eye(problem.system.controls)
-    low, high = -problem.control.support(-axes), problem.control.support(axes)
-    most = (high - low)[known.channel] / loop.spread.chords[known.entry]
-    low, high = np.repeat(low, pieces), np.repeat(high, pieces)
-    lower, upper = np.concatenate([low, -most]), np.concatenate([high, most])
-    priced = objective(problem, model.control, size, size)
-    weights, cost = np.zeros(size), priced["weights"][:nominal]
-    guide, among = None, None
-    if charge.cost == "peak":
-        both, every = np.vstack([axes, -axes]), Places.of_values(breakpoints, len(axes))
-        peaks = FeedbackControl(PEAK, loop, every, both, np.zeros(len(both)), first)
-        families.append(peaks.family())
-        settled.append(peaks.settled)
-        weights[first:] = cost
-        lower = np.concatenate([lower, np.zeros(nominal)])
-        upper = np.concatenate([upper, np.maximum(np.abs(low), np.abs(high))])
-    elif charge.cost == "worst":
-        effort = FeedbackEffort(EFFORT, loop, cost, first)
-        families.append(effort.family())
-        settled.append(effort.settled)
-        guide = (_program(model, replace(charge, cost="peak"), known, acting, fixed, own)[0], first)
-        weights[first:] = 1.0
-        lower = np.append(lower, 0.0)
-        most_effort = float(cost @ np.maximum(np.abs(low), np.abs(high)))
-        priced.setdefault("largest", most_effort)
-        upper = np.append(upper, 2.0 * most_effort)
-    else:
-        weights[:nominal] = cost
-        if charge.among == "peak" and problem.cost.is_linear:
-            peak = replace(charge, cost="peak")
-            among = (_program(model, peak, known, acting, fixed, own)[0], first)
-    priced["weights"] = weights
-    program = SemiInfiniteProgram(
-        n=size,
-        families=families,
-        **priced,
-        lower=lower,
-        upper=upper,
-        channels=problem.system.controls,
-        lengths=np.tile(model.control.lengths, problem.system.controls),
-        spread=loop.spread,
-        settle=None if not settled else lambda x: reduce(lambda at, settle: settle(at), settled, x),
-        guide=guide,
-        among=among,
-    )
-    return program, loop
-
-
-def _spread(model: Transcription, acting: MeasurablePieces | None) -> Spread:
+def _spread(posed: Posed, acting: MeasurablePieces | None) -> Spread:
     """The deviations of a problem's disturbance and of its initial state."""
-    problem, disturbance, periods = model.problem, model.functionals.disturbance, 1 + _begins_anew(model)
+    problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _begins_anew(posed)
     if acting is not None:
         return Spread((*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets), MISSED)
     blocks = 0 if disturbance is None else disturbance.block_count
     noise = None if problem.measurements is None else problem.measurements.noise
-    return deviations_of(problem.disturbance, blocks, problem.initial_set, noise, model.control.pieces, periods)
+    return deviations_of(problem.disturbance, blocks, problem.initial_set, noise, posed.control.pieces, periods)
 
 
-def _begins_anew(model: Transcription) -> bool:
+def _begins_anew(posed: Posed) -> bool:
     """Whether the initial state of the next period is seen in this one's program: by the step across the seam."""
-    problem = model.problem
+    problem = posed.problem
     return problem.control_step is not None and bool(problem.repeat) and problem.initial_set is not None
 
 
-def _divided(problem: OptimalControlProblem, H: Array, h: Array, step: ConvexSet) -> tuple[Array, Array]:
-    """The sides ``H a <= h`` of the control's steps, every row divided by its own unit."""
-    far = 2.0 * np.abs(H) @ extent(problem.control)
-    unit = units_of_sides(H, h, np.minimum(step.reach(H), far), far)
-    return H / unit[:, None], h / unit
+def _step_units(problem: OptimalControlProblem) -> Array | None:
+    """The units ``(r,)`` of the rows of the control's steps; ``None`` where these are free, or their set is curved."""
+    step = problem.control_step
+    flat = None if step is None else step.halfspaces()
+    return None if step is None or flat is None else units_of_steps(step, *flat, problem.control)

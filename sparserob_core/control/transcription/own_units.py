@@ -145,6 +145,12 @@ def units_of_sides(H: Array, h: Array, reach: Array, added: Array) -> Array:
     return power_of_two(unit) / 2.0
 
 
+def units_of_steps(step: ConvexSet, H: Array, h: Array, control: ConvexSet) -> Array:
+    """The unit ``(r,)`` of each side ``H a <= h`` of the steps of a control in its set: see `units_of_sides`."""
+    far = 2.0 * np.abs(H) @ extent(control)
+    return units_of_sides(H, h, np.minimum(step.reach(H), far), far)
+
+
 def reaches(
     functionals: WorstCase,
     parameters: ParameterIndex,
@@ -192,6 +198,25 @@ def reaches(
         sums = sums + np.abs(G) @ extent(control)
     reach = np.maximum(np.maximum(high, low), 0.0).max(axis=(0, 1))
     return reach, sums.max(axis=(0, 1))
+
+
+def fixed(problem: OptimalControlProblem) -> tuple[Array, Array]:
+    """The unit vectors ``(e, d)`` of the states that the terminal equalities fix, in the order of their rows, and the
+    values ``(e,)`` of these states."""
+    ends = [end for end in problem.terminal if isinstance(end, Equality)]
+    states = np.array([state for end in ends for state in end.fixed], dtype=int)
+    values = np.concatenate([np.zeros(0), *(end.values[end.fixed] for end in ends)])
+    return np.eye(problem.system.states)[states], values
+
+
+def added_up(problem: OptimalControlProblem, functionals: WorstCase) -> Array:
+    """The largest sums ``(e,)`` of absolute numbers from which the fixed states are computed."""
+    H, known = fixed(problem)[0], ParameterIndex(None)
+    if not H.size:
+        return np.zeros(0)
+    nominal = functionals if functionals.response.system.parameters is None else functionals.nominal()
+    _, added = reaches(nominal, known, problem.control, H, np.array([problem.horizon]))
+    return added
 
 
 def looked_at(parameters: ParameterIndex) -> Array:

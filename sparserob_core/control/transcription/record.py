@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -18,11 +19,26 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfiniteProgram
 
 if TYPE_CHECKING:
     from sparserob_core.control.feedback.closed_loop import ClosedLoop
     from sparserob_core.control.policies.policy import Charge, Policy
+    from sparserob_core.control.problem.units import Units
+    from sparserob_core.control.transcription.telling import Telling
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """How the control of a transcribed problem answers what it measures: its ``policy``, what that answers here,
+    ``answers (K, K)``, what it is charged, and the closed ``loop``."""
+
+    policy: Policy
+    answers: np.ndarray
+    charge: Charge
+    loop: ClosedLoop
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,43 +57,96 @@ class RowUnits:
         return np.where(self.entered[:, None], A, 0.0) / self.fixed[:, None], b / self.fixed
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class Feedback:
-    """How the control of a transcribed problem answers what it measures: its ``policy``, what that answers here,
-    ``answers (K, K)``, what it is charged, and the closed ``loop``.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Posed:
+    """A problem on its dictionaries, with what its state does, before it is a program.
 
-    ``made(model, charge)``: the program and the loop of another transcription of the problem, in the same units, from
-    another initial state, under a policy that answers the same and may be charged something else."""
-
-    policy: Policy
-    answers: np.ndarray
-    charge: Charge
-    loop: ClosedLoop
-    made: Callable[[Transcription, Charge], tuple[SemiInfiniteProgram, ClosedLoop]]
-
-
-@dataclass(frozen=True, eq=False)
-class Transcription:
-    """A problem on its dictionaries and the semi-infinite program that it became.
-
-    ``constraints`` are the path and terminal constraints, named and ordered as the families of the ``program``;
-    terminal equalities are not among them, they are rows of the program. ``functionals`` are what every family is built
-    from, ``formulation`` says what the indices of the families are. ``rows``: what rows were divided by, where the
-    problem is in its own units. ``given``: the problem as it was stated, with its integrals, which are states of
-    ``problem``. ``feedback``: how the control answers what it measures; the decision then begins with
-    the nominal control.
+    ``held``: the same problem with those bounds and equalities alone that are rows of the nominal decision, whatever
+    the control answers. ``constraints`` are the path and terminal constraints, named and ordered as the families of
+    the program will be; terminal equalities are not among them. ``functionals`` are what every family is built from.
+    ``rows``: what rows are divided by, in own units.
     """
 
     problem: OptimalControlProblem
+    held: OptimalControlProblem
     control: Dictionary
     disturbance: Dictionary
     functionals: WorstCase
     parameters: ParameterIndex
     constraints: tuple[StateConstraint, ...]
-    program: SemiInfiniteProgram
-    formulation: Formulation = "reduced"
     rows: RowUnits | None = None
+
+    @property
+    def response(self) -> Response:
+        """The responses of the system on the merged grid."""
+        return self.functionals.response
+
+    def became(self, acting: Acting, program: SemiInfiniteProgram, feedback: Feedback | None = None) -> Transcription:
+        """The program that it became, by a control that acts so."""
+        parts = {each.name: getattr(self, each.name) for each in fields(Posed)}
+        return Transcription(**parts, acting=acting, program=program, feedback=feedback)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Part:
+    """What a program owes to how its control acts: the ``families``, and entries of the decision beside the nominal
+    ones, with their bounds ``lower`` and ``upper (k,)``. ``weights (n,)`` are the prices where other entries than the
+    nominal ones are charged, ``largest`` is then the largest cost; the rest is as in a `SemiInfiniteProgram`."""
+
+    families: Sequence[ConstraintFamily]
+    lower: Array = field(default_factory=lambda: np.zeros(0))
+    upper: Array = field(default_factory=lambda: np.zeros(0))
+    weights: Array | None = None
+    largest: float | None = None
+    activity: Array | None = None
+    spread: Spread | None = None
+    settle: Callable[[Array], Array] | None = None
+    guide: tuple[SemiInfiniteProgram, int] | None = None
+    among: tuple[SemiInfiniteProgram, int] | None = None
+    feedback: Feedback | None = None
+
+
+class Acting(ABC):
+    """How a control acts: it answers what it measures, or nothing, which is the least of it. In one set of units."""
+
+    formulation: Formulation
+    """What the indices of the families are."""
+
+    @abstractmethod
+    def in_own(self, theirs: Posed, own: Posed, units: Units) -> Acting:
+        """The same in the problem's ``own`` units."""
+
+    @abstractmethod
+    def part(self, posed: Posed) -> Part:
+        """What the program of a posed problem in these units owes to it."""
+
+    @abstractmethod
+    def from_state(self, model: Transcription, begun: Posed) -> Transcription:
+        """The program of the same problem from another initial state, told as that of the ``model`` is."""
+
+    @abstractmethod
+    def free(self, model: Transcription) -> Transcription:
+        """The program of a ``model`` that acts so where nothing has a price that needs variables of its own."""
+
+    @abstractmethod
+    def telling(self, own: Posed, units: Units) -> Telling:
+        """How families in own units are told in the user's."""
+
+    @abstractmethod
+    def units_beside(self, own: Posed, units: Units) -> Array:
+        """What one of every entry of a decision that comes after the nominal ones is in the user's units."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Transcription(Posed):
+    """A problem on its dictionaries and the semi-infinite program that it became by how its control is ``acting``.
+
+    ``given``: the problem as it was stated, with its integrals, which are states of ``problem``. ``feedback``: how the
+    control answers what it measures; the decision then begins with the nominal control.
+    """
+
+    acting: Acting
+    program: SemiInfiniteProgram
     feedback: Feedback | None = None
     given: OptimalControlProblem | None = None
     _explained: dict[tuple[str, Formulation, int, bytes], TimedExplanation | None] = field(
@@ -108,9 +177,9 @@ class Transcription:
         return self.given or self.problem
 
     @property
-    def response(self) -> Response:
-        """The responses of the system on the merged grid."""
-        return self.functionals.response
+    def formulation(self) -> Formulation:
+        """What the indices of the families are."""
+        return self.acting.formulation
 
     @property
     def noise(self) -> ConvexSet | None:

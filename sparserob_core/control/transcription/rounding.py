@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
-from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.result import Result
 

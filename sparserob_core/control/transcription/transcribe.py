@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from functools import cache
+from typing import Literal
 
 import numpy as np
 
-from sparserob_core.control.constraints.control import ControlConstraint, held_at
 from sparserob_core.control.constraints.flat import FlatConstraint
-from sparserob_core.control.constraints.literal import LiteralConstraint
-from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import (
@@ -24,7 +21,7 @@ from sparserob_core.control.problem.problem import (
 )
 from sparserob_core.control.problem.representable import require_representable
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.problem.units import Units, power_of_two, ratios
+from sparserob_core.control.problem.units import Units, ratios
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -32,30 +29,18 @@ from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.accumulated import accumulated
-from sparserob_core.control.transcription.objective import objective, quadratics
 from sparserob_core.control.transcription.own_units import (
-    RESOLVED,
-    extent,
     own_units,
-    reaches,
     rough_units,
     row_units,
     shortfall,
-    units_of_sides,
 )
-from sparserob_core.control.transcription.provable import hindrance
-from sparserob_core.control.transcription.record import RowUnits, Transcription
-from sparserob_core.control.transcription.steps import Steps, paired, refuse_without_steps
-from sparserob_core.control.transcription.telling import Telling
-from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.control.transcription.program import OpenLoop, held_nominally, held_units, transcribed, way_back
+from sparserob_core.control.transcription.record import Acting, Posed, Transcription
+from sparserob_core.control.transcription.steps import refuse_without_steps
+from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, OwnUnits, SemiInfiniteProgram
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
-
-SAME = 1e-11  # of the numbers that are added up, a difference that is rounding
-IDLE = 1e-15  # of the numbers that are added up, an entry of a row that is rounding
+from sparserob_core.sip.program import OwnUnits, SemiInfiniteProgram
 
 
 def transcribe(
@@ -116,43 +101,24 @@ def prepare(
     if problem.execution is not None and mask.any():
         expected = "none under feedback, where the size of the control, and with it that of its error, answers too"
         raise InputError(path="execution", expected=expected, got=f"{np.asarray(problem.execution).tolist()}")
+    held = problem
     if policy is not None and mask.any():
-        from sparserob_core.control.transcription.feedback import refuse
+        from sparserob_core.control.transcription import feedback
 
         control = control.by_values()  # what answers a measurement is a value, which must not reach back before it
-        refuse(problem, control, disturbance, policy.charge.cost)
+        feedback.refuse(problem, control, disturbance, policy.charge.cost)
         if formulation != "reduced":
             raise InputError(
                 f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"
             )
-        return replace(_answering(problem, control, disturbance, policy, mask)[0], given=stated)
-    model = _assembled(problem, control, disturbance, formulation)
-    return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)), given=stated)
-
-
-def _answering(
-    problem: OptimalControlProblem,
-    control: Dictionary,
-    disturbance: Dictionary,
-    policy: Policy,
-    mask: np.ndarray,
-    wide: bool = False,
-) -> tuple[Transcription, Transcription, Units]:
-    """A problem under a policy that answers what ``mask`` says, in the user's units, in its own, and these
-    (`in_own_units`)."""
-    from sparserob_core.control.transcription.feedback import with_feedback
-
-    ends = [end for end in problem.terminal if not isinstance(end, Equality)]
-    model = _assembled(replace(problem, terminal=ends), control, disturbance, "reduced")
-    own, units = in_own_units(model, wide)
-
-    def wider() -> OwnUnits:
-        found = _answering(problem, control, disturbance, policy, mask, wide=True)[0].program.own_units
-        assert found is not None
-        return found
-
-    more = wider if not wide and _is_narrow(model, units) else None
-    return *with_feedback(problem, model, own, units, policy, mask, more), units
+        held = held_nominally(problem)
+    posed = _posed(problem, held, control, disturbance)
+    own = cache(lambda: _in_units(posed))
+    acting: Acting = OpenLoop(formulation)
+    if policy is not None and mask.any():
+        acting = feedback.answering(policy, mask, posed, *own())
+    model = transcribed(posed, acting)
+    return replace(model, program=model.program.mirrored(lambda _: _twin(model, *own())), given=stated)
 
 
 def _functionals(
@@ -179,100 +145,73 @@ def _functionals(
     return functionals, ParameterIndex(problem.system.parameters)
 
 
-def _assembled(
-    problem: OptimalControlProblem,
-    control: Dictionary,
-    disturbance: Dictionary,
-    formulation: Formulation,
-    own: ConvexSet | None = None,
-    like: Transcription | None = None,
-) -> Transcription:
-    """The program in the units of the problem; every row divided by the unit that it has where the control is in a set
-    of its ``own``, or by what it is divided by in another one that it is to be ``like``."""
+def _posed(
+    problem: OptimalControlProblem, held: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
+) -> Posed:
+    """A problem on its dictionaries, in its units, of which so much is ``held`` by rows of the nominal decision."""
     functionals, parameters = _functionals(problem, control, disturbance)
-    constraints = _state_constraints(problem, functionals, parameters)
-    A, b = _equalities(problem, functionals, parameters)
-    rows: RowUnits | None = None
-    if like is not None and like.rows is not None:
-        rows = like.rows
-        pairs = zip(constraints, like.constraints, strict=True)
-        constraints = tuple(one.divided(_shares(one, other)) for one, other in pairs)
-    elif own is not None:
-        rows = _row_units(problem if own is problem.control else replace(problem, control=own), functionals, A)
-        constraints = tuple(one.divided(row_units(one, own)) for one in constraints)
-    S, lower, upper = _image(problem, control, rows)
-    if rows is not None:
-        A, b = rows.equalities(A, b)
-        b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
-    if functionals.execution is not None:
-        S, lower, upper = _with_sizes(S, lower, upper, functionals)
-    families = [family_of(constraint) for constraint in constraints]
-    beside = functionals.variables - functionals.coefficients
-    for name, convex, places in held_at(problem, control.breakpoints, answering=False):
-        if convex.halfspaces() is None:  # sides are rows of the image
-            families.append(ControlConstraint.of(name, convex, places, control, beside).family())
-    if formulation == "literal":
-        families = [family.literal or family for family in families]
-    program = SemiInfiniteProgram(
-        n=functionals.variables,
-        families=families,
-        **objective(problem, control, lower.size, functionals.variables),
-        S=S,
-        lower=lower,
-        upper=upper,
-        A=A if b.size else None,
-        b=b if b.size else None,
-        channels=problem.system.controls,
-        lengths=np.tile(control.lengths, problem.system.controls),
-        activity=np.outer(problem.counts, control.lengths).ravel(),
-    )
-    return Transcription(
-        problem, control, disturbance, functionals, parameters, constraints, program, formulation, rows
+    return Posed(
+        problem=problem,
+        held=held,
+        control=control,
+        disturbance=disturbance,
+        functionals=functionals,
+        parameters=parameters,
+        constraints=_state_constraints(problem, functionals, parameters),
     )
 
 
-def in_own_units(model: Transcription, wide: bool = False) -> tuple[Transcription, Units]:
-    """The same problem in its own units (decision 0016), every row divided by its own, and these units; its families
-    are explained in the user's.
+def _in_units(posed: Posed, wide: bool = False) -> tuple[Posed, Units]:
+    """The same problem in its own units (decision 0016), every row divided by its own, and these units.
 
     Where a control may go so far that double precision does not resolve the walls beside it, the units are those of a
     control that goes as far as that allows, ``wide`` asks for those of its whole range nonetheless.
     """
-    if model.feedback is not None:
-        answering = model.feedback
-        return _answering(model.problem, model.control, model.disturbance, answering.policy, answering.answers)[1:]
-    controls = np.ones(model.problem.system.controls)
-    own, units = _scaled(model, controls)
+    controls = np.ones(posed.problem.system.controls)
+    own, units = _scaled(posed, controls)
     short = shortfall(own.constraints)
     if wide or short >= 1.0:
         return own, units
     share = float(np.exp2(np.floor(np.log2(short)))) / 2.0
-    ranged = _scaled(model, share * controls)
+    ranged = _scaled(posed, share * controls)
     if shortfall(ranged[0].constraints) < 1.0:  # what is too fine is so without a control
         return own, units
     for channel in range(controls.size if controls.size > 1 else 0):
         chosen = np.where(np.arange(controls.size) == channel, 1.0, ranged[1].controls / units.controls)
-        fewer = _scaled(model, chosen)
+        fewer = _scaled(posed, chosen)
         ranged = fewer if shortfall(fewer[0].constraints) >= 1.0 else ranged
     return ranged
 
 
-def _scaled(model: Transcription, shares: Array) -> tuple[Transcription, Units]:
+def _scaled(posed: Posed, shares: Array) -> tuple[Posed, Units]:
     """The problem in the units that it has where every channel goes as far as the share ``(m,)`` of its range; the
     range stays as it is."""
-    problem = model.problem
+    problem = posed.problem
     ranged = replace(problem, control=problem.control.in_units(1.0 / shares), control_step=None)
     ranged = problem if (shares == 1.0).all() else ranged
-    rough, dictionaries = rough_units(ranged), (model.control, model.disturbance)
+    rough, dictionaries = rough_units(ranged), (posed.control, posed.disturbance)
     moved = rough.of_problem(ranged)
     known, _ = _functionals(moved, *(rough.of_dictionary(one) for one in dictionaries))
     units = own_units(ranged, rough, known, moved.control)
     control, disturbance = (units.of_dictionary(one) for one in dictionaries)
     scaled = units.of_problem(problem)
-    far = scaled.control if ranged is problem else units.of_problem(ranged).control
-    own = _assembled(scaled, control, disturbance, model.formulation, own=far)
-    disturbed = own.functionals.disturbance
-    telling = Telling(units, blocks=np.zeros(0) if disturbed is None else _block_units(disturbed, units))
+    held = scaled if posed.held is problem else held_nominally(scaled)
+    own = _posed(scaled, held, control, disturbance)
+    far, held_far = (one.control.in_units(1.0 / shares) for one in (scaled, held))
+    constraints = tuple(one.divided(row_units(one, far)) for one in own.constraints)
+    return replace(own, constraints=constraints, rows=held_units(own, held_far)), units
+
+
+def in_own_units(model: Transcription, wide: bool = False) -> tuple[Transcription, Units]:
+    """The transcription of the same problem in its own units, and these (`_in_units`); its families are explained in
+    the user's."""
+    return _told(model, *_in_units(model, wide))
+
+
+def _told(model: Transcription, posed: Posed, units: Units) -> tuple[Transcription, Units]:
+    """What a problem that is ``posed`` in its own units is as a program, its families explained in the user's."""
+    own = transcribed(posed, model.acting.in_own(model, posed, units))
+    telling = own.acting.telling(own, units)
     families = [
         telling.family(one, theirs) for one, theirs in zip(own.program.families, model.program.families, strict=True)
     ]
@@ -282,7 +221,10 @@ def _scaled(model: Transcription, shares: Array) -> tuple[Transcription, Units]:
 def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProgram:
     """The program of another problem on the dictionaries of ``own``, with its rows divided by what those of ``own`` are
     divided by, and told as these are: for problems that differ from it in numbers on the right-hand sides only."""
-    program = _assembled(problem, own.control, own.disturbance, own.formulation, like=own).program
+    posed = _posed(problem, problem, own.control, own.disturbance)
+    pairs = zip(posed.constraints, own.constraints, strict=True)
+    constraints = tuple(one.divided(_shares(one, other)) for one, other in pairs)
+    program = transcribed(replace(posed, constraints=constraints, rows=own.rows), own.acting).program
     families = [
         replace(one, explain=told.explain, row_units=told.row_units, index_units=told.index_units)
         for one, told in zip(program.families, own.program.families, strict=True)
@@ -290,55 +232,23 @@ def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProg
     return replace(program, families=families)
 
 
-def _in_own_units(model: Transcription, wide: bool = False) -> OwnUnits:
-    """The program of the same problem in its own units, and the way back."""
-    own, units = in_own_units(model, wide)
-    rows = own.rows
-    assert rows is not None
-    theirs, ours = slanted(model.problem.control)[0], slanted(own.problem.control)[0]
-    sides = ratios(theirs, ours / rows.sides[:, None], units.controls)
-    steps, mine = Steps.of(model.problem, model.control), Steps.of(own.problem, own.control).divided(rows.steps)
-    pieces = np.repeat(np.concatenate([units.controls, sides]), own.control.pieces)
-    image = np.concatenate([pieces, np.repeat(ratios(steps.H, mine.H, units.controls), steps.times.size)])
-    decision = np.repeat(units.controls, own.control.functions)
-    if own.functionals.execution is not None:
-        sizes = np.repeat(units.controls, own.control.pieces)
-        decision, image = np.concatenate([decision, sizes]), np.concatenate([image, sizes, sizes])
+def _twin(model: Transcription, posed: Posed, units: Units) -> OwnUnits:
+    """The program of a problem that is ``posed`` in its own units, and the way back."""
+    own, _ = _told(model, posed, units)
+    decision, image, equalities = way_back(model, own, units)
+
+    def wider() -> OwnUnits:
+        return _twin(model, *_in_units(model, wide=True))
+
+    narrow = bool((units.controls < rough_units(model.problem).controls).any())  # it goes less far than it may
     return OwnUnits(
         program=replace(own.program, activity=model.program.activity, image_units=image),
         decision=decision,
         image=image,
-        equalities=_fixed(model.problem) @ units.states * rows.fixed,
+        equalities=equalities,
         cost=units.cost,
-        wider=None if wide or not _is_narrow(model, units) else lambda: _in_own_units(model, wide=True),
+        wider=wider if narrow else None,
     )
-
-
-def _is_narrow(model: Transcription, units: Units) -> bool:
-    """Whether units are those of a control that goes less far than it may."""
-    return bool((units.controls < rough_units(model.problem).controls).any())
-
-
-def _row_units(problem: OptimalControlProblem, functionals: WorstCase, A: Array) -> RowUnits:
-    """Equalities hold to rounding only: where no control enters a row, what is missing is compared with what double
-    precision resolves."""
-    added = _added_up(problem, functionals)
-    entered = np.abs(A).max(axis=1, initial=0.0) > IDLE * added
-    H, h = slanted(problem.control)
-    size = np.abs(H) @ extent(problem.control)
-    sides = units_of_sides(H, h, problem.control.reach(H), size) if h.size else h
-    return RowUnits(sides, _step_units(problem), power_of_two(np.where(entered, 1.0, RESOLVED) * added), entered)
-
-
-def _step_units(problem: OptimalControlProblem) -> Array:
-    """The unit ``(r,)`` of every row of the control's steps, the least of those of its two sides."""
-    H, lower, upper = paired(problem.control_step, problem.system.controls)
-    if problem.control_step is None or not upper.size:
-        return upper
-    both, far = np.vstack([H, -H]), 2.0 * np.abs(H) @ extent(problem.control)
-    reach = np.minimum(problem.control_step.reach(both), np.tile(far, 2))
-    units = units_of_sides(both, np.concatenate([upper, -lower]), reach, np.tile(far, 2))
-    return np.asarray(units.reshape(2, -1).min(axis=0))
 
 
 def _shares(one: StateConstraint, other: StateConstraint) -> Array:
@@ -347,40 +257,17 @@ def _shares(one: StateConstraint, other: StateConstraint) -> Array:
     return ratios(theirs, ours, np.ones(ours.shape[1]))
 
 
-def _block_units(model: DisturbanceModel, units: Units) -> Array:
-    """What one of every coefficient of a disturbance's blocks is in the user's units."""
-    if model.scale is not None:
-        return np.ones(model.block_count * model.set.dimension)
-    return np.tile(np.repeat(units.disturbances, model.set.dimension // model.channels), model.block_count)
-
-
 def from_state(model: Transcription, initial_state: Array) -> Transcription:
     """The reduced program of the same problem from another initial state ``(d,)``; what does not depend on it is
-    shared, and only the families' reduced form is offered."""
-    functionals = model.functionals.from_state(initial_state)
-    problem = replace(model.problem, initial_state=initial_state)
-    constraints = tuple(one.from_state(initial_state) for one in model.constraints)
-    if model.feedback is not None:
-        from sparserob_core.control.transcription.feedback import made_again
-
-        begun = replace(model, problem=problem, functionals=functionals, constraints=constraints)
-        return made_again(begun, model.feedback.charge)
-    moved = {
-        one.name: replace(_reduced(one), row_units=told.row_units, index_units=told.index_units)
-        for one, told in zip(constraints, model.program.families, strict=False)
-    }
-    A, b = _equalities(problem, functionals, model.parameters)
-    A, b = (A, b) if model.rows is None else model.rows.equalities(A, b)
-    program = replace(
-        model.program,
-        **quadratics(problem, model.control, functionals.variables),
-        families=[moved.get(family.name, family) for family in model.program.families],
-        A=A if b.size else None,
-        b=b if b.size else None,
+    shared."""
+    begun = replace(
+        model,
+        problem=replace(model.problem, initial_state=initial_state),
+        held=replace(model.held, initial_state=initial_state),
+        functionals=model.functionals.from_state(initial_state),
+        constraints=tuple(one.from_state(initial_state) for one in model.constraints),
     )
-    return replace(
-        model, problem=problem, functionals=functionals, constraints=constraints, program=program, formulation="reduced"
-    )
+    return replace(model.acting.from_state(model, begun), given=model.given)
 
 
 def _state_constraints(
@@ -422,185 +309,3 @@ def path_names(problem: OptimalControlProblem) -> list[str]:
 
 def _name(kind: str, position: int, count: int) -> str:
     return f"{kind}[{position}]" if count > 1 else kind
-
-
-def _image(
-    problem: OptimalControlProblem, dictionary: Dictionary, rows: RowUnits | None
-) -> tuple[csc_array | None, Array, Array]:
-    """The control on every piece, its bounds, one more image per piece and side of a polytope, and one per
-    step and side of the set of its changes."""
-    from scipy.sparse import csc_array, eye_array, kron, vstack
-
-    bound, channels = problem.control, problem.system.controls
-    axes = np.eye(channels)
-    lower, upper = (
-        np.repeat(-bound.support(-axes), dictionary.pieces),
-        np.repeat(bound.support(axes), dictionary.pieces),
-    )
-    values = csc_array(dictionary.sparse.T)
-    H, h = slanted(bound)
-    H, h = (H, h) if rows is None else (H / rows.sides[:, None], h / rows.sides)
-    steps = Steps.of(problem, dictionary)
-    steps = steps if rows is None else steps.divided(rows.steps)
-    if not h.size and not steps.count:
-        return (
-            (None if dictionary.is_indicators else csc_array(kron(eye_array(channels), values))),
-            lower,
-            upper,
-        )
-    blocks = [kron(eye_array(channels), values)]
-    blocks += [kron(csc_array(H), values)] if h.size else []
-    blocks += [steps.rows] if steps.count else []
-    S = csc_array(vstack(blocks))
-    extra, (least, most) = np.repeat(h, dictionary.pieces), steps.bounds()
-    return (
-        S,
-        np.concatenate([lower, np.full(extra.size, -np.inf), least]),
-        np.concatenate([upper, extra, most]),
-    )
-
-
-def _with_sizes(
-    S: csc_array | None, lower: Array, upper: Array, functionals: WorstCase
-) -> tuple[csc_array, Array, Array]:
-    """The images of `_image` where the decision goes on with a bound ``a`` of the size of every value ``s`` of the
-    control, and those that make it one: ``0 <= a - s``, ``0 <= a + s``, neither more than twice as far as ``s`` goes,
-    which ``a = |s|`` is not."""
-    from scipy.sparse import block_array, csc_array, eye_array
-
-    assert functionals.execution is not None
-    known = eye_array(functionals.coefficients, format="csc") if S is None else S
-    values, one = known[: functionals.execution.size], eye_array(functionals.execution.size, format="csc")
-    far = 2.0 * np.maximum(np.abs(lower), np.abs(upper))[: functionals.execution.size]
-    none = np.zeros(far.size)
-    return (
-        csc_array(block_array([[known, None], [-values, one], [values, one]])),
-        np.concatenate([lower, none, none]),
-        np.concatenate([upper, far, far]),
-    )
-
-
-def slanted(bound: ConvexSet) -> tuple[Array, Array]:
-    """The sides ``(H (r, m), h (r,))`` of a set of controls that bound several of them together; none for a box or a
-    curved set."""
-    flat = bound.halfspaces()
-    if flat is None:
-        return np.zeros((0, bound.dimension)), np.zeros(0)
-    several = np.count_nonzero(flat[0], axis=1) > 1
-    return flat[0][several], flat[1][several]
-
-
-def _equalities(
-    problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex
-) -> tuple[Array, Array]:
-    """Terminal equalities as rows; refused where the uncertainty reaches the state, since nothing could then satisfy
-    them."""
-    A, b = [np.zeros((0, functionals.variables))], [np.zeros(0)]
-    middle = np.zeros((1, 0)) if parameters.set is None else parameters.set.interior_point()[None]
-    values = np.concatenate(
-        [np.zeros(0), *(end.values[end.fixed] for end in problem.terminal if isinstance(end, Equality))]
-    )
-    directions, added = _fixed(problem), _added_up(problem, functionals)
-    for up, value, size in zip(directions, values, added, strict=True):
-        time = np.array([problem.horizon])
-        G, offset = functionals.rows(time, up[None], middle)
-        sigma = functionals.offsets(time, up[None], middle) + functionals.offsets(time, -up[None], middle)
-        state = int(np.flatnonzero(up)[0])
-        if sigma[0] > SAME * size or _reached(problem, parameters, state):
-            raise InputError(
-                f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final"
-                f" value to {value:g}; expected a set with interior"
-            )
-        A.append(G)
-        b.append(np.array([value - offset[0]]))
-    return np.vstack(A), np.concatenate(b)
-
-
-def _fixed(problem: OptimalControlProblem) -> Array:
-    """The unit vectors ``(e, d)`` of the states that the terminal equalities fix, in the order of their rows."""
-    fixed = [state for end in problem.terminal if isinstance(end, Equality) for state in end.fixed]
-    directions: Array = np.eye(problem.system.states)[np.array(fixed, dtype=int)]
-    return directions
-
-
-def _added_up(problem: OptimalControlProblem, functionals: WorstCase) -> Array:
-    """The largest sums ``(e,)`` of absolute numbers from which the fixed states are computed."""
-    H, known = _fixed(problem), ParameterIndex(None)
-    if not H.size:
-        return np.zeros(0)
-    nominal = functionals if functionals.response.system.parameters is None else functionals.nominal()
-    _, added = reaches(nominal, known, problem.control, H, np.array([problem.horizon]))
-    return added
-
-
-def _reached(problem: OptimalControlProblem, parameters: ParameterIndex, state: int) -> bool:
-    """Whether an uncertain entry of the system may reach a state: follow the entries of ``A`` that are not exactly 0,
-    over all parameters."""
-    if parameters.set is None:
-        return False
-    system, box = problem.system.forced, parameters.box
-    try:
-        middle, radius = (box.lower + box.upper) / 2, (box.upper - box.lower) / 2
-        every = [mode.taylor(TaylorSpace(parameters.count, 1), middle, radius) for mode in system.modes]
-    except NotEnclosable:
-        return True
-    counted = (0, 2) if problem.disturbance is None else (0, 2, 4)
-    rows, linked = np.zeros(system.states, dtype=bool), np.zeros((system.states,) * 2, dtype=bool)
-    for parts in every:  # of systems that take turns, whatever any of them links
-        for k in counted:
-            rows |= np.any(parts[k][1:] != 0, axis=(0, 2)) | np.any(parts[k + 1] != 0, axis=1)
-        linked |= np.any(parts[0] != 0, axis=0) | (parts[1] != 0)
-    reaching = np.arange(system.states) == state
-    for _ in range(system.states):
-        reaching = reaching | linked[reaching].any(axis=0)
-    return bool(rows[reaching].any())
-
-
-def family_of(constraint: StateConstraint) -> ConstraintFamily:
-    """The family of a constraint with its other forms: without the uncertainty, for sampled ones, and with the
-    disturbance as an index."""
-
-    def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
-        sides = constraint.sides
-        if sides is None:
-            raise InputError(
-                f"method: scenario: the constraint {constraint.name} has a curved set; expected sets with flat sides"
-            )
-        if constraint.functionals.execution is not None:
-            raise InputError("method: scenario: expected no problem.execution, whose errors are not sampled")
-        from sparserob_core.control.constraints.scenario import (
-            ScenarioConstraint,
-            sample_disturbances,
-            sample_parameters,
-        )
-
-        disturbances = None if model is None else sample_disturbances(model, count, rng)
-        drawn = sample_parameters(constraint.parameters.set, count, rng)
-        bound = constraint.functionals.initial
-        begun = None if bound is None else bound.sample(count, rng)
-        return ScenarioConstraint(constraint, *sides, disturbances, drawn, begun).family()
-
-    model, reduced = constraint.functionals.disturbance, _reduced(constraint)
-    literal = reduced if model is None else LiteralConstraint(constraint, model).family(reduced)
-    nominal = replace(_reduced(constraint.nominal()), formulation="nominal", source=constraint)
-    return replace(reduced, nominal=nominal, sample=sample, literal=literal)
-
-
-def _reduced(constraint: StateConstraint) -> ConstraintFamily:
-    response = constraint.functionals.response
-    return ConstraintFamily(
-        name=constraint.name,
-        index_set=constraint.index_set,
-        rows=constraint.rows,
-        chosen=constraint.chosen,
-        excess=constraint.at,
-        worst=constraint.worst,
-        enclosure=constraint.enclosure,
-        cells=constraint.cells,
-        gradient=Sensitivity(constraint).gradient,
-        explain=constraint.explain,
-        hindrance=lambda lower, upper: hindrance(response.system, float(response.grid.breakpoints[-1])),
-        measured=constraint.measured,
-        along=constraint.functionals.names.time,
-        source=constraint,
-    )

@@ -12,8 +12,8 @@ from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.answer import ControlResult
+from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.steps import Steps
-from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof

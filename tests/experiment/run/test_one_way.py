@@ -21,7 +21,7 @@ PLACES = (
     "experiment/run/run.py",
     "checker/claims/",
 )
-# how few pieces can act is claimed of a control that answers nothing; a policy's units are made where its answers are
+# how few pieces can act is claimed of a control that answers nothing, whose families have rows of the decision
 ALONE = {
     "checker.claims.activity.",
     "checker.claims.claims._at_least",
@@ -29,7 +29,10 @@ ALONE = {
     "checker.claims.claims._other",
     "checker.claims.constraints.tubes",
     "checker.claims.duality.Duality.nothing",
-    "control.transcription.transcribe._in_own_units",
+    "control.transcription.program.OpenLoop.",
+    "control.transcription.program._block_units",
+    "control.transcription.program._reduced",
+    "control.transcription.program.family_of",
     "sip.methods.fewest.",
 }
 # answers, the deviations that they answer, the policy itself, and the bound against every causal policy
@@ -45,8 +48,8 @@ ANSWERING = {
     "checker.claims.claims.derived_causal_bound",
     "checker.claims.duality.Duality.pushed",
     "control.transcription.feedback.",
+    "control.transcription.program.held_nominally",
     "control.transcription.record.Transcription.",
-    "control.transcription.transcribe._answering",
     "experiment.directory.certificate._admissible",
     "experiment.directory.certificate._deviation",
     "experiment.directory.certificate._inside",
@@ -86,6 +89,10 @@ def test_a_run_with_feedback_and_one_without_go_one_way(tmp_path: Path) -> None:
         "sip.methods.driver.drive",
         "sip.methods.exchange.Rounds.step",
         "control.transcription.transcribe.prepare",
+        "control.transcription.transcribe._twin",
+        "control.transcription.program.transcribed",
+        "control.transcription.program.way_back",
+        "control.transcription.telling.Telling.family",
         "checker.claims.multipliers._undisturbed",
         "checker.claims.constraints.bounded",
     ):
