@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import explanation
+from sparserob_core.control.constraints.explanation import TimedExplanation, explanation
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import (
     climb,
@@ -29,7 +29,7 @@ from sparserob_core.control.response.reference import Moving, Reference
 from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
-from sparserob_core.sip.program import Enclosure, Explanation, Separation
+from sparserob_core.sip.program import Enclosure, Separation
 
 SAMPLED = 8  # samples in any direction that are climbed from, beside the maxima along time
 STEP = 0.1  # first step of directions, on the cube of edge 2
@@ -202,7 +202,7 @@ class CurvedConstraint(StateConstraint):
         return answer
 
     @shaped
-    def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
+    def explain(self, index: Float[Array, " j"], row: int) -> TimedExplanation:
         times, directions, parameters, rhs = self.functionals_at(index[None])
         at = (float(times[0]), parameters[0])
         said = explanation(self.name, self.functionals, directions, rhs, 0, *at, scale=float(np.abs(directions).max()))

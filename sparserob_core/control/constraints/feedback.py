@@ -298,9 +298,7 @@ class FeedbackConstraint(Source):
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people, at every disturbance, or at the deviations that the index says."""
-        said = self.flat.explain(index[:1], row)
-        assert isinstance(said, TimedExplanation)
-        found = told(said, self.loop, index[1:])
+        found = told(self.flat.explain(index[:1], row), self.loop, index[1:])
         if not self._unanswered[row]:
             return found
         last = float(self.loop.functionals.dictionary.breakpoints[-2])

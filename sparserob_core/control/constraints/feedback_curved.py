@@ -276,9 +276,7 @@ class FeedbackCurved(Turning):
         return self.loop.state_rows(time, H, h - moved, np.zeros(1, dtype=int), np.ones(1))
 
     def explained(self, index: Array) -> TimedExplanation:
-        said = self.curved.explain(index, 0)
-        assert isinstance(said, TimedExplanation)
-        return said
+        return self.curved.explain(index, 0)
 
 
 @final

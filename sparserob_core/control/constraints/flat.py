@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import explanation
+from sparserob_core.control.constraints.explanation import TimedExplanation, explanation
 from sparserob_core.control.constraints.local_maxima import (
     TINY,
     along_spans,
@@ -31,7 +31,7 @@ from sparserob_core.control.response.reference import Direct, Moving, Reference
 from sparserob_core.control.response.response import LONG, Outputs, Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.program import Enclosure, Explanation, Separation
+from sparserob_core.sip.program import Enclosure, Separation
 
 if TYPE_CHECKING:
     from sparserob_core.control.response.measurable import Execution
@@ -319,7 +319,7 @@ class FlatConstraint(StateConstraint):
         return np.flatnonzero(np.isin(self.times, np.concatenate([[self.start], self.samples.cuts, [self.stop]])))
 
     @shaped
-    def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
+    def explain(self, index: Float[Array, " j"], row: int) -> TimedExplanation:
         time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
         allowed = self.h - self.moved(index[:1])[0]
         if self.gains is None:

@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import Source
+from sparserob_core.control.constraints.explanation import Source, TimedExplanation
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.functional import WorstCase
@@ -14,7 +14,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
-from sparserob_core.sip.program import Enclosure, Explanation, Separation
+from sparserob_core.sip.program import Enclosure, Separation
 
 
 class StateConstraint(Source):
@@ -77,7 +77,7 @@ class StateConstraint(Source):
         """Proven upper bounds of the violation on cells of the index set, each within one piece."""
 
     @abstractmethod
-    def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
+    def explain(self, index: Float[Array, " j"], row: int) -> TimedExplanation:
         """One constraint for people: what is bounded, when, and what the uncertainty does to it."""
 
     @abstractmethod
