@@ -77,8 +77,7 @@ def remaining(
         repeat=False,  # the return is among the windows
     )
     left = replace(left, disturbance=None) if alone else left
-    policy = None if alone or model.feedback is None else model.feedback.policy
-    return prepare(left, control, disturbance, policy=policy)
+    return prepare(left, control, disturbance, policy=None if alone else model.policy)
 
 
 def _rest(dictionary: Dictionary, begin: float, horizon: float) -> Dictionary:

@@ -255,6 +255,16 @@ class OptimalControlProblem:
         """The set of the measurable disturbances, 0 along the columns of others; ``None`` where there are none."""
         return apart(self.disturbance, self.disturbance_class, "measurable")
 
+    @property
+    def terminal_sets(self) -> list[ConvexSet]:
+        """The sets that the final state must be in; those that fix values are not among them."""
+        return [end for end in self.terminal if not isinstance(end, Equality)]
+
+    @property
+    def terminal_equalities(self) -> list[Equality]:
+        """What fixes values of the final state."""
+        return [end for end in self.terminal if isinstance(end, Equality)]
+
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
@@ -308,14 +318,11 @@ class OptimalControlProblem:
             )
         if not shares.any():
             return None
-        ends = any(isinstance(end, Equality) for end in self.terminal)
-        sets = [
-            e if isinstance(e, ConvexSet) else e.set
-            for e in (*self.path, *self.terminal)
-            if not isinstance(e, Equality)
-        ]
+        sets = [one if isinstance(one, ConvexSet) else one.set for one in (*self.path, *self.terminal_sets)]
         refused = {
-            "fixed final values, which an error of execution misses: a terminal set such as box": ends,
+            "fixed final values, which an error of execution misses: a terminal set such as box": bool(
+                self.terminal_equalities
+            ),
             "pieces of the system": isinstance(self.system, SwitchedSystem),
             "uncertain parameters": bool(self.system.parameter_count),
             "a delay": self.system.delay > 0.0,

@@ -25,7 +25,6 @@ from sparserob_core.control.problem.problem import MixedConstraint, OptimalContr
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.measurable import MISSED
-from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.own_units import added_up, fixed, units_of_steps
 from sparserob_core.control.transcription.program import ranges, transcribed
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
@@ -73,6 +72,11 @@ class Answering(Acting):
     """The problem in the own units in which this was seen first, and what was seen there."""
     formulation: Formulation = "reduced"
 
+    @property
+    def answers_by(self) -> Policy:
+        """Its own."""
+        return self.policy
+
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> Answering:
         """With what is seen in own units."""
         seen = self.first[1] if own is self.first[0] else _seen(self.mask, theirs, own, units)[0]
@@ -118,11 +122,11 @@ class Answering(Acting):
     def part(self, posed: Posed) -> Part:
         """Families that hold for every deviation, gains, and what bounds the charge."""
         functionals, problem, pieces = posed.functionals, posed.problem, posed.control.pieces
-        seen, known, charge = self.seen, self.seen.answers, self.charge
-        nominal, first = functionals.variables, functionals.variables + known.variables
+        seen, gains, charge = self.seen, self.seen.answers, self.charge
+        nominal, first = functionals.variables, functionals.variables + gains.variables
         size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
         loop = ClosedLoop(
-            functionals, known, _spread(posed, seen.pieces), size, seen.pieces, seen.observer, anew=_begins_anew(posed)
+            functionals, gains, _spread(posed, seen.pieces), size, seen.pieces, seen.observer, anew=_begins_anew(posed)
         )
         families = [of_state(constraint, loop).family() for constraint in posed.constraints]
         settled: list[Callable[[Array], Array]] = []
@@ -144,7 +148,7 @@ class Answering(Acting):
                 H, h = H / seen.steps[:, None], h / seen.steps
             families.append(FeedbackControl(name, loop, places, H, h).family())
         axes, (low, high) = np.eye(problem.system.controls), ranges(problem.control)
-        most = (high - low)[known.channel] / loop.spread.chords[known.entry]
+        most = (high - low)[gains.channel] / loop.spread.chords[gains.entry]
         far = np.repeat(np.maximum(np.abs(low), np.abs(high)), pieces)
         lower, upper, weights, largest = -most, most, None, None
         prices, peak = problem.prices(breakpoints).ravel(), replace(self, charge=replace(charge, cost="peak"))
@@ -213,10 +217,10 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
     anew = _begins_anew(own)
     deviations = np.concatenate([deviations, begun, *[begun] * anew])
     seen = innovations_of(seen, begun.size, observer, anew) * (spread.chords > 0.0)  # else not answered
-    known, (H, h) = answers(seen, mask, problem.system.controls), fixed(problem)
+    coordinates, (H, h) = answers(seen, mask, problem.system.controls), fixed(problem)
     small = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
     ends = _equal(H / small[:, None], h / small)
-    return Seen(known, pieces, observer, ends, deviations, _step_units(problem)), outputs
+    return Seen(coordinates, pieces, observer, ends, deviations, _step_units(problem)), outputs
 
 
 def _equal(H: Array, h: Array) -> tuple[Array, Array]:
@@ -228,13 +232,12 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
     """Raise `InputError` for what a policy is not built for, in one sentence."""
     disturbed = problem.disturbance is not None
     paths = [entry for entry in problem.path if isinstance(entry, PathConstraint | MixedConstraint)]
-    sets = [entry.set for entry in paths] + [end for end in problem.terminal if not isinstance(end, Equality)]
+    sets = [entry.set for entry in paths] + problem.terminal_sets
     steps = [] if problem.control_step is None else [problem.control_step]
     curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     kind, bound = problem.disturbance_class, problem.disturbance
     measurable = bound is not None and kind == "measurable"
-    ends = any(isinstance(end, Equality) for end in problem.terminal)
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
@@ -255,7 +258,8 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         and not measurable
         and not disturbance.is_complete,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
-        "terminal set with an interior under measurable disturbances: they reach a fixed state": measurable and ends,
+        "terminal set with an interior under measurable disturbances: they reach a fixed state": measurable
+        and bool(problem.terminal_equalities),
         "measurement of the whole state without noise under measurable disturbances": measurable
         and problem.measurements is not None,
         "control that acts at once under measurable disturbances, without a delay": measurable

@@ -203,7 +203,7 @@ def reaches(
 def fixed(problem: OptimalControlProblem) -> tuple[Array, Array]:
     """The unit vectors ``(e, d)`` of the states that the terminal equalities fix, in the order of their rows, and the
     values ``(e,)`` of these states."""
-    ends = [end for end in problem.terminal if isinstance(end, Equality)]
+    ends = problem.terminal_equalities
     states = np.array([state for end in ends for state in end.fixed], dtype=int)
     values = np.concatenate([np.zeros(0), *(end.values[end.fixed] for end in ends)])
     return np.eye(problem.system.states)[states], values

@@ -18,7 +18,6 @@ from sparserob_core.control.problem.units import Units, power_of_two, ratios
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.objective import objective, quadratics
 from sparserob_core.control.transcription.own_units import (
     RESOLVED,
@@ -49,6 +48,10 @@ class OpenLoop(Acting):
     """A control that answers nothing: its families have rows of the decision."""
 
     formulation: Formulation = "reduced"
+
+    @property
+    def answers_by(self) -> None:
+        """None."""
 
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> OpenLoop:
         """The same: it sees nothing."""
@@ -136,8 +139,8 @@ def transcribed(posed: Posed, acting: Acting) -> Transcription:
 def held_nominally(problem: OptimalControlProblem) -> OptimalControlProblem:
     """A problem with the ranges of its controls alone, of all that its own or their final values are held in: what
     else is asked of a control that answers is asked of it for every deviation."""
-    ends = [end for end in problem.terminal if not isinstance(end, Equality)]
-    return replace(problem, control=Box(*ranges(problem.control)), control_step=None, terminal=ends)
+    ranged = Box(*ranges(problem.control))
+    return replace(problem, control=ranged, control_step=None, terminal=problem.terminal_sets)
 
 
 def way_back(theirs: Posed, own: Transcription, units: Units) -> tuple[Array, Array, Array]:
@@ -224,12 +227,12 @@ def _with_sizes(
     from scipy.sparse import block_array, csc_array, eye_array
 
     assert functionals.execution is not None
-    known = eye_array(functionals.coefficients, format="csc") if S is None else S
-    values, one = known[: functionals.execution.size], eye_array(functionals.execution.size, format="csc")
+    image = eye_array(functionals.coefficients, format="csc") if S is None else S
+    values, sizes = image[: functionals.execution.size], eye_array(functionals.execution.size, format="csc")
     far = 2.0 * np.maximum(np.abs(lower), np.abs(upper))[: functionals.execution.size]
     none = np.zeros(far.size)
     return (
-        csc_array(block_array([[known, None], [-values, one], [values, one]])),
+        csc_array(block_array([[image, None], [-values, sizes], [values, sizes]])),
         np.concatenate([lower, none, none]),
         np.concatenate([upper, far, far]),
     )

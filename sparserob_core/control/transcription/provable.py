@@ -9,7 +9,6 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.sets.sets import Equality
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import ConvexSet
 
@@ -26,8 +25,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     """
     if problem.measurable is not None:
         paths = [entry if isinstance(entry, ConvexSet) else entry.set for entry in problem.path]
-        ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
-        curved = [one for one in (*paths, *ends) if one.halfspaces() is None]
+        curved = [one for one in (*paths, *problem.terminal_sets) if one.halfspaces() is None]
         if problem.system.parameter_count or curved:
             over = "uncertain parameters" if problem.system.parameter_count else "sets with curved sides"
             return (

@@ -112,6 +112,11 @@ class Acting(ABC):
     formulation: Formulation
     """What the indices of the families are."""
 
+    @property
+    @abstractmethod
+    def answers_by(self) -> Policy | None:
+        """The policy by which it answers; ``None`` where that is nothing."""
+
     @abstractmethod
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> Acting:
         """The same in the problem's ``own`` units."""
@@ -180,6 +185,11 @@ class Transcription(Posed):
     def formulation(self) -> Formulation:
         """What the indices of the families are."""
         return self.acting.formulation
+
+    @property
+    def policy(self) -> Policy | None:
+        """The policy by which the control answers what it measures; ``None`` for one that answers nothing."""
+        return self.acting.answers_by
 
     @property
     def noise(self) -> ConvexSet | None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
@@ -57,10 +57,8 @@ def _added(model: Transcription, result: Result) -> float:
                 besides += cut.multiplier * float(np.abs(said.gain) @ _far(model.problem.control))
             if constraint.reference is not None:
                 besides += cut.multiplier * float(np.abs(said.direction) @ constraint.reference.size)
-    fixed = [i for end in model.problem.terminal if isinstance(end, Equality) for i in end.fixed]
-    axes = np.eye(model.problem.system.states)
-    for i, price in zip(fixed, result.dual.mu, strict=False):
-        rows.append((abs(float(price)), model.problem.horizon, axes[i], middle))
+    for axis, price in zip(fixed(model.problem)[0], result.dual.mu, strict=False):
+        rows.append((abs(float(price)), model.problem.horizon, axis, middle))
     if not rows:
         return 0.0
     multipliers, times, directions, parameters = (np.array(column, dtype=float) for column in zip(*rows, strict=True))

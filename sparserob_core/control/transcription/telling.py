@@ -28,18 +28,18 @@ class Telling:
 
     def family(self, own: ConstraintFamily, theirs: ConstraintFamily) -> ConstraintFamily:
         """A family in own units, in all its forms, that is explained as the user's is."""
-        source, other = own.source, theirs.source
-        assert isinstance(source, Source) and isinstance(other, Source)
-        (normals, _), (mine, coordinates) = other.normals_in(self.units), source.normals_in(self.units)
-        rows, known = ratios(normals, mine, coordinates), source.index_units(self.units)
+        source, user = own.source, theirs.source
+        assert isinstance(source, Source) and isinstance(user, Source)
+        (normals, _), (mine, coordinates) = user.normals_in(self.units), source.normals_in(self.units)
+        rows, begins = ratios(normals, mine, coordinates), source.index_units(self.units)
 
         def told(one: ConstraintFamily, as_theirs: ConstraintFamily) -> ConstraintFamily:
-            return self._explained(one, as_theirs, rows, known)
+            return self._explained(one, as_theirs, rows, begins)
 
         def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
             assert draw is not None
-            found = draw(count, rng)
-            return told(found, found if found.formulation == "sampled" else theirs)
+            drawn = draw(count, rng)
+            return told(drawn, drawn if drawn.formulation == "sampled" else theirs)
 
         def form(one: ConstraintFamily | None, as_theirs: ConstraintFamily | None) -> ConstraintFamily | None:
             return None if one is None or as_theirs is None else told(one, as_theirs)
@@ -57,13 +57,13 @@ class Telling:
         )
 
     def _explained(
-        self, own: ConstraintFamily, theirs: ConstraintFamily, rows: Array, known: Array
+        self, own: ConstraintFamily, theirs: ConstraintFamily, rows: Array, begins: Array
     ) -> ConstraintFamily:
-        """One form of a family whose rows have the units ``rows (r,)``, whose reduced indices begin with ``known``."""
-        scale, said, hindered = self._index(own, known), theirs.explain, theirs.hindrance
+        """One form of a family, with units of its rows ``rows (r,)`` and of what its reduced indices begin with."""
+        scale, explain, hindered = self._index(own, begins), theirs.explain, theirs.hindrance
         return replace(
             own,
-            explain=None if said is None else (lambda index, row: said(index * scale, row)),
+            explain=None if explain is None else (lambda index, row: explain(index * scale, row)),
             hindrance=None if hindered is None else (lambda low, high: hindered(low * scale, high * scale)),
             row_units=rows,
             index_units=scale,
@@ -71,14 +71,14 @@ class Telling:
             along=theirs.along,
         )
 
-    def _index(self, own: ConstraintFamily, known: Array) -> Array:
+    def _index(self, own: ConstraintFamily, begins: Array) -> Array:
         """What one of each coordinate of an index is in the user's units; directions, signs and the numbers of samples
         have none."""
         begun, ended = {
-            "reduced": (known, np.zeros(0)),
-            "nominal": (known[:1], np.zeros(0)),
-            "literal": (np.concatenate([known[:1], self.blocks, known[1:]]), self.deviations),
-            "sampled": (known[:1], np.zeros(0)),
+            "reduced": (begins, np.zeros(0)),
+            "nominal": (begins[:1], np.zeros(0)),
+            "literal": (np.concatenate([begins[:1], self.blocks, begins[1:]]), self.deviations),
+            "sampled": (begins[:1], np.zeros(0)),
         }[own.formulation]
         between = np.ones(own.index_set.dimension - begun.size - ended.size)
         return np.concatenate([begun, between, ended])

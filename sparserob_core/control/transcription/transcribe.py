@@ -27,7 +27,6 @@ from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
-from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.accumulated import accumulated
 from sparserob_core.control.transcription.own_units import (
     own_units,
@@ -191,8 +190,8 @@ def _scaled(posed: Posed, shares: Array) -> tuple[Posed, Units]:
     ranged = problem if (shares == 1.0).all() else ranged
     rough, dictionaries = rough_units(ranged), (posed.control, posed.disturbance)
     moved = rough.of_problem(ranged)
-    known, _ = _functionals(moved, *(rough.of_dictionary(one) for one in dictionaries))
-    units = own_units(ranged, rough, known, moved.control)
+    reaching, _ = _functionals(moved, *(rough.of_dictionary(one) for one in dictionaries))
+    units = own_units(ranged, rough, reaching, moved.control)
     control, disturbance = (units.of_dictionary(one) for one in dictionaries)
     scaled = units.of_problem(problem)
     held = scaled if posed.held is problem else held_nominally(scaled)
@@ -295,7 +294,7 @@ def _state_constraints(
 def windows_of(problem: OptimalControlProblem) -> list[tuple[str, PathConstraint | MixedConstraint]]:
     """The path and terminal constraints with the names of their families; a terminal one has the window of one time."""
     end, path = problem.horizon, [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
-    ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
+    ends = problem.terminal_sets
     finals = [(_name("terminal", i, len(ends)), PathConstraint(one, end, end)) for i, one in enumerate(ends)]
     return [*zip(path_names(problem), path, strict=True), *finals]
 

@@ -79,17 +79,16 @@ NOISE = {"noise"}
 def _unread(case: Case) -> set[str]:
     """The names ``key.key`` of what a certificate says besides what its claims rest on."""
     data, measured = case.certificate, case.problem.measurements
-    noisy = case.policy is not None and measured is not None and measured.noise is not None
-    read = CERTIFICATE.get(str(data.get("status")), FIGURED) | (
-        set() if case.policy is None else {*ANSWERS, "causal", "policy"}
-    )
+    noisy = case.answering and measured is not None and measured.noise is not None
+    read = CERTIFICATE.get(str(data.get("status")), FIGURED)
+    read = read | {*ANSWERS, "causal", "policy"} if case.answering else read
     left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
     pieced = {window.name for window in case.windows if window.is_mixed}
     proof, witness, fewest = (data.get(name) for name in ("proof", "witness", "fewest_active"))
     of_activity = fewest.get("multipliers") if isinstance(fewest, Mapping) else None
     left |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
-    causal = data.get("causal") if case.policy is not None else None
-    left |= _besides("policy", data.get("policy") if case.policy is not None else None, {"cost", "answers"})
+    causal, policy = (data.get(name) if case.answering else None for name in ("causal", "policy"))
+    left |= _besides("policy", policy, {"cost", "answers"})
     left |= _besides("causal", causal, {"lower_bound", "signals", "multipliers", "shares"})
     rows = causal.get("multipliers") if isinstance(causal, Mapping) else None
     for entry in rows if isinstance(rows, list) else []:
@@ -106,10 +105,10 @@ def _unread(case: Case) -> set[str]:
         entries = multipliers.get("constraints")
         for entry in entries if isinstance(entries, list) else []:
             mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in pieced
-            more = ({"piece"} if mixed else set()) | (set() if case.policy is None else {"disturbance"})
-            more |= BEGUN if case.policy is not None and case.problem.initial_set is not None else set()
+            more = ({"piece"} if mixed else set()) | ({"disturbance"} if case.answering else set())
+            more |= BEGUN if case.answering and case.problem.initial_set is not None else set()
             more |= NOISE if noisy else set()
-            more |= {"changes"} if case.measurable and case.policy is not None else set()
+            more |= {"changes"} if case.measurable and case.answering else set()
             left |= _besides("multipliers.constraints", entry, MULTIPLIER | more)
             left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):
@@ -120,7 +119,7 @@ def _unread(case: Case) -> set[str]:
     known = WITNESS | (BEGUN if case.problem.initial_set is not None else set()) | (NOISE if noisy else set())
     mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in pieced
     known = known | {"piece"} if mixed else known
-    known = known - {"disturbance", *BEGUN} if case.measurable and case.policy is None else known
+    known = known - {"disturbance", *BEGUN} if case.measurable and not case.answering else known
     return left | (_besides("witness", witness, known) if "witness" in read else set())
 
 
@@ -198,7 +197,7 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
 
 def _causal(case: Case) -> dict[str, tuple[object, ...]]:
     """What is to be said of every causal policy."""
-    if case.policy is None:
+    if not case.answering:
         return {}
     claimed = case.certificate.get("causal")
     lower = claimed.get("lower_bound") if isinstance(claimed, Mapping) else None
@@ -327,7 +326,7 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
 
 def _begins(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> bool:
     """Whether the worst initial state that is told is the one that the witness begins at."""
-    if case.problem.initial_set is None or (case.policy is not None and "initial_state" not in said):
+    if case.problem.initial_set is None or (case.answering and "initial_state" not in said):
         return "initial_state" not in said
     deviation = witness.get("deviation")
     if not isinstance(deviation, list) or not all(isinstance(one, int | float) for one in deviation):
@@ -423,11 +422,11 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         theta, control, breakpoints, flat = (arrays[name] for name in STORED)
         decision = np.array(case.certificate["decision"], dtype=float)
         size = case.control.summands(decision)
-        answered = [] if case.policy is None else ANSWERS[: 1 if case.problem.measurements is None else 2]
+        answered = ANSWERS[: 1 if case.problem.measurements is None else 2] if case.answering else []
         same = (
             np.array_equal(theta, decision)
             and np.array_equal(flat[: decision.size], decision.ravel())
-            and (case.policy is not None or flat.size == decision.size + _sizes(case))
+            and (case.answering or flat.size == decision.size + _sizes(case))
             and all(np.array_equal(arrays[k], np.array(case.certificate.get(k, []), dtype=float)) for k in answered)
             and np.array_equal(breakpoints, case.control.breakpoints)
             and control.shape == size.shape

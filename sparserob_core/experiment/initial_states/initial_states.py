@@ -13,7 +13,6 @@ from sparserob_core.control.problem.problem import OptimalControlProblem, PathCo
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.reference import Reference
-from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.initial_states import InitialPlane, check_states
 from sparserob_core.control.transcription.own_units import walls
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
@@ -144,7 +143,7 @@ def _limit(within: object) -> float | None:
 def _far(problem: OptimalControlProblem) -> float:
     """A size beyond which a coordinate counts as unbounded."""
     flat = [entry.set.halfspaces() for entry in problem.path if isinstance(entry, PathConstraint)]
-    flat += [end.halfspaces() for end in problem.terminal if not isinstance(end, Equality)]
+    flat += [end.halfspaces() for end in problem.terminal_sets]
     sizes = [
         float((np.abs(h) / np.linalg.norm(H, axis=1)).max())
         for H, h in (sides for sides in flat if sides is not None)
@@ -152,7 +151,7 @@ def _far(problem: OptimalControlProblem) -> float:
     ]
     moved = [entry.relative_to for entry in problem.path if isinstance(entry, PathConstraint)]
     sizes += [float(np.abs(np.asarray(rows)[:, 1:]).max()) for rows in moved if rows is not None]
-    sizes += [float(np.abs(end.values[end.fixed]).max()) for end in problem.terminal if isinstance(end, Equality)]
+    sizes += [float(np.abs(end.values[end.fixed]).max()) for end in problem.terminal_equalities]
     return FAR * max([1.0, float(np.abs(np.asarray(problem.initial_state)).max()), *sizes])
 
 

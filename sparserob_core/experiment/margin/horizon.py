@@ -12,8 +12,9 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.sets.sets import ConvexSet, Equality
+from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_horizon, stretched
+from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.points import Point, Points
@@ -271,8 +272,6 @@ def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
                     piece=within,
                 )
             )
-    fixed = [(i, float(end.values[i])) for end in problem.terminal if isinstance(end, Equality) for i in end.fixed]
-    axes = np.eye(problem.system.states)
-    for (state, value), price in zip(fixed, result.dual.mu, strict=False):
-        found.append(Multiplier(float(price), 1.0, axes[state], middle, value, uncertain=False))
+    for axis, value, price in zip(*fixed(problem), result.dual.mu, strict=False):
+        found.append(Multiplier(float(price), 1.0, axis, middle, float(value), uncertain=False))
     return found

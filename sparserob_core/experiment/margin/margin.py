@@ -176,8 +176,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
             "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
         )
     problem, control, disturbance = experiment.transcription.stated, experiment.control, experiment.disturbance
-    feedback = experiment.transcription.feedback
-    policy = None if feedback is None else feedback.policy
+    policy = experiment.transcription.policy
     if of == HORIZON:
         if policy is not None:
             raise InputError(path="policy.name", expected="open_loop for the margin of the horizon", got="feedback")

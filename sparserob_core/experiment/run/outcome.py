@@ -171,8 +171,7 @@ class SolvedProblem(ControlResult):
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         model = self.model
-        policy = None if model.feedback is None else model.feedback.policy
-        given = (model.problem, model.control, model.disturbance, model.formulation, policy)
+        given = (model.problem, model.control, model.disturbance, model.formulation, model.policy)
         return _reread, (self.plain, *given, self.causal, self.origin)
 
 

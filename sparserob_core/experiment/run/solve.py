@@ -145,7 +145,7 @@ def solve(
             "maximiser": maximiser,
             "solver": solver,
             "regulariser": regulariser,
-            "policy": policy if model.feedback is None else model.feedback.policy,
+            "policy": policy if model.policy is None else model.policy,
         },
         dictionaries=(
             {"control": model.control, "disturbance": model.disturbance}

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import sparserob_core as sr
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem
@@ -218,3 +219,32 @@ def test_the_control_is_read_piece_by_piece():
     theta = np.arange(4.0)
     assert held(UNEVEN.breakpoints, theta[None], 0.22)[0] == 1.0
     assert held(UNEVEN.breakpoints, theta[None], HORIZON)[0] == 3.0
+
+
+def test_a_control_that_answers_has_the_nominal_entries_and_the_units_of_one_that_does_not() -> None:
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(A=[[0, 1], [-2, -0.5]], B=[[0], [1]]),
+        horizon=2.0,
+        initial_state=[-1, 1],
+        control=sr.Box([-3], [2]),
+        disturbance=sr.Box([-0.02, -40], [0.02, 40]),
+        path=[sr.PathConstraint(sr.Box([-300, -2000], [300, 2000]), 0.5)],
+    )
+    grid = sr.Dictionary.indicators(np.linspace(0.0, 2.0, 5))
+    plain, answering = (sr.transcribe(problem, grid, policy=policy) for policy in (None, sr.AffinePolicy()))
+    own = [program.own_units for program in (plain, answering)]
+    assert own[0] is not None and own[1] is not None
+    for one, other in ((plain, answering), (own[0].program, own[1].program)):
+        for name in ("weights", "lower", "upper"):
+            assert getattr(one.finite, name).tolist() == getattr(other.finite, name)[: grid.pieces].tolist()
+    for units in ("decision", "image"):
+        assert getattr(own[0], units).tolist() == getattr(own[1], units)[: grid.pieces].tolist()
+    mine, theirs = (each.program.family("path") for each in own if each is not None)
+    assert mine.row_units is not None and theirs.row_units is not None
+    assert mine.row_units.tolist() == theirs.row_units.tolist()
+    assert set(mine.row_units.tolist()) != {1.0}
+    for family in (mine, theirs):  # every form of a family in own units is told in the user's
+        literal = family.literal
+        assert literal is not None and literal.reduced is not None and literal.reduced.row_units is not None
+        assert literal.index_units is not None and literal.index_units.size == literal.index_set.dimension
+        assert literal.index_units.min() < 1.0 < literal.index_units.max()

@@ -65,7 +65,7 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
         experiment.disturbance,
         finite(data),
         Clock(SECONDS),
-        policy=None if feedback is None else feedback.policy,
+        policy=experiment.transcription.policy,
     )
     try:
         derived = derived_bound(case)
