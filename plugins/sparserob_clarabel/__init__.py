@@ -23,21 +23,25 @@ class Clarabel(sr.Solver, sr.Options):
 
     def solve(self, program: sr.QuadraticProgram, accuracy: float) -> sr.Claim:
         import clarabel
-        from scipy.sparse import csc_matrix, eye_array, triu, vstack
+        from scipy.sparse import csc_array, csc_matrix, eye_array, triu, vstack
 
         n, e, r = program.q.size, program.b.size, program.h.size
         above, below = np.flatnonzero(np.isfinite(program.upper)), np.flatnonzero(np.isfinite(program.lower))
         identity = eye_array(n, format="csr")
-        rows = csc_matrix(vstack([program.A, program.G, identity[above], -identity[below]], format="csc"))
+        inside = np.concatenate([np.zeros(0, dtype=int), *program.cones])  # variables, cone after cone
+        held = csc_array((-np.ones(inside.size), (np.arange(inside.size), inside)), shape=(inside.size, n))
+        rows = csc_matrix(vstack([program.A, program.G, identity[above], -identity[below], held], format="csc"))
         rhs = np.concatenate([program.b, program.h, program.upper[above], -program.lower[below]])
         cones = [clarabel.ZeroConeT(e), clarabel.NonnegativeConeT(rhs.size - e)]
+        cones += [clarabel.SecondOrderConeT(cone.size) for cone in program.cones]
+        rhs = np.concatenate([rhs, np.zeros(inside.size)])
         solver = clarabel.DefaultSolver(
-            csc_matrix(triu(program.P, format="csc")), program.q, rows, rhs, cones, self._settings(accuracy)
+            csc_matrix(triu(program.P, format="csc")), program.q, rows, rhs, cones, self._settings(program, accuracy)
         )
         solution = solver.solve()
         dual, z_box = np.array(solution.z), np.zeros(n)
         z_box[above] = dual[e + r : e + r + above.size]
-        z_box[below] -= dual[e + r + above.size :]
+        z_box[below] -= dual[e + r + above.size : rhs.size - inside.size]
         kinds: dict[Any, Literal["solved", "infeasible"]] = {"Solved": "solved", "PrimalInfeasible": "infeasible"}
         claim = sr.Claim(
             kinds.get(str(solution.status), "failed"),
@@ -49,13 +53,14 @@ class Clarabel(sr.Solver, sr.Options):
         )
         return claim.judged(program, accuracy)
 
-    def _settings(self, accuracy: float) -> Any:
+    def _settings(self, program: sr.QuadraticProgram, accuracy: float) -> Any:
         import clarabel
 
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.max_iter = self.max_iterations
         settings.max_threads = 1
+        settings.equilibrate_enable = not program.cones  # rows have unit norm, and a cone scaled as one loses digits
         settings.tol_gap_abs = settings.tol_feas = settings.tol_gap_rel = accuracy
         settings.tol_infeas_abs = settings.tol_infeas_rel = accuracy
         return settings

@@ -31,7 +31,8 @@ NUMBERS = re.compile(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProgram:
-    """minimise ``1/2 x'P x + q'x`` subject to ``G x <= h``, ``A x = b``, ``lower <= x <= upper``.
+    """minimise ``1/2 x'P x + q'x`` subject to ``G x <= h``, ``A x = b``, ``lower <= x <= upper``, and to ``cones``
+    where there are any, which is for solvers alone that say that they are ``conic``.
 
     ``n`` variables, ``r`` rows, ``e`` equalities; ``r`` and ``e`` may be 0, the arrays are then empty and none is
     missing. ``P`` is the whole symmetric matrix, not one triangle of it, positive semidefinite, and often 0. ``h`` and
@@ -55,11 +56,24 @@ class QuadraticProgram:
     """``(n,)``, ``-inf`` where there is no bound."""
     upper: Array
     """``(n,)``, ``inf`` where there is no bound."""
+    cones: tuple[np.ndarray, ...] = ()
+    """The variables of each second-order cone: the first is at least the Euclidean norm of the others. No variable is
+    in two of them."""
+
+    def slope_missed(self, slope: Array) -> Array:
+        """By how much the slope ``(n,)`` of the Lagrangian of all that is no cone misses what it may be, ``(n,)``: 0,
+        and in a cone's variables a point of that cone."""
+        missed = np.abs(slope)
+        for cone in self.cones:
+            missed[cone] = 0.0
+            missed[cone[0]] = max(float(np.linalg.norm(slope[cone[1:]])) - slope[cone[0]], 0.0)
+        return missed
 
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """What a solver says: ``x (n,)``, and multipliers with ``P x + q + G'z + A'y + z_box = 0``.
+    """What a solver says: ``x (n,)``, and multipliers with ``P x + q + G'z + A'y + z_box = 0``; in the variables of a
+    cone that sum is the multiplier of the cone, and is in the cone.
 
     ``z (r,)`` of the rows is at least 0, and 0 where a row is not active. ``y (e,)`` of the equalities has any sign.
     ``z_box (n,)`` of the bounds is at most 0 at a lower and at least 0 at an upper bound, and 0 between them. Solvers
@@ -126,7 +140,8 @@ class Claim:
             (G @ x - program.h, abs(G) @ size + np.abs(program.h)),
             (np.abs(A @ x - program.b), abs(A) @ size + np.abs(program.b)),
             (outside, size),
-            (np.abs(slope), slopes),
+            (np.array([np.linalg.norm(x[cone[1:]]) - x[cone[0]] for cone in program.cones]), size),
+            (program.slope_missed(slope), slopes),
             (np.abs(terms.sum(keepdims=True)), np.abs(terms).sum(keepdims=True)),
         )
         return signs <= accuracy and all(
@@ -139,7 +154,7 @@ class Solver(ABC):
     """An inner convex solver: one quadratic program in, one claim out.
 
     Capabilities, declared by the adapter: ``warm_start`` (starts from its last solution), ``sparse`` (exploits sparse
-    rows), ``conic`` (accepts more than linear rows).
+    rows), ``conic`` (takes programs with ``cones``, second-order ones).
     """
 
     warm_start: ClassVar[bool] = False
@@ -184,20 +199,35 @@ class Auto(Solver, Options):
     general: Any = Field(default={"name": "piqp"}, json_schema_extra={"component": "solver"})
     """The solver that is asked where none of these answers."""
 
+    cones: Any = Field(default={"name": "clarabel"}, json_schema_extra={"component": "solver"})
+    """The solver that is asked where norms of groups are in the cost; one that is not conic leaves these to
+    ``general``."""
+
     _called: str = PrivateAttr(default=SOLVER)
+    _called_of_cones: str = PrivateAttr(default=SOLVER)
 
     @model_validator(mode="after")
     def _named(self) -> Auto:
         if isinstance(self.general, Mapping):
             self._called = str(self.general.get("name"))
-        if self._called == AUTO or isinstance(self.general, Auto):
-            raise InputError(path="general", expected="a solver that answers by itself", got=AUTO)
+        if isinstance(self.cones, Mapping):
+            self._called_of_cones = str(self.cones.get("name"))
+        for path, name in (("general", self._called), ("cones", self._called_of_cones)):
+            if name == AUTO or isinstance(getattr(self, path), Auto):
+                raise InputError(path=path, expected="a solver that answers by itself", got=AUTO)
         return self
 
     @property
     def called(self) -> str:
         """The name of the ``general`` solver."""
         return whole_name(self.general, self._called)
+
+    @property
+    def of_cones(self) -> tuple[Solver, str] | None:
+        """The solver of ``cones`` and its name, if it is conic."""
+        if not isinstance(self.cones, Solver) or not self.cones.conic:
+            return None
+        return self.cones, whole_name(self.cones, self._called_of_cones)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """See `Solver.solve`: the claim of the ``general`` solver."""
@@ -254,7 +284,8 @@ class Asked(Solver):
     """A solver, and the account of what it is asked: the number of ``calls`` of it, and its ``failures``.
 
     ``name``: whose its answers are. ``quick``: who may answer before it is asked (`CLOSED_FORM`, `DUAL_NEWTON` from the
-    last solution, `HIGHS`). ``instead``: who is asked where no answer of it is believed.
+    last solution, `HIGHS`). ``instead``: who is asked where no answer of it is believed. ``cones``: who is asked for a
+    program with second-order cones, and the name: itself, if it is conic and nobody else is given.
     """
 
     def __init__(
@@ -264,8 +295,10 @@ class Asked(Solver):
         quick: frozenset[str] = SHORTCUTS,
         instead: Asked | None = None,
         failures: Failures | None = None,
+        cones: tuple[Solver, str] | None = None,
     ) -> None:
         self.solver, self.name, self.quick, self.instead = solver, name, quick, instead
+        self.cones = (solver, name) if cones is None and solver.conic else cones
         self.calls, self.failures = 0, Failures() if failures is None else failures
 
     @staticmethod
@@ -279,14 +312,15 @@ class Asked(Solver):
                 quick = frozenset({solver.name} & {DUAL_NEWTON})
                 return Asked(solver.solver, solver.name, quick, Asked.of(solver.instead), solver.failures)
             case Auto():
-                return Asked(solver.general, solver.called)
+                return Asked(solver.general, solver.called, cones=solver.of_cones)
         return Asked(solver)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """See `Solver.solve`."""
         self.calls += 1
         self.failures.calls += 1
-        return self.solver.solve(program, accuracy)
+        asked = self.cones[0] if program.cones and self.cones is not None else self.solver
+        return asked.solve(program, accuracy)
 
 
 def named(solver: Solver, name: str, instead: Solver) -> Solver:

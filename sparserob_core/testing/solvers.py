@@ -281,22 +281,43 @@ class Question:
 
 
 def question(
-    name: str, rng: np.random.Generator, n: int, rows: int, equalities: int, bounded: bool, curved: bool
+    name: str,
+    rng: np.random.Generator,
+    n: int,
+    rows: int,
+    equalities: int,
+    bounded: bool,
+    curved: bool,
+    cones: tuple[int, ...] = (),
 ) -> Question:
-    """A program made from its optimum: rows of unit norm, every second one active; a third of the bounds reached."""
+    """A program made from its optimum: rows of unit norm, every second one active; a third of the bounds reached.
+    ``cones``: the sizes of those of the first variables; the optimum is on one, at the apex of the next, and inside of
+    the third."""
     from scipy.sparse import csc_array
 
     half = rng.normal(size=(n, n)) / np.sqrt(n)
     P = half @ half.T + 0.1 * np.eye(n) if curved else np.zeros((n, n))
     G, A = rng.normal(size=(rows, n)), rng.normal(size=(equalities, n))
     G, A = (M / np.linalg.norm(M, axis=1, keepdims=True) for M in (G, A))
-    x = rng.uniform(-1.0, 1.0, n)
+    x, pull, first = rng.uniform(-1.0, 1.0, n), np.zeros(n), 0
+    members = []
+    for number, size in enumerate(cones):
+        cone = np.arange(first, first + size)
+        norm = float(np.linalg.norm(x[cone[1:]]))
+        if number % 3 == 0:
+            x[cone[0]], pull[cone] = norm, 0.7 * np.append(norm, -x[cone[1:]])
+        elif number % 3 == 1:
+            pull[cone], x[cone] = np.append(norm + 0.4, x[cone[1:]]), 0.0
+        else:
+            x[cone[0]] = norm + 0.4
+        members.append(cone)
+        first += size
     z = np.where(np.arange(rows) % 2 == 0, rng.uniform(0.2, 1.0, rows), 0.0)
     side = np.arange(n) % 3 if bounded else np.full(n, 2)  # at the lower bound, at the upper one, at neither
     lower = np.where(side == 0, x, np.where(np.arange(n) % 2 == 0, -np.inf, x - 1.0)) if bounded else -np.inf
     upper = np.where(side == 1, x, np.where(np.arange(n) % 2 == 1, np.inf, x + 1.0)) if bounded else np.inf
     z_box = np.where(side == 0, -1.0, np.where(side == 1, 1.0, 0.0)) * rng.uniform(0.2, 1.0, n)
-    q = -(P @ x + G.T @ z + A.T @ rng.normal(size=equalities) + z_box)
+    q = pull - (P @ x + G.T @ z + A.T @ rng.normal(size=equalities) + z_box)
     scale = float(np.abs(q).max())
     program = QuadraticProgram(
         csc_array(P / scale),
@@ -307,12 +328,14 @@ def question(
         A @ x,
         np.broadcast_to(lower, n).astype(float),
         np.broadcast_to(upper, n).astype(float),
+        tuple(members),
     )
     return Question(name, program, objective(program, x))
 
 
-def questions() -> Iterator[Question]:
-    """Programs with and without curvature, rows, equalities and bounds; each has a solution."""
+def questions(conic: bool = False) -> Iterator[Question]:
+    """Programs with and without curvature, rows, equalities and bounds, and for a ``conic`` solver with cones; each has
+    a solution."""
     rng = np.random.default_rng(11)
     yield question("one variable", rng, 1, 1, 0, False, True)
     yield question("bounds only", rng, 7, 0, 0, True, True)
@@ -322,6 +345,10 @@ def questions() -> Iterator[Question]:
     yield question("everything, larger", rng, 60, 40, 10, True, True)
     yield question("a linear program", rng, 9, 12, 2, True, False)
     yield question("a linear program, larger", rng, 50, 60, 5, True, False)
+    if conic:
+        yield question("a cone", rng, 4, 3, 0, False, True, (4,))
+        yield question("cones and everything", rng, 20, 12, 3, True, True, (3, 2, 5, 4))
+        yield question("cones without curvature", rng, 24, 20, 2, True, False, (3, 3, 3, 3, 4, 4))
 
 
 def hopeless() -> Iterator[Question]:
@@ -374,7 +401,10 @@ def misses(program: QuadraticProgram, claim: Claim) -> dict[str, float]:
         "G x <= h": largest(program.G @ x - program.h),
         "A x = b": largest(np.abs(program.A @ x - program.b)),
         "lower <= x <= upper": largest(np.maximum(program.lower - x, x - program.upper)),
-        "P x + q + G'z + A'y + z_box = 0": largest(np.abs(stationary)),
+        "the first of a cone's variables is at least the norm of the others": largest(
+            np.array([np.linalg.norm(x[cone[1:]]) - x[cone[0]] for cone in program.cones])
+        ),
+        "P x + q + G'z + A'y + z_box = 0": largest(program.slope_missed(stationary)),
         "z >= 0": largest(-z),
         "z_box >= 0 where lower is -inf, z_box <= 0 where upper is inf": largest(
             np.concatenate([-z_box[open_below], z_box[open_above]])
@@ -437,7 +467,7 @@ class SolverContract(Contract[Solver], kind="solver"):
 
     def test_a_claim_satisfies_the_conditions_of_optimality(self) -> None:
         solver, given_up = self.create(), []
-        for one in questions():
+        for one in questions(solver.conic):
             claim = self.claim(solver, one)
             demand(
                 claim.status != "infeasible",

@@ -150,6 +150,10 @@ class _Solver(Solver):
     def delegate(self) -> str:
         return asked(self.origin, "delegate", lambda: self._solver.delegate, str)
 
+    @property
+    def conic(self) -> bool:  # type: ignore[override]
+        return self._solver.conic
+
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         claim = asked(self.origin, "solve", lambda: self._solver.solve(program, accuracy), Claim)
         if claim.status not in ("solved", "infeasible", "failed"):

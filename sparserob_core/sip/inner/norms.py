@@ -108,11 +108,12 @@ def _renumbered(number: np.ndarray) -> np.ndarray:
     return answer
 
 
-def of_the_rest(directions: Directions, moving: Bool[np.ndarray, " b"]) -> Directions:
-    """The directions of the blocks that are not ``moving (b,)``, by their numbers among those."""
+def of_the_rest(directions: Directions, moving: Bool[np.ndarray, " b"], width: int) -> Directions:
+    """The directions of the blocks that are not ``moving (b,)``, by their numbers among those, of which the largest has
+    ``width`` entries."""
     kept = ~moving[directions.block]
     numbers = np.cumsum(~moving) - 1
-    return Directions(numbers[directions.block[kept]], directions.vectors[kept])
+    return Directions(numbers[directions.block[kept]], directions.vectors[kept, :width])
 
 
 def _unit(blocks: Blocks, image: Array) -> Directions:

@@ -36,7 +36,7 @@ from sparserob_core.sip.inner.dual_newton import polish
 from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
-from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
+from sparserob_core.sip.inner.standard_form import Form, Recovered, has_cones, standard_form
 from sparserob_core.sip.inner.vertex import many, sifted, simplex
 from sparserob_core.sip.solver import Asked, Claim, QuadraticProgram, Solver
 
@@ -154,8 +154,9 @@ def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
 
 
 def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:
-    """Norms of blocks as the largest of ``d's`` over finitely many directions (Kelley 1960), those of the answers and
-    those that their multipliers ask for, until the cost with the norms themselves meets the bound."""
+    """Norms of blocks as second-order cones, where there is a solver that takes them (`_conic`); else as the largest of
+    ``d's`` over finitely many directions (Kelley 1960), those of the answers and those that their multipliers ask for,
+    until the cost with the norms themselves meets the bound."""
     program, directions = case.program, around(blocks)
     if guess is not None and np.isfinite(guess.x).all():
         wanted = towards(program, blocks, guess.x, guess.y, guess.mu, guess.z)
@@ -167,6 +168,9 @@ def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) ->
             believed, _, _ = _newton(case, blocks, ACCURACIES[0] * case.tolerance, directions, start, np.inf)
             if believed is not None:
                 return replace(believed, directions=directions)
+    believed = _conic(case, blocks, directions)
+    if believed is not None:
+        return believed
     for accuracy in ACCURACIES:
         believed, proof, directions = _kelley(case, blocks, accuracy * case.tolerance, directions)
         if believed is None:
@@ -174,6 +178,28 @@ def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) ->
         if believed is not None:
             return replace(believed, directions=directions)
     return replace(_failed(case), directions=directions)
+
+
+def _conic(case: _Case, blocks: Blocks, directions: Directions) -> FiniteSolution | None:
+    """A believed answer of a solver that takes second-order cones, or its proof that there is none; ``None`` without
+    such a solver. Along a norm whose bounds are reached the cost is flat, and the bound asks for more digits of the
+    decision than such a solver has: Newton's method goes on from there, with ``directions`` for the blocks that are
+    0."""
+    program, cones = case.program, case.solver.cones
+    if cones is None or not has_cones(program, blocks):
+        return None
+    for accuracy in ACCURACIES:
+        claim, answer = _ask(case, program, "cones", accuracy * case.tolerance)
+        if claim is not None and claim.status == "infeasible":
+            proof = _proof(case, answer, "the solver's ray")
+            return None if proof is None else replace(proof, by=cones[1])
+        if answer is not None and np.isfinite(answer[0]).all():
+            believed, gap = _looked_at(case, answer, "with cones", cones[1])
+            if believed is None and program.S is None and gap < np.inf:
+                believed, _, _ = _newton(case, blocks, accuracy * case.tolerance, directions, answer, gap)
+            if believed is not None:
+                return believed
+    return case.blunt
 
 
 def _kelley(
@@ -208,14 +234,16 @@ def _kelley(
     return None, None, directions
 
 
-def _looked_at(case: _Case, answer: Recovered) -> tuple[FiniteSolution | None, float]:
+def _looked_at(
+    case: _Case, answer: Recovered, name: str = "by directions", by: str = ""
+) -> tuple[FiniteSolution | None, float]:
     """A believed solution, if the answer is one, and its gap: with its own multipliers or those of the tangent there,
     whichever prove more."""
     x, y, mu, z = answer
     gap = np.inf
     for offer in ((y, mu), vertex_multipliers(case.program.tangent(x), x, y, mu)):
         solution = measure(case.program, x, *offer, z, message="claimed")
-        believed = case.judge(solution, "by directions")
+        believed = case.judge(solution, name, by)
         gap = min(gap, solution.gap if solution.residual <= CRUDE else np.inf)
         if believed is not None:
             return believed, gap
@@ -235,7 +263,7 @@ def _newton(
         if not moving.any():
             break
         step = bent(program, blocks, here, moving)
-        rest = None if step.blocks is None else of_the_rest(directions, moving)
+        rest = None if step.blocks is None else of_the_rest(directions, moving, step.blocks.table.shape[1])
         _, found = _ask(case, step, "epigraph", accuracy, rest)
         if found is None or not np.isfinite(found[0]).all():
             break

@@ -18,14 +18,14 @@ from sparserob_core.sip.solver import Claim, QuadraticProgram
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-Form: TypeAlias = Literal["split", "epigraph"]
+Form: TypeAlias = Literal["split", "epigraph", "cones"]
 Recovered: TypeAlias = tuple[Array, Array, Array, Array | None]
 
 
 @dataclass(frozen=True, eq=False)
 class ImageModel:
     """The image as ``s = T v + offset`` of variables ``lower <= v <= upper`` with cost ``cost'v`` and rows
-    ``R v <= right``.
+    ``R v <= right``; in each of ``cones`` the first variable is at least the norm of the others.
 
     Column ``j`` of ``T`` has the single entry ``sign[j]`` (0 for an epigraph variable) in row ``entry[j]``.
     """
@@ -38,6 +38,7 @@ class ImageModel:
     upper: Array
     R: csc_array | None
     right: Array
+    cones: tuple[np.ndarray, ...] = ()
 
 
 _models = Memory(16)
@@ -53,8 +54,12 @@ def standard_form(
     With ``S`` the identity ``x`` is substituted (a diagonal ``P`` is put on both parts, which are complementary at an
     optimum, so that the split program stays strictly convex); otherwise ``S x = s`` are equality rows. The cost is
     divided by its largest linear coefficient, rows by their norm; rows that hold nothing (zero, or with an infinite
-    right-hand side) are left out. Norms of blocks get ``t >= d's`` for the ``directions`` given, in the epigraph form.
+    right-hand side) are left out. Norms of blocks get ``t >= d's`` for the ``directions`` given, in the epigraph form,
+    and ``t >= |s|`` itself in the form ``cones``.
     """
+    if program.blocks is not None and form == "cones":
+        model = _with_cones(_epigraph_model(program, program.blocks.number < 0), program, program.blocks)
+        return _substituted(program, model) if program.S is None else _lifted(program, model)
     if program.blocks is not None and directions is not None:
         model = _with_norms(_epigraph_model(program, program.blocks.number < 0), program, program.blocks, directions)
         return _substituted(program, model) if program.S is None else _lifted(program, model)
@@ -138,6 +143,35 @@ def _with_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, direc
     )
 
 
+def _with_cones(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
+    """The model with one variable for every block, which costs the block's weight and is at least its norm. An entry
+    that is fixed is fixed at 0 (`has_cones`), and is in no cone."""
+    from scipy.sparse import csc_array, hstack
+
+    count, tops = blocks.first.size, model.entry.size
+    of = np.full(program.weights.size + 1, -1)  # where an entry is among the variables; none is where -1 stands
+    of[model.entry[model.sign > 0]] = np.flatnonzero(model.sign > 0)
+    places = of[blocks.table]
+    R = None if model.R is None else csc_array(hstack([model.R, csc_array((model.R.shape[0], count))]))
+    return ImageModel(
+        np.concatenate([model.entry, blocks.first]),
+        np.concatenate([model.sign, np.zeros(count)]),
+        model.offset,
+        np.concatenate([model.cost, program.weights[blocks.first]]),
+        np.concatenate([model.lower, np.zeros(count)]),
+        np.concatenate([model.upper, np.full(count, np.inf)]),
+        R,
+        model.right,
+        tuple(np.concatenate([[tops + b], mine[mine >= 0]]) for b, mine in enumerate(places)),
+    )
+
+
+def has_cones(program: FiniteProgram, blocks: Blocks) -> bool:
+    """Whether `standard_form` has one with ``cones``: no entry of a block is fixed at anything but 0."""
+    lower, upper = program.lower[blocks.entries], program.upper[blocks.entries]
+    return not ((lower == upper) & (lower != 0.0)).any()
+
+
 def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
     """Variables ``v``; ``x = T v + offset``."""
     from scipy.sparse import csc_array
@@ -157,7 +191,7 @@ def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticPr
     equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, model)
     G = _stack(rows, model.R)
     right = np.concatenate([h, model.right])
-    qp = QuadraticProgram(P, cost / kappa, G, right, _stack(equal, None), b, model.lower, model.upper)
+    qp = QuadraticProgram(P, cost / kappa, G, right, _stack(equal, None), b, model.lower, model.upper, model.cones)
 
     def recover(claim: Claim) -> Recovered:
         x = model.offset + np.bincount(model.entry, model.sign * claim.x, program.n)
@@ -200,6 +234,7 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
         np.concatenate([b, model.offset[held]]),
         np.concatenate([-free, model.lower]),
         np.concatenate([free, model.upper]),
+        tuple(n + cone for cone in model.cones),
     )
 
     def recover(claim: Claim) -> Recovered:
