@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
@@ -9,10 +13,13 @@ from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.shapes import Bool, Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
 DEFINITE = 1e-12  # relative to the largest, how negative the eigenvalues of a Hessian are made
 SLOPE = 1e-9  # relative to the Hessian, that at which a side of the box is left again
 ROUNDS = 3  # of the active set method, per variable
-FACES_KEPT = 256  # matrices of faces that a space remembers
+FACES_KEPT = 256  # faces that a space remembers
 
 
 @shaped
@@ -67,23 +74,42 @@ def distinct_patterns(ends: Float[Array, "k r nu"]) -> tuple[Float[Array, "u nu"
     return patterns, which.reshape(ends.shape[:2])
 
 
-@shaped
-def face_matrix(space: TaylorSpace, ends: Float[Array, " nu"]) -> Float[Array, "M M"]:
-    """The matrix ``(M, M)`` that sets the variables with ``ends (nu,)`` not 0 to them, in coefficient vectors on its
-    right; remembered."""
+@final
+@dataclass(frozen=True, eq=False)
+class Face:
+    """A side of the box, on which some variables are at an end: every monomial is ``sign (M,)``, 1 or -1, times
+    another one there, ``target (M,)``."""
+
+    target: np.ndarray
+    sign: Array
+
+    def onto(self, monomials: np.ndarray) -> tuple[np.ndarray, Array]:
+        """The monomials ``(j,)`` that are left of some ``(k,)`` with the constant, and the matrix ``(j, k)`` that
+        makes coefficients of these those of them."""
+        left, place = np.unique(self.target[monomials], return_inverse=True)
+        matrix = np.zeros((left.size, monomials.size))
+        matrix[place.reshape(-1), np.arange(monomials.size)] = self.sign[monomials]
+        return left, matrix
+
+    @cached_property
+    def matrix(self) -> csr_array:
+        """That of all monomials, ``(M, M)``."""
+        from scipy.sparse import csr_array
+
+        size = self.target.size
+        return csr_array((self.sign, (self.target, np.arange(size))), shape=(size, size))
+
+
+def face_of(space: TaylorSpace, ends: Array) -> Face:
+    """The face on which the variables with ``ends (nu,)`` not 0 are at them; remembered."""
     key = ends.tobytes()
-    if key not in space.faces:
-        remember(space.faces, key, _face_matrix(space, ends), FACES_KEPT)
-    return space.faces[key]
+    return space.faces.get(key) or remember(space.faces, key, _face(space, ends), FACES_KEPT)
 
 
-def _face_matrix(space: TaylorSpace, ends: Array) -> Array:
+def _face(space: TaylorSpace, ends: Array) -> Face:
     fixed = ends != 0
     sign = np.prod(np.where(fixed, ends, 1.0) ** space.exponents, axis=1)
-    target = [space.index[tuple(exponents)] for exponents in np.where(fixed, 0, space.exponents).tolist()]
-    matrix = np.zeros((space.size, space.size))
-    matrix[target, np.arange(space.size)] = sign
-    return matrix
+    return Face(space.places(np.where(fixed, 0, space.exponents)), sign)
 
 
 @shaped

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from itertools import combinations_with_replacement
-from typing import NoReturn, final
+from typing import TYPE_CHECKING, NoReturn, final
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,9 @@ from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
+if TYPE_CHECKING:
+    from sparserob_core.control.enclosures.polynomial import Face
+
 _NUMBERS = (float, int, np.floating, np.integer)
 _LARGEST_POWER = 64
 
@@ -40,7 +43,7 @@ class TaylorSpace:
 
     ``exponents (M, nu)`` in graded order, the constant first; ``degrees (M,)``; ``index`` from an exponent tuple to its
     place; ``products``: three arrays ``(left, right, target)``, every pair of monomials whose product is in the space;
-    ``faces``: what `face_matrix` remembers.
+    ``faces``: what `face_of` remembers.
     """
 
     def __init__(self, nu: int, degree: int) -> None:
@@ -57,12 +60,18 @@ class TaylorSpace:
         self.degrees: npt.NDArray[np.int64] = self.exponents.sum(axis=1)
         self.even: npt.NDArray[np.bool_] = (self.exponents % 2 == 0).all(axis=1)
         left, right = np.nonzero(self.degrees[:, None] + self.degrees <= degree)
-        codes = self.exponents @ (degree + 1) ** np.arange(nu, dtype=np.int64)
-        order = np.argsort(codes)
-        target = order[np.searchsorted(codes[order], codes[left] + codes[right])]
+        self._bases = (degree + 1) ** np.arange(nu, dtype=np.int64)
+        codes = self.exponents @ self._bases
+        self._order = np.argsort(codes)
+        self._codes = codes[self._order]
+        target = self._order[np.searchsorted(self._codes, codes[left] + codes[right])]
         self.products = (left, right, target)
         self.terms = int(np.bincount(target).max())  # products that add up to one coefficient, at most
-        self.faces: dict[bytes, Array] = {}
+        self.faces: dict[bytes, Face] = {}
+
+    def places(self, exponents: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
+        """The places ``(k,)`` of monomials of the space with these ``exponents (k, nu)``."""
+        return np.asarray(self._order[np.searchsorted(self._codes, exponents @ self._bases)])
 
     @property
     def size(self) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix
+from sparserob_core.control.enclosures.polynomial import Face, distinct_patterns, face_of
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem, Past
@@ -65,7 +65,7 @@ class DisturbanceSupport:
             ),
         )
 
-    def _summed(self, blocks: Array, face: Array | None) -> Array:
+    def _summed(self, blocks: Array, face: Face | None) -> Array:
         return summed(self.disturbance.set, blocks, face, self._monomials, self._space.size)
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -353,7 +353,7 @@ def _carry(past: Past, disturbance: DisturbanceModel) -> Carried:
 
 
 def over_faces(
-    space: TaylorSpace, ends: Array, parts: Callable[[np.ndarray, Array | None], Array]
+    space: TaylorSpace, ends: Array, parts: Callable[[np.ndarray, Face | None], Array]
 ) -> tuple[Array, Array]:
     """Coefficients ``(k, r, M)`` and excess ``(k, r)`` where every functional has its own pattern of ``ends (k, r,
     nu)``; ``parts(here, face)`` gives both as ``(k', r, M + 1)`` for the times ``here`` on one face of the cell."""
@@ -364,7 +364,7 @@ def over_faces(
     patterns, which = distinct_patterns(ends)
     coefficients, excess = np.empty((k, r, space.size)), np.empty((k, r))
     for position, pattern in enumerate(patterns):
-        face = face_matrix(space, pattern) if pattern.any() else None
+        face = face_of(space, pattern) if pattern.any() else None
         here = (which == position).any(axis=1)
         found = parts(here, face)
         mine = which[here] == position
@@ -373,20 +373,19 @@ def over_faces(
 
 
 def summed(
-    bound: ConvexSet, blocks: Array, face: Array | None, monomials: np.ndarray | None = None, size: int = 0
+    bound: ConvexSet, blocks: Array, face: Face | None, monomials: np.ndarray | None = None, size: int = 0
 ) -> Array:
     """Per block in ``bound``: the polynomial under the centre's worst point, and the excess as one more entry; from
     Taylor coefficients ``(k, r, M, nb, q)``.
 
     ``monomials (M,)``: whose they are where these are not all ``size`` of a space; the others are 0, in many
-    dimensions most of them. On a ``face (M', M')`` only monomials of the variables that it leaves are looked at.
+    dimensions most of them. On a ``face`` only monomials of the variables that it leaves are looked at.
     """
     k, r, given, count, width = blocks.shape
     kept = np.arange(given) if monomials is None else monomials
     if face is not None:
-        onto = face[:, kept]
-        kept = np.flatnonzero(onto.any(axis=1))  # with the constant, which a face leaves where it is
-        blocks = (onto[kept] @ blocks.reshape(k, r, given, count * width)).reshape(k, r, kept.size, count, width)
+        kept, onto = face.onto(kept)
+        blocks = (onto @ blocks.reshape(k, r, given, count * width)).reshape(k, r, kept.size, count, width)
     size = given if monomials is None else size
     point = bound.support_point(blocks[:, :, 0])
     polynomials = np.zeros((k, r, count, size + 1))

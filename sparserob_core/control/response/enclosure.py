@@ -19,7 +19,7 @@ import numpy as np
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
+from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_of, monotone_ends, polynomial_bound
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.response.initial_support import Supports
@@ -288,7 +288,7 @@ def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
     for position, pattern in enumerate(patterns):
         if pattern.any():
             here = which == position
-            on_faces[here] = coefficients[here] @ face_matrix(space, pattern).T
+            on_faces[here] = (face_of(space, pattern).matrix @ coefficients[here].T).T
     return on_faces
 
 

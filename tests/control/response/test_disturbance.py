@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from sparserob_core.control.enclosures.combination import combination
-from sparserob_core.control.enclosures.polynomial import face_matrix
+from sparserob_core.control.enclosures.polynomial import face_of
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.response.disturbance import disturbance_model
@@ -183,12 +183,12 @@ def test_coefficients_that_are_0_are_left_out_and_change_nothing(name, ends):
     rng, space = np.random.default_rng(5), TaylorSpace(2, 2)
     larger = combination(space, 2)
     blocks = rng.normal(size=(3, 3, space.size, 4, 2)) * 0.3 ** space.degrees[:, None, None]
-    face = None if ends is None else face_matrix(larger.space, np.array(ends))
+    face = None if ends is None else face_of(larger.space, np.array(ends))
     dense = larger.apply(blocks)
     whole = summed(BOUNDS[name], dense, face)
     few = summed(BOUNDS[name], blocks.reshape(3, 1, -1, 4, 2), face, larger.targets.reshape(-1), larger.space.size)
     np.testing.assert_allclose(few, whole, rtol=1e-13, atol=1e-13)
-    onto = dense if face is None else np.einsum("ab,krbnq->kranq", face, dense)
+    onto = dense if face is None else np.einsum("ab,krbnq->kranq", face.matrix.toarray(), dense)
     s = rng.uniform(-1.0, 1.0, (50, 4))
     s = s if ends is None else np.where(np.array(ends) != 0.0, ends, s)
     powers = np.prod(s[:, None] ** larger.space.exponents, axis=2)
