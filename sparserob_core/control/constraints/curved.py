@@ -149,7 +149,8 @@ class CurvedConstraint(StateConstraint):
 
         start = np.full(self._b, STEP)
         z, found = climb(height, indices[:, first:], start, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
-        return np.hstack([indices[:, :first], z]), found
+        turned = np.hstack([indices[:, :first], z])
+        return turned, found if self.functionals.measurable is None else self._height(x, turned)
 
     @shaped
     def _at(self, times: Float[Array, " k"], positions: Int[np.ndarray, "k q"]) -> Float[Array, "k j"]:

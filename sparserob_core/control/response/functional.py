@@ -246,7 +246,8 @@ class WorstCase:
     def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
         """``max_w c'x(t)`` at a decision as a function of the direction alone, at ``times (k,)`` and ``parameters (k,
         nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, as many at each, ``(j,)``. Weights are
-        linear in the direction, so that those of the axes are computed once."""
+        linear in the direction, so that those of the axes are computed once. What measurable disturbances add is not,
+        and is only about right."""
         known, model = self._axes(times, parameters), self.disturbance
         states = known.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", known.control, self.on_grid(theta))
         by_block, measurable = None if model is None else model.on_blocks, self.measurable
@@ -264,7 +265,7 @@ class WorstCase:
                     on_blocks = turned @ blocks[at].reshape(*blocks[at].shape[:2], -1)
                     found[part] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
             if measurable is not None:
-                found += measurable(times[which], directions, parameters[which]).reshape(found.shape)
+                found += measurable.roughly(times[which], directions, parameters[which]).reshape(found.shape)
             return found.reshape(-1)
 
         return along

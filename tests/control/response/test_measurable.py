@@ -195,3 +195,16 @@ def test_the_halves_of_a_polynomial_are_itself():
     for u in (0.0, 0.3, 1.0):
         np.testing.assert_allclose(at(halves[:2], u), at(points, u / 2), atol=1e-14)
         np.testing.assert_allclose(at(halves[2:], u), at(points, 0.5 + u / 2), atol=1e-14)
+
+
+@pytest.mark.parametrize("name", sorted(BOUNDS))
+def test_a_rough_support_is_near_the_support(name):
+    """It says where to climb to; what is found there is measured anew."""
+    rng = np.random.default_rng(4)
+    system = random_system(rng, speed=2.0)
+    times, directions, none = rng.uniform(0.0, HORIZON, 40), rng.normal(size=(40, 2)), np.zeros((40, 0))
+    for pieces, share in ((6, 2e-3), (24, 2e-4)):
+        support = worst_case(system, uniform(pieces, HORIZON), bound=BOUNDS[name], kind="measurable").measurable
+        exact, rough = support(times, directions, none), support.roughly(times, directions, none)
+        assert np.abs(rough - exact).max() <= share * np.abs(exact).max()
+        assert (rough != exact).any()
