@@ -156,6 +156,7 @@ from sparserob_core.sip.events import Sketch as Sketch
 from sparserob_core.sip.events import Event as Event
 from sparserob_core.sip.events import ProofProgress as ProofProgress
 from sparserob_core.sip.events import RoundFinished as RoundFinished
+from sparserob_core.sip.events import StageProgress as StageProgress
 from sparserob_core.experiment.run.inspection import Inspection as Inspection
 from sparserob_core.experiment.run.inspection import RelaxedValue as RelaxedValue
 from sparserob_core.experiment.run.landscape import Landscape as Landscape

@@ -12,7 +12,7 @@ import sparserob_core as sr
 from sparserob_progress.screen import Screen
 from sparserob_progress.status import Status, duration
 
-SHOWN = (sr.RoundFinished, sr.EvaluationsFinished, sr.ProofProgress, sr.StudyProgress)
+SHOWN = (sr.RoundFinished, sr.EvaluationsFinished, sr.ProofProgress, sr.StageProgress, sr.StudyProgress)
 
 
 class ProgressObserver(sr.Observer, sr.Options):

@@ -21,7 +21,7 @@ class Status:
         self.round: sr.RoundFinished | None = None
         self.searched: sr.EvaluationsFinished | None = None
         self.proving: sr.ProofProgress | None = None
-        self.study: sr.StudyProgress | None = None
+        self.now = ""  # what goes on beside rounds, or after the method
         self.lower, self.upper, self.gap, self.proven = -math.inf, math.inf, math.inf, math.inf
         self.phase = "relax"  # with a relaxed program every method begins
         self.result: sr.Result | None = None
@@ -35,7 +35,7 @@ class Status:
         """Take note of an event."""
         match event:
             case sr.RoundFinished():
-                self.round, self.proving, self.study, self.phase = event, None, None, "relax"
+                self.round, self.proving, self.now, self.phase = event, None, "", "relax"
                 self.lower = max(self.lower, event.lower_bound)
                 self.upper = min(self.upper, math.inf if event.simplified else event.upper_bound, event.proven)
                 self.gap, self.proven = math.inf if event.simplified else event.gap, event.proven
@@ -44,8 +44,11 @@ class Status:
                 self.lower = max(self.lower, event.lower_bound)
             case sr.ProofProgress():
                 self.searched, self.proving, self.phase = None, event, "proof"
+            case sr.StageProgress():
+                self.searched, self.proving, self.now = None, None, event.text
+                self.phase = event.text.partition(":")[0]
             case sr.StudyProgress():
-                self.searched, self.proving, self.study = None, None, event
+                self.searched, self.proving, self.now = None, None, event.text
                 self.phase = event.text.partition(":")[0] if event.phase else ""
                 if event.result is not None:
                     self._ended(event.result)
@@ -72,8 +75,8 @@ class Status:
         if self.proving is not None:
             parts.append(("proof", _proof(self.proving)))
             parts += [("stuck", self.proving.hindrance)] if self.proving.hindrance else []
-        if self.study is not None:
-            parts.append(("now", self.study.text))
+        if self.now:
+            parts.append(("now", self.now))
         return parts
 
     def last(self, event: sr.Event) -> str:
@@ -87,7 +90,7 @@ class Status:
                 return "  ".join(["search " + _search(event), _notes(event)]).strip()
             case sr.ProofProgress():
                 return f"proof {_proof(event)}"
-            case sr.StudyProgress():
+            case sr.StageProgress() | sr.StudyProgress():
                 return event.text
             case _:
                 return type(event).__name__

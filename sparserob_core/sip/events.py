@@ -55,11 +55,20 @@ def forwarded(notify: Notify, kind: type[T], complete: Callable[[T], Event]) -> 
     return lambda event: notify(complete(event) if isinstance(event, kind) else event)
 
 
-def proofs_only(notify: Notify) -> Notify:
-    """A listener that passes on how proofs go on, of a program beside the one whose rounds are told."""
+def beside(notify: Notify, stage: str) -> Notify:
+    """A listener to a program beside the one whose rounds are told: of its rounds it passes on that they go on, in this
+    ``stage``, and how its proofs do; that the stage begins is told at once."""
     if notify is ignore:
         return ignore
-    return lambda event: notify(event) if isinstance(event, ProofProgress) else None
+
+    def heard(event: Event) -> None:
+        if isinstance(event, RoundFinished):
+            notify(StageProgress(text=f"{stage}: round {event.round}, {event.active_indices} cuts"))
+        elif isinstance(event, ProofProgress):
+            notify(event)
+
+    notify(StageProgress(text=f"{stage}: begins"))
+    return heard
 
 
 def frozen(array: Array) -> Array:
@@ -237,6 +246,14 @@ class ProofProgress(Event):
     bound_before: float = np.nan
     hindrance: str = ""
     measured: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StageProgress(Event):
+    """A method goes on with a program beside the one whose rounds are told; ``text`` says which up to a colon, and then
+    how far it is."""
+
+    text: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -119,13 +119,37 @@ def test_the_phase_is_named_and_what_is_proven(monkeypatch: pytest.MonkeyPatch) 
     assert status.line().endswith("phase relax")
     figures = sr.StudyProgress(text="figures: the worst cases", phase=True)
     study = sr.StudyProgress(text="3 of 7 loops", done=3, total=7)
-    for event in (ROUND, PROOF, SEARCH, finished_round(3, proven=0.5), figures, study):
+    stage = sr.StageProgress(text="weighted program 2 of at most 10: round 3, 7 cuts")
+    for event in (ROUND, PROOF, SEARCH, stage, finished_round(3, proven=0.5), figures, study):
         status.receive(event)
         said.append(dict(status.parts()).get("phase"))
-    assert said == ["relax", "proof", "search", "relax", "figures", None]
+    assert said == ["relax", "proof", "search", "weighted program 2 of at most 10", "relax", "figures", None]
     assert "proven a control of cost 0.5" in status.line()
     assert "proven 0.5" in status.last(finished_round(3, proven=0.5))
     assert status.last(figures) == "figures: the worst cases"
+    assert status.last(stage) == stage.text
+    status.receive(stage)
+    assert status.line().endswith(f"now {stage.text}")
+
+
+@pytest.mark.parametrize(
+    ("method", "stages"),
+    [
+        ("sparsest", ["least cost, to compare with"]),
+        ("reweighted", ["weighted program 1 of at most 10"]),
+    ],
+)
+def test_programs_beside_the_one_whose_rounds_are_told_are_told_as_stages(method: str, stages: list[str]) -> None:
+    said: list[sr.Event] = []
+    A, b = np.array([[3.0, 2.0, 1.0, 1.0], [1.0, 2.0, 3.0, 1.0]]), np.array([2.5, 2.5])
+    program = sr.SemiInfiniteProgram(
+        n=4, weights=np.array([1.0, 1.1, 1.0, 0.6]), lower=-1.0, upper=1.0, G=-A, h=-b, activity=np.ones(4)
+    )
+    sr.solve(program, method=method, notify=said.append)
+    told = [event.text for event in said if isinstance(event, sr.StageProgress)]
+    begun = [text.partition(":")[0] for text in told]
+    assert [stage for stage in stages if stage not in begun] == []
+    assert any(text.endswith("cuts") for text in told)
 
 
 def test_the_upper_bound_is_said_to_be_proven_once_it_is() -> None:

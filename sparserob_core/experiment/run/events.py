@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
 
-from sparserob_core.sip.events import EvaluationsFinished, Event, ProofProgress, RoundFinished
+from sparserob_core.sip.events import EvaluationsFinished, Event, ProofProgress, RoundFinished, StageProgress
 
 if TYPE_CHECKING:
     from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -28,6 +28,7 @@ __all__ = [
     "RoundFinished",
     "RunFinished",
     "RunStarted",
+    "StageProgress",
     "StudyProgress",
     "SweepFinished",
     "SweepProgress",

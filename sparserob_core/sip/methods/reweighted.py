@@ -17,7 +17,7 @@ from pydantic import Field
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import ignore, proofs_only
+from sparserob_core.sip.events import beside
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
@@ -60,13 +60,14 @@ class Reweighted(Method, Options):
         best, spent = first.decision, list[Result]()
         x = best
         known = [*first.indices, *first.dual.cuts]
-        plain = replace(tools, notify=ignore, regulariser=None)
+        plain = replace(tools, regulariser=None)
         exchange = Exchange(tolerance=self.tolerance, rounds=self.rounds)
-        for _ in range(self.passes):
+        for number in range(1, self.passes + 1):
             if tools.deadline.passed:
                 break
+            told = replace(plain, notify=beside(tools.notify, f"weighted program {number} of at most {self.passes}"))
             heavier = replace(program, weights=program.finite.weights * self._weights(program, x), twin=None)
-            found = exchange.close(heavier, plain, unproven, imposed_cuts(known))
+            found = exchange.close(heavier, told, unproven, imposed_cuts(known))
             spent.append(found)
             if found.decision is None or found.status not in PROVEN:
                 break
@@ -121,7 +122,7 @@ def on_support(
     off = ~acts & (prices > 0.0)
     lower, upper = np.where(off, 0.0, base.lower), np.where(off, 0.0, base.upper)
     narrow = replace(program, lower=lower, upper=upper, twin=None)
-    quiet = replace(tools, notify=proofs_only(tools.notify))
+    quiet = replace(tools, notify=beside(tools.notify, "least cost on the entries that were found"))
     return exchange.close(narrow, quiet, prover_of(program, quiet), imposed_cuts(known))
 
 

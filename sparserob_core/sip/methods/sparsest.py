@@ -19,7 +19,7 @@ from pydantic import Field, field_validator
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import RoundFinished, forwarded, ignore, proofs_only
+from sparserob_core.sip.events import RoundFinished, StageProgress, beside, forwarded, ignore
 from sparserob_core.sip.evidence import Cut, Leaf, Sparsest
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.branching import Branching, proposed
@@ -117,7 +117,7 @@ class SparsestMethod(Method, Options):
         """An optimum of the program's own cost, to compare with; none with an alphabet."""
         if self.alphabet is not None:
             return None
-        tools = replace(tools, notify=proofs_only(tools.notify))
+        tools = replace(tools, notify=beside(tools.notify, "least cost, to compare with"))
         return Exchange(tolerance=self.tolerance, rounds=self.rounds).solve(program, tools)
 
 
@@ -329,6 +329,7 @@ class _Search:
         crude = self.letters is not None and self.best is None
         norms = np.linalg.norm(self.rows.G, axis=1)
         rows = replace(self.rows, h=self.rows.h - self.margin * norms) if crude else self.rows
+        self.tools.notify(StageProgress(text="proposal: which entries may be fewer, by the mixed-integer solver"))
         x = proposed(self.bounded, self.relaxed, rows, self.letters, ANY if crude else 0.0)
         if x is None and crude and self.margin > 0.0:
             self.margin, self.roomy = 0.0, False
