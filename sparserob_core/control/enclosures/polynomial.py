@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, final
-
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.taylor import Face, TaylorSpace
 from sparserob_core.shapes import Bool, Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 DEFINITE = 1e-12  # relative to the largest, how negative the eigenvalues of a Hessian are made
 SLOPE = 1e-9  # relative to the Hessian, that at which a side of the box is left again
@@ -72,32 +65,6 @@ def distinct_patterns(ends: Float[Array, "k r nu"]) -> tuple[Float[Array, "u nu"
         return np.zeros((1, 0)), np.zeros(ends.shape[:2], dtype=int)
     patterns, which = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
     return patterns, which.reshape(ends.shape[:2])
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Face:
-    """A side of the box, on which some variables are at an end: every monomial is ``sign (M,)``, 1 or -1, times
-    another one there, ``target (M,)``."""
-
-    target: np.ndarray
-    sign: Array
-
-    def onto(self, monomials: np.ndarray) -> tuple[np.ndarray, Array]:
-        """The monomials ``(j,)`` that are left of some ``(k,)`` with the constant, and the matrix ``(j, k)`` that
-        makes coefficients of these those of them."""
-        left, place = np.unique(self.target[monomials], return_inverse=True)
-        matrix = np.zeros((left.size, monomials.size))
-        matrix[place.reshape(-1), np.arange(monomials.size)] = self.sign[monomials]
-        return left, matrix
-
-    @cached_property
-    def matrix(self) -> csr_array:
-        """That of all monomials, ``(M, M)``."""
-        from scipy.sparse import csr_array
-
-        size = self.target.size
-        return csr_array((self.sign, (self.target, np.arange(size))), shape=(size, size))
 
 
 def face_of(space: TaylorSpace, ends: Array) -> Face:

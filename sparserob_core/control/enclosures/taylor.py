@@ -8,6 +8,8 @@ what it may have rounded to the remainder; numbers that do not depend on the par
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import TYPE_CHECKING, NoReturn, final
 
@@ -30,10 +32,36 @@ from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from sparserob_core.control.enclosures.polynomial import Face
+    from scipy.sparse import csr_array
 
 _NUMBERS = (float, int, np.floating, np.integer)
 _LARGEST_POWER = 64
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Face:
+    """A side of the box, on which some variables are at an end: every monomial is ``sign (M,)``, 1 or -1, times
+    another one there, ``target (M,)``."""
+
+    target: np.ndarray
+    sign: Array
+
+    def onto(self, monomials: np.ndarray) -> tuple[np.ndarray, Array]:
+        """The monomials ``(j,)`` that are left of some ``(k,)`` with the constant, and the matrix ``(j, k)`` that
+        makes coefficients of these those of them."""
+        left, place = np.unique(self.target[monomials], return_inverse=True)
+        matrix = np.zeros((left.size, monomials.size))
+        matrix[place.reshape(-1), np.arange(monomials.size)] = self.sign[monomials]
+        return left, matrix
+
+    @cached_property
+    def matrix(self) -> csr_array:
+        """That of all monomials, ``(M, M)``."""
+        from scipy.sparse import csr_array
+
+        size = self.target.size
+        return csr_array((self.sign, (self.target, np.arange(size))), shape=(size, size))
 
 
 @final

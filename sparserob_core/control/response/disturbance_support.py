@@ -11,8 +11,8 @@ import numpy as np
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.polynomial import Face, distinct_patterns, face_of
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_of
+from sparserob_core.control.enclosures.taylor import Face, TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem, Past
 from sparserob_core.control.response.response import Impulses
