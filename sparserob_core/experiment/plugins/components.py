@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from typing import Any, final
 
@@ -37,6 +38,7 @@ class Part:
     of: type | None = None
 
 
+@cache
 def parts(model: type[Options]) -> dict[str, Part]:
     """The options that are components themselves, by name, as `sparserob_core.options.part` says."""
     extras = {key: field.json_schema_extra for key, field in model.model_fields.items()}
