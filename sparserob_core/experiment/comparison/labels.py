@@ -40,9 +40,10 @@ def _differences(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]]) 
     for section in config:
         if section in UNSEEN:
             continue
-        if section in COMPONENTS and len({_name(peer, section) for peer in peers}) > 1:
-            yield f"{section} {_name(config, section)}"
-        yield from (f"{section} {option}" for option in _options(config, peers, section))
+        if section in COMPONENTS and len({_called(peer, section) for peer in peers}) > 1:
+            yield f"{section} {_called(config, section)}"
+        same = [peer for peer in peers if _called(peer, section) == _called(config, section)]
+        yield from (f"{section} {option}" for option in _options(config, same, section))
 
 
 def _options(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]], section: str) -> Iterator[str]:
@@ -62,6 +63,14 @@ def _options(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]], sect
 def _name(config: Mapping[str, Any], section: str) -> str:
     entry = config.get(section)
     return str(entry.get("name", "")) if isinstance(entry, Mapping) else "none"
+
+
+def _called(config: Mapping[str, Any], section: str) -> str:
+    """The name of a component, and in brackets that of the one that it hands the work to: an option of its own that is
+    called like the section, such as the ``solver`` of qpsolvers."""
+    entry = config.get(section)
+    delegate = entry.get(section) if isinstance(entry, Mapping) else None
+    return f"{_name(config, section)} ({delegate})" if isinstance(delegate, str) else _name(config, section)
 
 
 def _with_seeds(found: list[str], seeds: list[object]) -> list[str]:

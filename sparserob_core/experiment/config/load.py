@@ -17,7 +17,7 @@ from sparserob_core.experiment.config.overrides import Override, apply_override,
 from sparserob_core.experiment.config.reader import Source, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.plugins.components import Registry
-from sparserob_core.experiment.plugins.messages import Complaint, complaints, malformed
+from sparserob_core.experiment.plugins.messages import Complaint, complaints, malformed, models_in
 from sparserob_core.experiment.plugins.registry import load_registry
 
 KEPT = {*MaximiserEntry.model_fields} - {"name"}  # keys of a maximiser that are the framework's own
@@ -130,7 +130,7 @@ def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple
     try:
         checked = RunConfig.model_validate(data)
     except ValidationError as error:
-        wrong += complaints(error, RunConfig, data)
+        wrong += complaints(error, RunConfig, data, list(_below(data, registry)))
     plain = checked.plain() if checked else data
     for path, kind, entry in _entries(plain):
         options = {
@@ -147,6 +147,19 @@ def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple
         if typed is not None:
             entry.update(typed.model_dump(mode="json", by_alias=True))
     return (RunConfig.model_validate(plain) if not wrong else None), wrong
+
+
+def _below(data: dict[str, Any], registry: Registry) -> Iterator[str]:
+    """The keys of the sections, with the section in front: the options of the components that stand there."""
+    for path, slot in SLOTS.items():
+        entry = _at(data, path)
+        name = entry.get("name") if isinstance(entry, dict) else slot.name
+        if name in registry.names(slot.kind):
+            fields = registry.get(slot.kind, str(name)).options_type().model_fields
+            yield from (dotted((*path, field.alias or key)) for key, field in fields.items())
+    for section, inner in RunConfig.model_fields.items():
+        for model in models_in(inner.annotation):
+            yield from (dotted((section, key)) for key in model.model_fields if key != "name")
 
 
 def _entries(data: dict[str, Any]) -> Iterator[tuple[Path, str, dict[str, Any]]]:

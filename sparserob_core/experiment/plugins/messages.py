@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -58,18 +58,27 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """``; did you mean 'x'? (known: ...)``, with the nearest of the known names first."""
+def nearest(name: str, known: Iterable[str], below: Iterable[str] = ()) -> str:
+    """``; did you mean 'x'? (known: ...)``, with the nearest of the known names first. ``below``: keys under them, such
+    as ``problem.horizon``, which come before what looks alike where their last step is the name, and after it else."""
     names = sorted(known)
     if not names:
         return "; there are none"
-    close = difflib.get_close_matches(str(name).lower(), names, n=2, cutoff=0.6)
+    asked = str(name).lower()
+    further = {key.rpartition(".")[2]: key for key in reversed(list(below))}  # the first of those called the same
+    close = [further[asked]] if asked in further else []
+    close += difflib.get_close_matches(asked, names, n=2 - len(close), cutoff=0.6)
+    if not close:
+        close = [further[last] for last in difflib.get_close_matches(asked, further, n=1, cutoff=0.6)]
     guess = "; did you mean " + " or ".join(repr(match) for match in close) + "?" if close else ";"
     return f"{guess} (known: {', '.join(names)})" if close else f"; known: {', '.join(names)}"
 
 
-def complaints(error: ValidationError, model: type[BaseModel], data: object) -> list[Complaint]:
-    """One complaint per key; what several members of a union say of one key is joined by *or*."""
+def complaints(
+    error: ValidationError, model: type[BaseModel], data: object, below: Sequence[str] = ()
+) -> list[Complaint]:
+    """One complaint per key; what several members of a union say of one key is joined by *or*. ``below``: keys further
+    down that may have been meant by an unknown one at the top."""
     found: dict[Path, list[tuple[str, str]]] = {}
     items = error.errors(include_url=False)
     misspelt = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
@@ -79,7 +88,7 @@ def complaints(error: ValidationError, model: type[BaseModel], data: object) -> 
         path = visible(item["loc"], data, missing=item["type"] == "missing")
         path += tuple(item.get("ctx", {}).get("below", ())) if item["type"] == COMPLAINT else ()
         faults = found.setdefault(path, [])
-        fault = _fault(dict(item), model)
+        fault = _fault(dict(item), model, below)
         if fault not in faults:
             faults.append(fault)
     return [Complaint(path, _joined(faults)) for path, faults in found.items()]
@@ -115,7 +124,7 @@ def visible(loc: Path, data: object, missing: bool = False) -> Path:
     return tuple(path)
 
 
-def _fault(item: dict[str, Any], model: type[BaseModel]) -> tuple[str, str]:
+def _fault(item: dict[str, Any], model: type[BaseModel], below: Sequence[str]) -> tuple[str, str]:
     """What is wrong, and the value that was given; empty where the sentence names it or there is none."""
     got = shown(item["input"])
     match item["type"]:
@@ -123,7 +132,9 @@ def _fault(item: dict[str, Any], model: type[BaseModel]) -> tuple[str, str]:
             return "missing, and it has no default", ""
         case "extra_forbidden":
             known = _known_keys(model, item["loc"][:-1])
-            return f"unknown key{nearest(str(item['loc'][-1]), known) if known else '; it has no options'}", ""
+            further = below if len(item["loc"]) == 1 else ()
+            said = nearest(str(item["loc"][-1]), known, further) if known else "; it has no options"
+            return f"unknown key{said}", ""
         case "value_error":
             cause = item.get("ctx", {}).get("error")
             return str(cause), "" if isinstance(cause, InputError) and cause.got else got

@@ -191,6 +191,25 @@ def test_labels_say_what_differs_and_nothing_else() -> None:
     assert labels([config_of()], [False]) == ["exchange"]
 
 
+def test_a_solver_that_hands_the_work_to_another_is_told_with_it() -> None:
+    osqp, daqp = ({"name": "qpsolvers", "solver": name} for name in ("osqp", "daqp"))
+    exact = {**osqp, "eps_abs": 1e-9}
+    assert labels([config_of(), config_of(solver=osqp)], [False, False]) == [
+        "exchange, solver piqp",
+        "exchange, solver qpsolvers (osqp)",
+    ]
+    assert labels([config_of(solver=one) for one in ({"name": "piqp"}, osqp, daqp, exact)], [False] * 4) == [
+        "exchange, solver piqp",
+        "exchange, solver qpsolvers (osqp)",
+        "exchange, solver qpsolvers (daqp)",
+        "exchange, solver qpsolvers (osqp), solver eps_abs 1e-09",
+    ]
+    assert labels([config_of(solver=osqp), config_of(solver=daqp)], [False, False]) == [
+        "exchange, solver qpsolvers (osqp)",
+        "exchange, solver qpsolvers (daqp)",
+    ]
+
+
 def test_options_of_a_component_are_compared_between_runs_that_have_it() -> None:
     wide = {"name": "random_search", "budget": 50, "rule": {"name": "geometric", "factor": 0.5}}
     configs = [config_of(**SEARCH), config_of(method=SEARCH["method"], maximiser=wide)]

@@ -681,6 +681,7 @@ def test_the_directory_of_a_run_has_a_name_for_readers(counting: Path, tmp_path:
         (["sweep", "counting.yaml", "seed=0:5", "--random", "0"], "number: expected how many points to draw"),
         (["sweep", "counting.yaml", "seed=0,1", "--executor", "nosuch"], "no executor is named 'nosuch'"),
         (["sweep", "nothing.yaml", "seed=0,1"], "nothing.yaml: there is no such file"),
+        (["sweep", "counting.yaml", "horizon=1,2"], "horizon: unknown key; did you mean 'problem.horizon'?"),
         (["sweep", "counting.yaml", "sed=0,1"], "sed: unknown key; did you mean 'seed'?"),
     ],
 )
