@@ -30,6 +30,7 @@ nb_execution_mode = "cache"
 nb_execution_cache_path = str(Path(__file__).resolve().parents[1] / ".docs_cache")
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
+nb_render_markdown_format = "myst"  # what a cell shows as Markdown has tables, as the pages have
 nb_merge_streams = True
 nb_output_stderr = "warn"  # a cell that complains, such as an observer that is detached, fails the build
 

@@ -14,14 +14,14 @@ from ruamel.yaml import YAML
 import sparserob_core as sr
 from make_site.docstrings import safe
 from make_site.gallery import gallery
-from sparserob_core.experiment.config.option_rows import option_rows
+from sparserob_core.experiment.config.option_rows import OptionRow, option_rows
 from sparserob_core.experiment.plugins.records import Plugin
 
 DOCS = Path(__file__).resolve().parents[1]
 OUT = DOCS / "generated"
 WHEN = DOCS / "make_site" / "when.yaml"
 TABLE = Path(sr.__file__).with_suffix(".pyi")
-PLURAL = {"policy": "policies"}
+PLURAL = {"policy": "policies", "dictionary": "dictionaries"}
 
 
 def write() -> None:
@@ -119,9 +119,16 @@ def _component(record: Plugin, when: str) -> str:
 
 
 def _options(record: Plugin) -> list[str]:
-    rows = [[f"`{row.name}`", row.type, row.default, row.range, row.meaning] for row in option_rows(record)]
-    table = ["| option | type | default | range | meaning |", "|---|---|---|---|---|"]
+    """Three columns, so that the meaning has room beside the contents and on a narrow screen."""
+    rows = [[f"`{row.name}`", _value(row), row.meaning] for row in option_rows(record)]
+    table = ["| option | value | meaning |", "|---|---|---|"]
     return [*table, *("| " + " | ".join(map(_cell, row)) + " |" for row in rows)] if rows else ["None of its own."]
+
+
+def _value(row: OptionRow) -> str:
+    """What may be given, and what holds where nothing is."""
+    default = row.default if row.default in {"", "required"} else f"{row.default} unless given"
+    return ", ".join(part for part in (row.type, row.range, default) if part)
 
 
 def _cell(text: str) -> str:

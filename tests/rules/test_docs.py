@@ -8,6 +8,7 @@ second one runs every page as a reader does, in a shell.
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shlex
@@ -115,6 +116,24 @@ def test_links_between_pages_lead_somewhere() -> None:
     links = [(page, link) for page in PAGES for link in LINK.findall(page.read_text())]
     inside = [(page, link) for page, link in links if not link.startswith(("http://", "https://"))]
     assert not [f"{relative(page)}: {link}" for page, link in inside if not (page.parent / link).exists()]
+
+
+def cells(line: str) -> int:
+    return len(re.split(r"(?<!\\)\|", line.strip().strip("|")))
+
+
+def test_rows_of_a_table_have_as_many_cells_as_its_head() -> None:
+    """A rule of another length makes text with bars of it all, and further cells are lost without a word."""
+    tables, wrong = 0, list[str]()
+    for page in PAGES:
+        lines = FENCE.sub("", page.read_text()).splitlines()
+        for number, line in enumerate(lines):
+            if re.fullmatch(r"\|[ :|-]*-[ :|-]*\|", line.strip()) and lines[number - 1].startswith("|"):
+                rows = itertools.takewhile(lambda row: row.startswith("|"), lines[number:])
+                tables, head = tables + 1, cells(lines[number - 1])
+                wrong += [f"{relative(page)}: {row}" for row in rows if cells(row) != head]
+    assert tables > 50
+    assert not wrong
 
 
 def test_make_targets_that_a_page_names_exist() -> None:

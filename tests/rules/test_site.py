@@ -34,6 +34,17 @@ def test_every_public_name_is_on_one_page_of_the_site():
     assert sorted(names) == sorted(sr.__all__)
 
 
+def test_the_options_of_a_component_say_what_may_be_given_and_what_holds_otherwise():
+    from make_site.generated import components
+
+    pages = dict(components())
+    rows = pages["components/problem/linear.md"].splitlines()
+    assert "| option | value | meaning |" in rows
+    assert any(row.startswith("| `horizon` | number, > 0.0, required | ") for row in rows)
+    assert any(row.startswith("| `cost.l1` | number, >= 0.0, 1.0 unless given | ") for row in rows)
+    assert pages["components/dictionary/index.md"].startswith("# Dictionaries\n")
+
+
 @pytest.mark.parametrize(
     "plain, safe",
     [
@@ -87,3 +98,4 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "\N{EN DASH}" not in re.sub(r"<code.*?</code>", "", (tmp_path / "reference.html").read_text())
     assert (tmp_path / "generated" / "components" / "maximiser" / "sequool.html").exists()
+    assert not [page for page in tmp_path.rglob("*.html") if "<p>|" in page.read_text()], "a table that is none"
