@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 from abc import ABC
 from collections.abc import Callable, Mapping
@@ -55,6 +56,15 @@ def without_output(test: Callable[..., None]) -> Callable[..., None]:
     return watched
 
 
+def _waits_for_arguments(given: Callable[..., object]) -> bool:
+    """Whether it is a method, a function with arguments, or a fixture of pytest, none of which can be called as it is.
+    What a class asks for, its own error says."""
+    if not inspect.isfunction(given):
+        return type(given).__module__.startswith("_pytest.")
+    parameters = inspect.signature(given).parameters.values()
+    return any(one.default is one.empty and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters)
+
+
 class Contract(ABC, Generic[Component]):
     """What every component of a kind must keep: subclass the contract of the kind in a test module as
     ``class TestMine(...)``, and say with the class attribute ``component`` what is tested.
@@ -86,12 +96,13 @@ class Contract(ABC, Generic[Component]):
             options = {"name": given} if isinstance(given, str) else dict(given)
             name = str(options.pop("name"))
             made: object = load_registry().build(self.kind, name, options)
-        elif callable(given):
+        elif callable(given) and not _waits_for_arguments(given):
             made = given()
         else:
             raise TypeError(
                 f"{type(self).__name__}: expected the attribute `component`: the class of the {self.kind}, a function "
-                f"without arguments that makes one, or its name in a config; got {given!r}"
+                "without arguments that makes one, or its name in a config (a method is called `create`); "
+                f"got {given!r}"
             )
         expected = self.expected()
         if not isinstance(made, expected):

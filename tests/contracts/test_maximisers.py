@@ -283,6 +283,8 @@ class TestAMaximiserThatSpendsItsBudgetInOneCall(MaximiserContract):
     [
         (None, "expected the attribute `component`: the class of the maximiser"),
         (Uniform(), "expected the attribute `component`"),
+        (lambda self: Uniform(), r"\(a method is called `create`\)"),
+        (pytest.fixture(lambda: None), "expected the attribute `component`"),
         (dict, "gave {}, expected a Maximiser"),
         ("no_such", "no maximiser is named 'no_such'"),
     ],
