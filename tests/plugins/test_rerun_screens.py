@@ -4,6 +4,7 @@ that contradicts another line."""
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import sparserob_core as sr
 pytest.importorskip("rerun")
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from sparserob_core.experiment.run.replay import stored_result, stored_run
 from sparserob_rerun.drawing.canvas import Axes, Drawing
@@ -174,7 +176,7 @@ def test_what_a_drawing_has_no_more_is_taken_away() -> None:
     assert gone == {"here/bound", "here/dots"}
 
 
-@pytest.mark.parametrize(("horizon", "left"), [(5.0, -60.0), (7200.0, -96.0), (0.5, -78.0)])
+@pytest.mark.parametrize(("horizon", "left"), [(5.0, -72.0), (7200.0, -108.0), (0.5, -90.0)])
 def test_the_map_has_room_for_the_numbers_of_its_times(horizon: float, left: float) -> None:
     from sparserob_rerun.search.views import landscape
 
@@ -186,6 +188,55 @@ def test_an_upper_bound_of_a_simpler_program_is_none() -> None:
     paper = Paper()
     Bounds(rr, paper).add(replace(entry(1, 0.5, 0.7), simplified=True))
     assert "0.5 ≤ J* ≤ unknown" in " ".join(paper.labels("rounds/picture/bounds/labels"))
+
+
+def test_what_was_proven_on_the_way_is_an_upper_bound_of_a_search() -> None:
+    event = replace(entry(1, 0.5, np.inf), proven=0.75, violation=-1.0)
+    paper = Paper()
+    Bounds(rr, paper).add(event)
+    assert "0.5 ≤ J* ≤ 0.75" in " ".join(paper.labels("rounds/picture/bounds/labels"))
+    (said,) = words.round_lines(event, None)
+    assert "lower bound 0.5, proven: a control of cost 0.75;" in said
+    (same,) = words.round_lines(replace(event, upper_bound=0.75), None)
+    assert "upper bound 0.75" in same and "proven" not in same
+
+
+def test_a_run_that_was_stopped_in_its_first_round_has_its_bounds_drawn() -> None:
+    paper = Paper()
+    Bounds(rr, paper).end(0.25, np.inf, np.inf)
+    assert "0.25 ≤ J* ≤ unknown" in " ".join(paper.labels("rounds/picture/bounds/labels"))
+
+
+def test_a_share_has_the_whole_of_its_range_upwards() -> None:
+    from sparserob_rerun.search.views import notes
+
+    shares = {one.name: one.properties.get("ScalarAxis") for one in notes(rrb, {"temperature", "accepted"})}
+    (share,) = [axis for axis in shares.values() if axis is not None]
+    assert share.range.as_arrow_array().to_pylist() == [[0.0, 1.0]] and len(shares) == 2
+
+
+WIDE, HIGH = 5.8, 25.0  # pixels of a letter, and of a line of words, on a screen of 1600 by 1000
+PADDING = 12.0
+
+
+def over(labels: list[tuple[np.ndarray, str, Any]], scale: float) -> list[tuple[str, str]]:
+    """Words that lie on one another, in a panel in which a unit of the drawing is ``scale`` pixels."""
+    found = []
+    for (here, one, _), (there, other, _) in combinations(labels, 2):
+        room = ((len(one) + len(other)) * WIDE / 2 + PADDING, HIGH)
+        found += [(one, other)] * bool((np.array(room) - scale * np.abs(here - there) > 1.0).all())
+    return found
+
+
+@pytest.mark.parametrize("low", [-1.0, -1.02, -0.5, -1.04e-9, 0.0])
+@pytest.mark.parametrize("below", [False, True])
+def test_no_number_of_an_axis_lies_on_another(low: float, below: bool) -> None:
+    """In the panels as they are on the first screen: violation, control and states, the map."""
+    for height, room, scale, name in ((112.0, 1.15, 0.66, "t"), (118.0, 1.0, 0.67, "t"), (384.0, 1.4, 0.46, "")):
+        drawing = Drawing()
+        axes = Axes(60.0, 0.0, 640.0, height, (0.0, 5.0), (low, 1.2 * max(-low, 1e-9) if low else 5.0))
+        drawing.frame(axes, "", name, ticks_below=below, room=room)
+        assert over(drawing.labels, scale) == []
 
 
 def test_the_strip_of_a_clash_is_as_far_from_its_wall_as_it_misses(infeasible: sr.Outcome) -> None:

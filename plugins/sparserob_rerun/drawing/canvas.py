@@ -20,6 +20,10 @@ LINE = 34.0  # units between two numbers on an axis upwards: a line of words is 
 LEAST = 5e-4
 """Of the best value, the least height of a panel that shows values. With a tenth of it the numbers beside it are wider
 than their room; with ten times as much, the last tenths of a search look flat."""
+LIFTED, BELOW = 8.0, 17.0  # how far above the lower edge the lowest number upwards is, and how far below those across
+ASIDE = 13.0
+"""How much further left the lowest number upwards is where there are numbers across. With 0 it lies on the first of
+them, with much more it is outside the panel."""
 LETTER = 5.0  # half the width of a letter, in units of a drawing that is a little smaller than its panel
 SHOWN: WeakKeyDictionary[Any, dict[str, set[str]]] = WeakKeyDictionary()
 """What the last drawing below each path had, of every stream: the viewer keeps an entity until it hears of it again."""
@@ -90,7 +94,7 @@ class Drawing:
         which is more in a panel that is small."""
         left, top, right, bottom = axes.left, axes.top, axes.left + axes.width, axes.top + axes.height
         self.line("frame", np.array([[left, top], [left, bottom], [right, bottom]]), GREY, 1.0)
-        upwards = _apart(axes, room * LINE, decades)
+        upwards = _apart(axes, room * LINE, decades, room * LIFTED)
         digits = next(
             n for n in range(6, 18) if len({f"{value:.{n}g}" for value in upwards}) == upwards.size or n == 17
         )
@@ -98,19 +102,20 @@ class Drawing:
             y = float(axes.at(axes.x[0], value)[0, 1])
             self.line("frame", np.array([[left - 5, y], [left, y]]), GREY, 1.0)
             words = f"1e{value:g}" if decades else f"{value:.{digits}g}"
-            # above the corner, where the first number across has its place
-            self.text(left - room * (10 + LETTER * len(words)), min(y, bottom - 8 * room), words, GREY)
+            y = min(y, bottom - room * LIFTED)  # above the corner, where the first number across has its place
+            aside = ASIDE if ticks_below and y > bottom + room * (BELOW - LINE) else 0.0
+            self.text(left - room * (10 + aside + LETTER * len(words)), y, words, GREY)
         for value in ticks(*axes.x):
             x = float(axes.at(value, axes.y[0])[0, 0])
             self.line("frame", np.array([[x, bottom], [x, bottom + 5]]), GREY, 1.0)
             if ticks_below:
-                self.text(x, bottom + 17 * room, f"{value:g}", GREY)
+                self.text(x, bottom + BELOW * room, f"{value:g}", GREY)
         if axes.y[0] < 0.0 < axes.y[1]:
             self.line("frame", axes.at(np.array(axes.x), np.zeros(2)), FAINT, 0.7)
         if title:
             self.text((left + right) / 2, top - 16 * room, title)
         if x_label:
-            self.text(right + room * (14 + LETTER * len(x_label)), bottom - 12 * room, x_label, GREY)
+            self.text(right + room * (22 + LETTER * len(x_label)), bottom - 12 * room, x_label, GREY)
 
     def band(self, layer: str, axes: Axes, x: Floats, lower: Floats, upper: Floats, colour: Colour) -> None:
         """The area between two curves, as upright strokes."""
@@ -184,13 +189,16 @@ class Drawing:
             )
 
 
-def _apart(axes: Axes, line: float, whole: bool) -> Floats:
+def _apart(axes: Axes, line: float, whole: bool, lifted: float = 0.0) -> Floats:
     """Round numbers on the axis upwards, as many as there is room for: a ``line`` from one to the next; two at least,
-    where there are as many. ``whole``: no others than whole ones."""
+    where there are as many. ``whole``: no others than whole ones; ``lifted``: how far above the lower edge the lowest
+    one is written at least."""
     choices = [values for values in (ticks(*axes.y, most) for most in (5, 4, 3, 2, 1)) if values.size > 1]
     choices = [values for values in choices if not whole or (values == np.rint(values)).all()] or [ticks(*axes.y)]
     unit = axes.height / (axes.y[1] - axes.y[0])
-    return next((v for v in choices if v.size > 1 and unit * float(np.diff(v).min()) >= line), choices[-1])
+    heights = [np.maximum(unit * (values - axes.y[0]), lifted) for values in choices]
+    fit = (v for v, h in zip(choices, heights, strict=True) if v.size > 1 and float(np.diff(h).min()) >= line)
+    return next(fit, choices[-1])
 
 
 def ticks(low: float, high: float, most: int = 5) -> Floats:

@@ -33,16 +33,17 @@ class Bounds:
 
     def add(self, event: sr.RoundFinished) -> None:
         """One more round: all of them are drawn anew. What is an upper bound of a program with less uncertainty only is
-        none."""
-        upper = np.inf if event.simplified else event.upper_bound
+        none; the cost of a decision that was proven is one."""
+        upper = min(np.inf if event.simplified else event.upper_bound, event.proven)
         self.rows.append((float(event.round), event.lower_bound, upper, event.gap, event.violation))
         self._draw(np.array(self.rows))
 
     def end(self, lower: float, upper: float, gap: float) -> None:
-        """The bounds that the run ended with, and their gap: rounding, and what was proven last, have moved them."""
-        if self.rows and np.isfinite(lower):
-            number, _, _, _, violation = self.rows[-1]
-            self.rows[-1] = (number, lower, upper, gap, violation)
+        """The bounds that the run ended with, and their gap: rounding, and what was proven last, have moved them. A run
+        that was stopped in its first round has no other ones."""
+        if np.isfinite(lower):
+            number, *_, violation = self.rows.pop() if self.rows else (1.0, np.nan)
+            self.rows.append((number, lower, upper, gap, violation))
             self._draw(np.array(self.rows))
 
     def _draw(self, rows: Floats) -> None:

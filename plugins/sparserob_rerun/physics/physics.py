@@ -23,7 +23,7 @@ LAYERS = ("hatch", "tube", "frame", "marks", "worst", "curve", "wall")
 
 def extent(count: int) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of ``count`` plots above one another."""
-    return -20.0, LEFT + WIDTH + 64.0, -36.0, count * (HEIGHT + GAP) + 8.0
+    return -20.0, LEFT + WIDTH + 76.0, -36.0, count * (HEIGHT + GAP) + 8.0
 
 
 @final
@@ -135,7 +135,7 @@ class Physics:
             axes,
             f"how the constraints push the nominal {name}; 1 is what its largest size costs"
             if self.switching.peak
-            else f"why {name} switches: it acts where the push of the constraints leaves the band",
+            else f"why {name} switches: it acts where the push leaves the band",
             _time(data),
             ticks_below=last,
         )

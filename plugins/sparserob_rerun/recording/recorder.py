@@ -267,7 +267,7 @@ class Recorder:
     def _round(self, event: sr.RoundFinished) -> None:
         self.timelines.move(None if self.searches else event.relaxed_programs, event.round, event.seconds)
         self.lower = max(self.lower, event.lower_bound)
-        self.upper = min(self.upper, np.inf if event.simplified else event.upper_bound)
+        self.upper = min(self.upper, np.inf if event.simplified else event.upper_bound, event.proven)
         self.draw(BOUNDS, self.rounds.bounds, event)
         lines = words.round_lines(event, self.inspection)
         for line in lines:

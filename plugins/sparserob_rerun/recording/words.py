@@ -33,8 +33,10 @@ def round_lines(event: sr.RoundFinished, inspection: sr.Inspection | None) -> li
         violated = f"every constraint holds with {-event.violation:.2e}{unit} to spare"
     if event.simplified:
         violated += ", with some of the uncertainty only"
-    known_above = math.isfinite(event.upper_bound) and not event.simplified
-    bound = f"lower bound {event.lower_bound:.7g}" + (f", upper bound {event.upper_bound:.7g}" if known_above else "")
+    above = math.inf if event.simplified else event.upper_bound
+    bound = f"lower bound {event.lower_bound:.7g}" + (f", upper bound {above:.7g}" if math.isfinite(above) else "")
+    if event.proven < above:
+        bound += f", proven: a control of cost {event.proven:.7g}"
     lines = [f"round {event.round}: {bound}; {violated}; epsilon {event.epsilon:.1e}"]
     for word, cuts in (("+", event.added), ("-", event.dropped)):
         lines += [f"{word} {cut_words(cut, inspection)}" for cut in cuts[:CUTS]]

@@ -54,8 +54,8 @@ class Terrain:
         )
         (one, other), drawing, axes = landscape.names(self.unit), Drawing(), self._axes(landscape)
         drawing.frame(axes, "", room=1.4)
-        drawing.text(axes.width / 2, axes.height + 72.0, f"across: {one}", ink.GREY)
-        drawing.text(axes.width / 2, -44.0, f"up: {other}", ink.GREY)
+        drawing.text(axes.width / 2, axes.height + 80.0, f"across: {one}", ink.GREY)
+        drawing.text(axes.width / 2, -62.0, f"up: {other}", ink.GREY)
         two = landscape.first[0] != landscape.second[0]
         weight = [f"epsilon {landscape.epsilon:.3g}"] if landscape.epsilon > 0.0 else []
         both = ["over the two indices that decide most"] if two else []

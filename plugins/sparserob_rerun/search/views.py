@@ -23,7 +23,7 @@ def landscape(searches: bool, answers: bool, horizon: float = 1.0) -> Any:
     return view("/landscape/map", f"{name}: when the run is over" if answers else name, (left, *EXTENT[1:]))
 
 
-EXTENT = (-60.0, 1090.0, -76.0, 520.0)
+EXTENT = (-72.0, 1090.0, -94.0, 520.0)
 LETTER, LETTERS = 18.0, 2  # how much room a letter takes, and how many have it within the `EXTENT`
 
 
@@ -33,10 +33,15 @@ def climb() -> Any:
 
 
 def series(
-    rrb: Any, origin: str, name: str, contents: list[str] | None = None, legend: Literal["left", "right"] = "right"
+    rrb: Any,
+    origin: str,
+    name: str,
+    contents: list[str] | None = None,
+    legend: Literal["left", "right"] = "right",
+    limits: tuple[float, float] | None = None,
 ) -> Any:
     """A plot against the timeline that shows the whole of it, however long it is. ``legend``: the upper corner in which
-    the names of its lines are."""
+    the names of its lines are; ``limits``: of the axis upwards, where they are known before."""
     from rerun.encodings import TimeRange
 
     everything = TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
@@ -48,6 +53,7 @@ def series(
             corner=rrb.Corner2D.RightTop if legend == "right" else rrb.Corner2D.LeftTop, visible=contents is None
         ),
         axis_x=rrb.TimeAxis(view_range=everything),
+        axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
     )
 
 
@@ -59,7 +65,8 @@ def notes(rrb: Any, told: Collection[str]) -> list[Any]:
 
 def _note(rrb: Any, name: str) -> Any:
     words = NOTES.get(name, (name, ink.GREY))[0]
-    return series(rrb, "/search/notes", words[0].upper() + words[1:], [f"+ /search/notes/{name}"])
+    limits = (0.0, 1.0) if name in SHARES else None  # of a narrow range of its own the viewer writes one number only
+    return series(rrb, "/search/notes", words[0].upper() + words[1:], [f"+ /search/notes/{name}"], limits=limits)
 
 
 def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:

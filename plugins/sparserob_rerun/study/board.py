@@ -21,6 +21,7 @@ LEFT, WIDTH, HEIGHT = 150.0, 620.0, 330.0
 EXTENT = (0.0, LEFT + WIDTH + 40.0, -62.0, HEIGHT + 116.0)
 """Left, right, top and bottom of the map."""
 LETTER = 8.0  # pixels, about
+VEIL = 8.0  # pixels by which the veil behind words is wider than they are
 CORNER = 9.0  # pixels of a mark from the corner of a cell that has words
 SHADE = 0.35  # of the colour of a status, for a cell: words are bright, and are to be read on it
 LINE = 22.0  # pixels between two labels above one another
@@ -66,7 +67,7 @@ class Scale:
         found = list[tuple[float, str]]()
         for place, words in shown:
             pixel = float(at(place))
-            wide = max(room, LETTER * len(words) if room > LINE else 0.0)
+            wide = max(room, LETTER * len(words) + VEIL if room > LINE else 0.0)
             if not found or abs(pixel - found[-1][0]) >= wide:
                 found.append((pixel, words))
         return found
