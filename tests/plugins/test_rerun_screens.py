@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 
 from sparserob_core.experiment.run.replay import stored_result, stored_run
 from sparserob_rerun.drawing.canvas import Axes, Drawing
-from sparserob_rerun.exchange.bounds import FEWEST, Bounds
+from sparserob_rerun.exchange.bounds import FEWEST, ONE, Bounds
 from sparserob_rerun.exchange.clash import draw_clash, extent
 from sparserob_rerun.exchange.rounds import Rounds, Worst, told_by_result
 from sparserob_rerun.physics.pages import heading, pages
@@ -163,6 +163,20 @@ def test_numbers_beside_the_bounds_differ_and_have_room(gap: float) -> None:
     assert len(numbers) >= 2 and len(set(numbers)) == len(numbers) and max(map(len, numbers)) <= 7
 
 
+@pytest.mark.parametrize("lower", [0.0, 0.217, 0.63204925, -3.5])
+def test_no_word_of_the_bounds_lies_on_another(lower: float) -> None:
+    for upper in (np.inf, lower + 1e-8, lower + 0.3):
+        paper = Paper()
+        picture = Bounds(rr, paper)
+        for number in (1, 2):
+            picture.add(entry(number, lower if number == 2 else 0.0, upper))
+        kept = paper.kept["rounds/picture/bounds/labels"][0]
+        places = [np.array(at) for at in kept.positions.as_arrow_array().to_pylist()]
+        words = paper.labels("rounds/picture/bounds/labels")
+        assert over([(at, one, None) for at, one in zip(places, words, strict=True)], 0.63) == []
+        assert min(at[0] - len(one) * WIDE / 1.26 for at, one in zip(places, words, strict=True)) > ONE[0]
+
+
 def test_what_a_drawing_has_no_more_is_taken_away() -> None:
     paper, before = Paper(), Drawing()
     before.line("bound", np.zeros((2, 2)), (0, 0, 0, 255))
@@ -212,7 +226,8 @@ def test_a_share_has_the_whole_of_its_range_upwards() -> None:
 
     shares = {one.name: one.properties.get("ScalarAxis") for one in notes(rrb, {"temperature", "accepted"})}
     (share,) = [axis for axis in shares.values() if axis is not None]
-    assert share.range.as_arrow_array().to_pylist() == [[0.0, 1.0]] and len(shares) == 2
+    ((low, high),) = share.range.as_arrow_array().to_pylist()
+    assert low < 0.0 and high > 1.0 and len(shares) == 2
 
 
 WIDE, HIGH = 5.8, 25.0  # pixels of a letter, and of a line of words, on a screen of 1600 by 1000
@@ -232,7 +247,8 @@ def over(labels: list[tuple[np.ndarray, str, Any]], scale: float) -> list[tuple[
 @pytest.mark.parametrize("below", [False, True])
 def test_no_number_of_an_axis_lies_on_another(low: float, below: bool) -> None:
     """In the panels as they are on the first screen: violation, control and states, the map."""
-    for height, room, scale, name in ((112.0, 1.15, 0.66, "t"), (118.0, 1.0, 0.67, "t"), (384.0, 1.4, 0.46, "")):
+    panels = [(112.0, 1.15, 0.66, "t"), (118.0, 1.0, 0.67, "t"), (384.0, 1.4, 0.46, "")]
+    for height, room, scale, name in panels:
         drawing = Drawing()
         axes = Axes(60.0, 0.0, 640.0, height, (0.0, 5.0), (low, 1.2 * max(-low, 1e-9) if low else 5.0))
         drawing.frame(axes, "", name, ticks_below=below, room=room)

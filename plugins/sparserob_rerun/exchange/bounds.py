@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
 LEFT, WIDTH, HEIGHT, GAP = 74.0, 640.0, 136.0, 66.0
 ABOVE = 36.0  # the caption, which is as wide as the plot, is above the highest number upwards
-ONE = (-20.0, LEFT + WIDTH + 94.0, -64.0, HEIGHT + 62.0)
-BOTH = (-20.0, LEFT + WIDTH + 94.0, -64.0, 2 * HEIGHT + GAP + 48.0)
+ONE = (-36.0, LEFT + WIDTH + 94.0, -64.0, HEIGHT + 62.0)
+BOTH = (-36.0, LEFT + WIDTH + 94.0, -64.0, 2 * HEIGHT + GAP + 48.0)
 """Left, right, top and bottom of the bounds, and of both drawings."""
 VIEW = 1.5  # the view reaches down by this many times the size of the best bound; first bounds may be far below
 SMALLEST = 1e-12
+ROOM = 1.15  # of words, in the panel of the first screen, which is smaller than the drawing
 FEWEST = 5.0  # rounds on the axis at least
 
 
@@ -70,7 +71,7 @@ class Bounds:
         said = f"{_number(lower.max())} ≤ J* ≤ {_number(best)}"
         there, closes = np.isfinite(lower), bool(np.isfinite(best))
         shades = closes and there.sum() > 1
-        drawing.frame(axes, "", "round")
+        drawing.frame(axes, "", "round", room=ROOM)
         caption = f"proven: {said}{'; the gap is shaded' if shades else ''}"
         drawing.text(axes.left + axes.width / 2, axes.top - ABOVE, caption)
         if closes:

@@ -87,7 +87,7 @@ def _columns(rrb: Any, shown: Shown) -> list[Any]:
         words.insert(1, _phase(rrb, shown.problem))
     first = pages(shown.problem)[0]
     plots = view(f"/{first.path}", heading(shown.problem), physics.extent(len(first.plots)))
-    return [plots, middle, rrb.Vertical(*words, row_shares=[4, 3, 3] if len(words) == 3 else [1, 1])]
+    return [plots, middle, rrb.Vertical(*words, row_shares=[13, 9, 8] if len(words) == 3 else [1, 1])]
 
 
 def _room(shown: Shown) -> int:

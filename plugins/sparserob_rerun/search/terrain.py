@@ -23,6 +23,9 @@ BESIDE = 745.0  # where the words are: at the right of the map
 LETTERS = 46  # in a line; a word more does not fit there
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 LIFT = 0.015  # points stand this share of the height above the surface
+POLE = 0.32
+"""How far above the best point its value is written, in heights of the surface. Much lower, the bright surface is
+behind the words, which cannot be read in a light theme; twice as high, they are outside the panel."""
 SHOWN = 60  # boxes of a sketch that are drawn
 
 
@@ -274,10 +277,16 @@ class Terrain:
                 radii=self.rr.Radius.ui_points(6.0),
             ),
         )
+        self.stream.log(
+            "landscape/surface/pole",
+            self.rr.LineStrips3D(
+                [[[*at, top], [*at, top + POLE]]], colors=[ink.ORANGE], radii=self.rr.Radius.ui_points(0.6)
+            ),
+        )
         names = landscape.names(self.unit)
         flat = landscape.flat
-        corners = {  # words have one colour, which is legible on the surface too
-            (at[0], at[1], top + LIFT): f"best {landscape.value:.6g}",
+        corners = {  # words are bright, so that each has the dark ground behind it
+            (at[0], at[1], top + POLE): f"best {landscape.value:.6g}",
             (0.5, -0.12, 0.0): f"{names[0]}: {across[0]:.3g} to {across[-1]:.3g}",
             (1.12, 0.5, 0.0): f"{names[1]}: {up[0]:.3g} to {up[-1]:.3g}",
             (0.0, 0.0, 1.05): ", ".join(_said(landscape)) if flat else f"g = {scale[1]:.4g}",

@@ -12,6 +12,7 @@ from sparserob_rerun.search.search import LOGARITHMIC, NOTES
 
 FIRST = ("temperature", "depth", "constant", "radius", "reach", "spread", "slope")  # of what is noted, for the overview
 SHARES = ("accepted", "rejected")
+WHOLE = (-0.1, 1.1)  # of a share; of a narrower range the viewer writes one number only, and none at its ends
 
 
 def landscape(searches: bool, answers: bool, horizon: float = 1.0) -> Any:
@@ -65,7 +66,7 @@ def notes(rrb: Any, told: Collection[str]) -> list[Any]:
 
 def _note(rrb: Any, name: str) -> Any:
     words = NOTES.get(name, (name, ink.GREY))[0]
-    limits = (0.0, 1.0) if name in SHARES else None  # of a narrow range of its own the viewer writes one number only
+    limits = WHOLE if name in SHARES else None
     return series(rrb, "/search/notes", words[0].upper() + words[1:], [f"+ /search/notes/{name}"], limits=limits)
 
 
