@@ -19,9 +19,11 @@ import rerun.blueprint as rrb
 
 from sparserob_core.experiment.run.replay import stored_result, stored_run
 from sparserob_rerun.drawing.canvas import Axes, Drawing
+from sparserob_rerun.exchange import rounds
 from sparserob_rerun.exchange.bounds import FEWEST, ONE, Bounds
 from sparserob_rerun.exchange.clash import draw_clash, extent
 from sparserob_rerun.exchange.rounds import Rounds, Worst, told_by_result
+from sparserob_rerun.physics import physics
 from sparserob_rerun.physics.pages import heading, pages
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
@@ -247,12 +249,14 @@ def over(labels: list[tuple[np.ndarray, str, Any]], scale: float) -> list[tuple[
 @pytest.mark.parametrize("below", [False, True])
 def test_no_number_of_an_axis_lies_on_another(low: float, below: bool) -> None:
     """In the panels as they are on the first screen: violation, control and states, the map."""
+    edges = rounds.extent(2, True)[0], physics.extent(4)[0], -np.inf  # the map has as much room as its times need
     panels = [(112.0, 1.15, 0.66, "t"), (118.0, 1.0, 0.67, "t"), (384.0, 1.4, 0.46, "")]
-    for height, room, scale, name in panels:
+    for (height, room, scale, name), edge in zip(panels, edges, strict=True):
         drawing = Drawing()
         axes = Axes(60.0, 0.0, 640.0, height, (0.0, 5.0), (low, 1.2 * max(-low, 1e-9) if low else 5.0))
         drawing.frame(axes, "", name, ticks_below=below, room=room)
         assert over(drawing.labels, scale) == []
+        assert min(at[0] - (len(one) * WIDE + PADDING) / 2 / scale for at, one, _ in drawing.labels) > edge
 
 
 def test_the_strip_of_a_clash_is_as_far_from_its_wall_as_it_misses(infeasible: sr.Outcome) -> None:

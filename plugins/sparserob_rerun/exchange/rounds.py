@@ -32,7 +32,7 @@ SERIES = {
 def extent(families: int, shared: bool) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of the violation plots; ``shared``: over one axis, that of time."""
     bottom = max(1, min(FAMILIES, families)) * _below(shared) - (GAP if shared else GAP + NUMBERS)
-    return -30.0, LEFT + WIDTH + 76.0, -40.0, bottom + 60.0
+    return -42.0, LEFT + WIDTH + 76.0, -40.0, bottom + 60.0
 
 
 def _below(shared: bool) -> float:

@@ -23,7 +23,7 @@ LAYERS = ("hatch", "tube", "frame", "marks", "worst", "curve", "wall")
 
 def extent(count: int) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of ``count`` plots above one another."""
-    return -20.0, LEFT + WIDTH + 76.0, -36.0, count * (HEIGHT + GAP) + 8.0
+    return -32.0, LEFT + WIDTH + 76.0, -36.0, count * (HEIGHT + GAP) + 8.0
 
 
 @final
