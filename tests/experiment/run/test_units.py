@@ -235,3 +235,18 @@ def test_nothing_is_said_of_units_that_nobody_has_named(tmp_path: Path) -> None:
     outcome = sr.run({"problem": PROBLEM, "dictionaries": PIECES}, out=tmp_path / "run", quiet=True, figures=False)
     assert "units" not in outcome.summary
     assert " in path" in told(outcome)["proven to"] and " m" not in told(outcome)["proven to"]
+
+
+def test_the_table_says_who_answered_how_many_programs_each_under_the_name_it_is_known_by() -> None:
+    from sparserob_core.experiment.terminal.table import _solved_by
+
+    counts = {"closed_form": 1, "osqp": 6, "dual_newton": 2, "highs": 3, "nobody": 1}
+    said = _solved_by(counts).split(", ")
+    assert [int(part.split()[0]) for part in said if part[0].isdigit()] == list(counts.values())
+    assert (
+        "6 by osqp" in said
+        and "2 by the dual Newton method" in said
+        and "3 by HiGHS" in said
+        and "1 not solved" in said
+    )
+    assert _solved_by(None) == _solved_by({}) == "unknown"
