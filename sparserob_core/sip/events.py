@@ -57,7 +57,7 @@ def forwarded(notify: Notify, kind: type[T], complete: Callable[[T], Event]) -> 
 
 def beside(notify: Notify, stage: str) -> Notify:
     """A listener to a program beside the one whose rounds are told: of its rounds it passes on that they go on, in this
-    ``stage``, and how its proofs do; that the stage begins is told at once."""
+    ``stage``, and how its proofs do."""
     if notify is ignore:
         return ignore
 
@@ -67,7 +67,6 @@ def beside(notify: Notify, stage: str) -> Notify:
         elif isinstance(event, ProofProgress):
             notify(event)
 
-    notify(StageProgress(text=f"{stage}: begins"))
     return heard
 
 

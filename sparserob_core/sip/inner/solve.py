@@ -290,7 +290,9 @@ def _tried(case: _Case) -> FiniteSolution:
             if believed is not None:
                 return believed
         if (form, factor) == attempts[0] and proof is None:
-            believed = (None if answer is None else _at_a_vertex(case)) or _more_digits(case, claim)
+            lacking = claim is not None and claim.status == "solved" and answer is not None
+            believed = _at_a_vertex(case) if lacking else None
+            believed = believed or _more_digits(case, claim)
             if believed is not None:
                 return believed
         if case.blunt is not None:
