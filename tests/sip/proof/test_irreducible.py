@@ -3,6 +3,7 @@ told, in words and numbers that are true."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,34 @@ def test_without_any_one_row_of_a_clash_something_is_feasible(seed):
     y = solution.y
     assert (y > 0).all()
     assert -np.abs(y @ kept.G).sum() * 3.0 - y @ kept.h > 0
+
+
+def test_a_proof_by_many_rows_is_made_one_of_few_before_any_is_left_out() -> None:
+    turns = 2.0 * np.pi * np.arange(120) / 120
+    G, h = np.stack([np.cos(turns), np.sin(turns)], axis=1), np.full(120, -0.1)  # all away from the middle
+    family = sr.ConstraintFamily(
+        name="half-planes",
+        index_set=sr.Box([0.0], [119.0]),
+        rows=lambda i: (G[i[:, 0].astype(int)][:, None], h[i[:, 0].astype(int)][:, None]),
+    )
+    program = sr.SemiInfiniteProgram(n=2, weights=1.0, lower=-3.0, upper=3.0, families=[family])
+    rows, asked = rows_at(program, "half-planes", np.arange(120.0)[:, None]), list[int]()
+
+    class Counted(RelaxedProgram):
+        def solve(self, rows, epsilon, *more):
+            asked.append(rows.h.size)
+            return super().solve(rows, epsilon, *more)
+
+    relaxed = Counted(program, sr.load_registry().build("solver", "piqp", {}))
+    every = replace(relaxed.solve(rows, 0.0), y=np.full(120, 1.0 / 120))  # as an interior point proves it
+    asked.clear()
+    kept, solution = irreducible(relaxed, rows, every)
+    assert 2 <= kept.h.size <= 3
+    assert len(asked) <= 6  # of 120 rows one by one
+    y = solution.y
+    amount = (-np.abs(y @ kept.G).sum() * 3.0 - y @ kept.h) / y.sum()
+    assert amount > 0.0
+    assert solution.infeasibility == pytest.approx(amount, rel=1e-6)
 
 
 def test_experiment_1_as_printed_has_its_separate_reasons_one_sentence_each(tmp_path):
