@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
@@ -113,11 +113,10 @@ def _epigraph_model(program: FiniteProgram, alone: npt.NDArray[np.bool_]) -> Ima
 
 def _with_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, directions: Directions) -> ImageModel:
     """The model with one variable ``t`` for every block, which costs the block's weight, and rows ``d's <= t``."""
-    from scipy.sparse import csc_array, hstack, vstack
+    from scipy.sparse import csc_array, vstack
 
-    size, count, tops = directions.block.size, blocks.first.size, model.entry.size
-    of = np.full(program.weights.size, -1)  # where an entry is among the variables; a fixed one is not
-    of[model.entry[model.sign > 0]] = np.flatnonzero(model.sign > 0)
+    model = _with_tops(model, program, blocks)
+    size, tops, of = directions.block.size, model.entry.size - blocks.first.size, _places(model, program)
     entries = blocks.table[directions.block]
     inside = (entries >= 0) & (directions.vectors != 0.0)
     moving = inside & (of[entries] >= 0)
@@ -127,43 +126,43 @@ def _with_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, direc
         np.concatenate([of[entries[moving]], tops + directions.block]),
     )
     data = np.concatenate([directions.vectors[moving], -np.ones(size)]) / np.sqrt(2.0)
-    rows = csc_array((data, places), shape=(size, tops + count))
+    rows = csc_array((data, places), shape=(size, model.entry.size))
     fixed = np.where(inside, directions.vectors * model.offset[entries], 0.0).sum(axis=1)
     if model.R is not None:
-        rows = vstack([hstack([model.R, csc_array((model.R.shape[0], count))]), rows], format="csc")
-    return ImageModel(
-        np.concatenate([model.entry, blocks.first]),
-        np.concatenate([model.sign, np.zeros(count)]),
-        model.offset,
-        np.concatenate([model.cost, program.weights[blocks.first]]),
-        np.concatenate([model.lower, np.zeros(count)]),
-        np.concatenate([model.upper, np.full(count, np.inf)]),
-        rows,
-        np.concatenate([model.right, -fixed / np.sqrt(2.0)]),
-    )
+        rows = vstack([model.R, rows], format="csc")
+    return replace(model, R=rows, right=np.concatenate([model.right, -fixed / np.sqrt(2.0)]))
 
 
 def _with_cones(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
     """The model with one variable for every block, which costs the block's weight and is at least its norm. An entry
     that is fixed is fixed at 0 (`has_cones`), and is in no cone."""
+    model, tops = _with_tops(model, program, blocks), model.entry.size
+    places = _places(model, program)[blocks.table]
+    return replace(model, cones=tuple(np.concatenate([[tops + b], mine[mine >= 0]]) for b, mine in enumerate(places)))
+
+
+def _with_tops(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
+    """The model with one variable more for every block, at least 0, which costs the block's weight."""
     from scipy.sparse import csc_array, hstack
 
-    count, tops = blocks.first.size, model.entry.size
-    of = np.full(program.weights.size + 1, -1)  # where an entry is among the variables; none is where -1 stands
-    of[model.entry[model.sign > 0]] = np.flatnonzero(model.sign > 0)
-    places = of[blocks.table]
-    R = None if model.R is None else csc_array(hstack([model.R, csc_array((model.R.shape[0], count))]))
-    return ImageModel(
-        np.concatenate([model.entry, blocks.first]),
-        np.concatenate([model.sign, np.zeros(count)]),
-        model.offset,
-        np.concatenate([model.cost, program.weights[blocks.first]]),
-        np.concatenate([model.lower, np.zeros(count)]),
-        np.concatenate([model.upper, np.full(count, np.inf)]),
-        R,
-        model.right,
-        tuple(np.concatenate([[tops + b], mine[mine >= 0]]) for b, mine in enumerate(places)),
+    count = blocks.first.size
+    return replace(
+        model,
+        entry=np.concatenate([model.entry, blocks.first]),
+        sign=np.concatenate([model.sign, np.zeros(count)]),
+        cost=np.concatenate([model.cost, program.weights[blocks.first]]),
+        lower=np.concatenate([model.lower, np.zeros(count)]),
+        upper=np.concatenate([model.upper, np.full(count, np.inf)]),
+        R=None if model.R is None else csc_array(hstack([model.R, csc_array((model.R.shape[0], count))])),
     )
+
+
+def _places(model: ImageModel, program: FiniteProgram) -> np.ndarray:
+    """Where every entry of the image is among the variables, -1 for one that is fixed; and a last -1, which the -1 of
+    no entry finds."""
+    places = np.full(program.weights.size + 1, -1)
+    places[model.entry[model.sign > 0]] = np.flatnonzero(model.sign > 0)
+    return places
 
 
 def has_cones(program: FiniteProgram, blocks: Blocks) -> bool:
