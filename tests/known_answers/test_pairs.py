@@ -89,6 +89,15 @@ def of_two_classes(config: Config) -> None:
     ]
 
 
+def on_own_pieces(config: Config) -> None:
+    """Two components on grids of which neither is the dictionary's, nor a part of the other."""
+    if isinstance(config["problem"].get("disturbance"), dict):
+        in_a_list(config)
+    own: list[Config] = [{"breakpoints": [0, 0.4, 1.7, 3]}, {"pieces": 4}]
+    for one, pieces in zip(config["problem"].get("disturbance", []), own, strict=False):
+        one.update(pieces)
+
+
 def changing_with_time(config: Config) -> None:
     for one in systems(config):
         one["A"][1][1] = "-0.4 - 0.1*sin(t)"
@@ -120,6 +129,7 @@ FEATURES: dict[str, Callable[[Config], object]] = {
     "entries in t": changing_with_time,
     "execution": in_problem(execution=0.03),
     "two classes": of_two_classes,
+    "pieces of their own": on_own_pieces,
 }
 SIGNS = {
     ("proven", "verified"): "●",

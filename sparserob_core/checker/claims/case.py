@@ -21,6 +21,7 @@ from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.integrals import integrating
+from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
@@ -61,6 +62,10 @@ class Case:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "problem", integrating(self.problem))
+        if self.problem.disturbance_breakpoints is not None:
+            known_by, joint = on_one_grid(self.problem, self.disturbance)
+            object.__setattr__(self, "problem", known_by)
+            object.__setattr__(self, "disturbance", joint)
         if self.policy is not None and self.control.functions == self.control.pieces:
             # as many functions as pieces, which are independent, make all controls on these: what is written are values
             object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))
@@ -171,6 +176,24 @@ class Case:
     def measurable(self) -> bool:
         """Whether there are measurable disturbances."""
         return self.problem.measurable is not None
+
+    @cached_property
+    def lasting(self) -> Lasting | None:
+        """Which components of the disturbance stay what they are for several of its pieces, ``None`` where none do."""
+        return Lasting.of(self.problem, self.changes or [])
+
+    @property
+    def alike(self) -> bool:
+        """Whether all disturbances are of one class, and constant on the same pieces where they are on pieces."""
+        return not self.several and self.lasting is None
+
+    def may_jump(self, time: float) -> np.ndarray:
+        """Which components of the disturbance ``(mw,)`` may have another value from a time on, of those that are
+        constant on pieces."""
+        assert self.problem.disturbance is not None
+        if self.lasting is not None:
+            return self.lasting.may_jump(time)
+        return np.full(self.problem.disturbance.dimension, time in (self.changes or ()))
 
     @property
     def several(self) -> bool:
@@ -290,6 +313,7 @@ class Case:
             changes or [],
             self.problem.initial_set,
             tuple(float(t) for t in self.problem.system.switches),
+            self.lasting,
         )
 
     def beside(self, window: Window, basis: Array, gains: Array) -> Beside | None:
@@ -421,7 +445,7 @@ class Case:
 
     @cached_property
     def duality(self) -> Duality:
-        return Duality(self.problem, self.control, self.changes, self.changing, self.held)
+        return Duality(self.problem, self.control, self.changes, self.changing, self.held, self.lasting)
 
 
 def _middle(bound: ConvexSet) -> Array:

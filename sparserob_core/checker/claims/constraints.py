@@ -96,7 +96,7 @@ def follows(case: Case) -> bool:
     system = case.problem.system
     if not isinstance(system, LinearSystem) or system.parameter_count or system.states < FOLLOWED:
         return False
-    return not case.answering and not case.several and case.execution is None and len(case.grid) <= MANY
+    return not case.answering and case.alike and case.execution is None and len(case.grid) <= MANY
 
 
 def _along_rows(case: Case, window: Window) -> Proven:

@@ -189,7 +189,9 @@ class RowUnits:
         middles = (np.array(nodes[:-1]) + np.array(nodes[1:])) / 2
         which = np.searchsorted(self.scene.changes, middles, side="right")
         answer: Array = np.add.reduceat(pushed, np.flatnonzero(np.diff(which, prepend=-1)), axis=0)
-        return answer
+        if self.scene.lasting is None:
+            return answer
+        return self.scene.lasting.gathered(answer[..., None], np.zeros((*answer.shape, 1)))[0][..., 0]
 
     def _nodes(self) -> tuple[list[float], npt.NDArray[np.intp]]:
         """The grid up to the window's end with the window's ends, and the places among it that are looked at."""

@@ -15,6 +15,7 @@ from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.reach.flow import Flow, in_time, stacked, up_to
+from sparserob_core.checker.reach.lasting import Lasting
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING, Enclosed, lengths, rounding
 from sparserob_core.checker.sets.shape import Shape
@@ -35,7 +36,8 @@ SAME = 1e-14  # of the horizon: durations closer than this are treated as one ba
 class Scene:
     """What is simulated: the ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of
     ``x(0)`` and the set of deviations from it, and the disturbance: its set and the breakpoints between which it is
-    constant. At the ``switches``, which are breakpoints, another system takes over."""
+    constant, of which some components may be ``lasting`` longer. At the ``switches``, which are breakpoints, another
+    system takes over."""
 
     grid: list[float]
     control: list[arb_mat]
@@ -44,6 +46,7 @@ class Scene:
     changes: list[float]
     initial_set: ConvexSet | None = None
     switches: tuple[float, ...] = ()
+    lasting: Lasting | None = None
 
     def leg(self, piece: int) -> int:
         """Which system acts on a piece of the grid; the last one at its end."""
@@ -180,7 +183,9 @@ class DisturbanceSupports:
             if found is not None:
                 return found
         if self._latest is None or self._latest[0] != (start, ticks):
-            self._latest = ((start, ticks), *self.every(start, ticks))
+            every = self.every(start, ticks)
+            every = every if self.scene.lasting is None else self.scene.lasting.gathered(*every)
+            self._latest = ((start, ticks), *every)
         return bounded(shape, self.flow.monomials, *self._latest[1:], z, sharp)
 
     def begun(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array, Array]:
@@ -289,7 +294,7 @@ class DisturbanceSupports:
         """`bounds` where what a piece adds depends on its age alone, since they are equally long: a sum over the ages,
         which is remembered; ``None`` where they are not, or are few."""
         grid, count = self.scene.grid, int(np.searchsorted(self._jumps, start, side="right"))
-        if count < FEWEST_SUMMED[bool(self.flow.centre)] or self.scene.switches:
+        if count < FEWEST_SUMMED[bool(self.flow.centre)] or self.scene.switches or self.scene.lasting is not None:
             return None
         # no piece begins at the end, which is looked at from the beginning of the last one
         node = float(self._jumps[-1]) if start == grid[-1] else grid[bisect_right(grid, start) - 1]

@@ -162,7 +162,7 @@ def _followed(case: Case, asked: Asked) -> Worst | None:
         raise Unchecked("worst cases of a system that changes with time are not derived")
     if case.problem.execution is not None and case.theta.any():
         raise Unchecked("worst cases of a control that is delivered with errors are not derived")
-    if not isinstance(system, LinearSystem) or system.parameter_count or case.several:
+    if not isinstance(system, LinearSystem) or system.parameter_count or not case.alike:
         return None
     return followed(case, asked.window.split(asked.direction)[0])
 
@@ -211,9 +211,10 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
     if signal.shape != (problem.disturbance.dimension, changes.size - 1):
         raise Broken(f"disturbance: expected shape {(problem.disturbance.dimension, changes.size - 1)}")
     held = ~columns_of(problem.disturbance, problem.disturbance_class, "measurable")
-    jumps = changes[1:-1][(signal[held, 1:] != signal[held, :-1]).any(axis=0)]
-    if not np.isin(jumps, case.changes or []).all():
-        raise Broken("the disturbance jumps within a piece")
+    jumps = (signal[:, 1:] != signal[:, :-1]) & held[:, None]
+    for time, jumping in zip(changes[1:-1].tolist(), jumps.T, strict=True):
+        if (jumping & ~case.may_jump(time)).any():
+            raise Broken("the disturbance jumps within a piece")
     shape, seen = known(problem.disturbance), set[tuple[float, ...]]()
     for value in case.clock.each(map(tuple, signal.T.tolist())):
         if value not in seen and not shape.contains(value):

@@ -30,6 +30,7 @@ def refuse_remaining(model: Transcription) -> None:
             or (problem.disturbance_class == "piecewise_constant" and not model.disturbance.is_complete)
         ),
         "disturbances of one class": disturbed and not isinstance(problem.disturbance_class, str),
+        "disturbances on the pieces of one dictionary": problem.disturbance_breakpoints is not None,
         "integrals of controls alone, and none beside feedback: what states add up to between measurements is not"
         " known": any(model.feedback is not None or np.any(entry.H) for entry in model.stated.integral),
         "a control that acts at once, without a delay": problem.system.delay > 0.0,

@@ -5,7 +5,8 @@ in the product of the ``W_i``: every signal of the one is a signal of the other.
 problem with one, and whatever is proven of one disturbance is proven of a list. Of two classes they are one in a
 `Product`, each part of it of a class of its own; what each class does is that of the set that is 0 along the columns of
 the other, and both add up (`apart`). One that acts in a window of time alone
-enters a system that takes turns, whose ``E`` is 0 outside of the window.
+enters a system that takes turns, whose ``E`` is 0 outside of the window. Those that are constant on pieces of their own
+are one on the pieces of all, of which some parts stay what they are from one to the next (`finest`).
 """
 
 from __future__ import annotations
@@ -17,16 +18,19 @@ from functools import reduce
 from typing import Literal, TypeAlias, final, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.control.problem.expression import Entries, beside
 from sparserob_core.control.problem.system import LinearSystem, Matrix, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Product, product
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Box, ConvexSet
+from sparserob_core.shapes import sealed
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
 
 DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
 Classes: TypeAlias = DisturbanceClass | tuple[DisturbanceClass, ...]
+Breakpoints: TypeAlias = tuple[Array | None, ...]
 SHORTEST = 1e-12  # of the horizon: ten times more and windows are lost that a clock can tell apart; ten times less and
 # ends that are sums of steps make pieces of the system that are rounding
 
@@ -35,16 +39,21 @@ SHORTEST = 1e-12  # of the horizon: ten times more and windows are lost that a c
 @dataclass(frozen=True, eq=False)
 class Disturbance:
     """One of several disturbances: its bounded ``set``, how it enters, ``E (d, mw)`` as in `LinearSystem` (that of the
-    system unless given), its ``kind``, the class of functions that it may be, and the window ``[start, stop]`` in which
-    it acts; ``stop`` is the horizon when ``None``."""
+    system unless given), its ``kind``, the class of functions that it may be, the window ``[start, stop]`` in which it
+    acts, ``stop`` is the horizon when ``None``, and the ``breakpoints (K + 1,)`` between which it is constant,
+    increasing from 0 to the horizon; those of the disturbance's dictionary when ``None``."""
 
     set: ConvexSet
     E: Matrix | None = None
     kind: DisturbanceClass = "piecewise_constant"
     start: float = 0.0
     stop: float | None = None
+    breakpoints: npt.ArrayLike | None = None
 
     __repr__ = noun
+
+    def __post_init__(self) -> None:
+        sealed(self)
 
     def entering(self, where: str, mode: LinearSystem) -> LinearSystem:
         """One of the systems that take turns, under this disturbance alone; raises `InputError` where it does not
@@ -57,10 +66,12 @@ class Disturbance:
             raise InputError(error.sentence, path=f"{where}.E") from None
 
 
-def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tuple[System, ConvexSet, Classes]:
-    """The system under all of these disturbances side by side until the ``horizon``, the set of them together, and
-    their class, or that of every part of the set; raises `InputError` that begins with ``disturbance`` and the number
-    of the one at fault."""
+def joined(
+    system: System, every: Sequence[Disturbance], horizon: float
+) -> tuple[System, ConvexSet, Classes, Breakpoints | None]:
+    """The system under all of these disturbances side by side until the ``horizon``, the set of them together, their
+    class, or that of every part of the set, and the breakpoints of every part where one has its own; raises
+    `InputError` that begins with ``disturbance`` and the number of the one at fault."""
     kind, first = every[0].kind, system.law if isinstance(system, VaryingSystem) else system.modes[0]
     for i, one in enumerate(every):
         if one.kind not in get_args(DisturbanceClass):
@@ -73,6 +84,8 @@ def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tupl
                 got=one.kind,
             )
     windows = [_window(f"disturbance.{i}", one, horizon) for i, one in enumerate(every)]
+    own = tuple(_own(f"disturbance.{i}", one, every, horizon) for i, one in enumerate(every))
+    grids = own if any(times is not None for times in own) else None
     sets = [
         _checked(f"disturbance.{i}.set", one.set, one.entering(f"disturbance.{i}", first))
         for i, one in enumerate(every)
@@ -89,14 +102,14 @@ def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tupl
         pieces.append((until, replace(mode, E=reduce(beside, columns))))
     kinds = tuple(one.kind for one in every)
     together: tuple[ConvexSet, Classes] = (product(sets), kind)
-    if len(set(kinds)) > 1:
-        together = Product(tuple(sets)), kinds
+    if len(set(kinds)) > 1 or grids is not None:
+        together = Product(tuple(sets)), kinds if len(set(kinds)) > 1 else kind
     if isinstance(system, VaryingSystem):
         laws = [(begin, law) for begin, (_, law) in zip(begins, pieces, strict=True)]
-        return system.lawful(laws), *together
+        return system.lawful(laws), *together, grids
     if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
-        return pieces[0][1], *together
-    return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay), *together
+        return pieces[0][1], *together, grids
+    return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay), *together, grids
 
 
 def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
@@ -115,6 +128,38 @@ def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np
         return np.full(bound.dimension, classes == kind)
     assert isinstance(bound, Product)
     return np.repeat([one == kind for one in classes], [part.dimension for part in bound.parts])
+
+
+def finest(breakpoints: Breakpoints, dictionary: Array) -> tuple[Breakpoints, Array]:
+    """The breakpoints of every part, those of the ``dictionary (K + 1,)`` for one without its own, and all of them as
+    those of one: none that is another one but for rounding."""
+    every = tuple(dictionary if times is None else times for times in breakpoints)
+    joint: Array = np.unique(np.concatenate(every))
+    apart = np.concatenate([[True], np.diff(joint) > SHORTEST * joint[-1]])
+    joint = joint[apart]
+    joint[-1] = dictionary[-1]
+    return every, joint
+
+
+def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: float) -> Array | None:
+    """The breakpoints of one of several disturbances, ``None`` where it has none of its own."""
+    if one.breakpoints is None:
+        return None
+    if {other.kind for other in every} != {"piecewise_constant"}:
+        raise InputError(
+            path=f"{where}.breakpoints",
+            expected="none where a disturbance of the list is not of the class piecewise_constant",
+            got="some",
+        )
+    times = as_bound("breakpoints", one.breakpoints)
+    fit = times.ndim == 1 and times.size > 1 and times[0] == 0.0 and abs(times[-1] - horizon) <= SHORTEST * horizon
+    if not fit or not (np.diff(times) > SHORTEST * horizon).all():
+        raise InputError(
+            path=f"{where}.breakpoints",
+            expected=f"times that increase from 0 to {horizon:g} (the horizon), apart by more than rounding",
+            got=np.array2string(times, threshold=8, precision=6),
+        )
+    return np.append(times[:-1], horizon)
 
 
 def _nothing(dimension: int) -> ConvexSet:

@@ -15,7 +15,14 @@ import numpy.typing as npt
 from sparserob_core.brief import noun
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost
-from sparserob_core.control.problem.disturbances import Classes, Disturbance, DisturbanceClass, apart, joined
+from sparserob_core.control.problem.disturbances import (
+    Breakpoints,
+    Classes,
+    Disturbance,
+    DisturbanceClass,
+    apart,
+    joined,
+)
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.prices import checked_weights, counted, integrals
 from sparserob_core.control.problem.system import (
@@ -148,10 +155,12 @@ class OptimalControlProblem:
     control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any.
     ``names`` are for messages, tables and figures.
 
-    ``disturbances``: instead of ``disturbance``, a list of them, each with its set, its ``E``, its class and its window
-    of time; ``w`` is made of all of them, one after another. After construction ``disturbance`` is the product of their
-    sets, ``E`` of the system has the columns of theirs (0 in pieces of the system outside of a window), and the list is
-    empty; where there are two classes, ``disturbance_class`` has that of every part of the product.
+    ``disturbances``: instead of ``disturbance``, a list of them, each with its set, its ``E``, its class, its window
+    of time and the pieces on which it is constant; ``w`` is made of all of them, one after another. After construction
+    ``disturbance`` is the product of their sets, ``E`` of the system has the columns of theirs (0 in pieces of the
+    system outside of a window), and the list is empty; where there are two classes, ``disturbance_class`` has that of
+    every part of the product, and where one has pieces of its own, ``disturbance_breakpoints`` has the ends of the
+    pieces of every part, ``None`` where these are those of the disturbance's dictionary.
 
     ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
     anywhere in ``initial_state + initial_set``, and every constraint holds from there.
@@ -201,6 +210,7 @@ class OptimalControlProblem:
     measurements: Measurements | None = None
     repeat: bool | Repeating = False
     execution: npt.ArrayLike | None = None
+    disturbance_breakpoints: Breakpoints | None = None
 
     __repr__ = noun
 
@@ -419,6 +429,13 @@ class OptimalControlProblem:
                 expected=f"one of {', '.join(get_args(DisturbanceClass))}",
                 got=f"{self.disturbance_class!r}",
             )
+        own, parts = self.disturbance_breakpoints, bound.parts if isinstance(bound, Product) else ()
+        if own is not None and (len(own) != len(parts) or kinds != "piecewise_constant"):
+            raise InputError(
+                path="disturbance_breakpoints",
+                expected="those of every part of a product of piecewise constant disturbances, made by disturbances",
+                got=f"{len(own)} for {len(parts)} parts",
+            )
         if self.disturbance is None:
             return
         _checked_set("disturbance", self.disturbance, self.system.disturbances, "columns of E", bounded=True)
@@ -442,10 +459,11 @@ class OptimalControlProblem:
                 expected="none beside a list of disturbances, each of which has its own",
                 got=f"{self.disturbance_class}" if self.disturbance is None else self.disturbance.kind,
             )
-        system, bound, kind = joined(self.system, every, self.horizon)
+        system, bound, kind, breakpoints = joined(self.system, every, self.horizon)
         self._set("system", system)
         self._set("disturbance", bound)
         self._set("disturbance_class", kind)
+        self._set("disturbance_breakpoints", breakpoints)
         self._set("disturbances", ())
 
     def _check_names(self) -> None:

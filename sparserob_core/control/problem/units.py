@@ -65,6 +65,11 @@ class Units:
             weights=in_units(problem.weights, self.controls * self.time / self.cost, self.time),
             disturbance=None if problem.disturbance is None else problem.disturbance.in_units(self.disturbances),
             disturbance_class=problem.disturbance_class,
+            disturbance_breakpoints=(
+                None
+                if problem.disturbance_breakpoints is None
+                else tuple(None if times is None else times / self.time for times in problem.disturbance_breakpoints)
+            ),
             path=[self._window(entry) for entry in problem.path if not isinstance(entry, ConvexSet)],
             terminal=[end.in_units(self.states) for end in problem.terminal],
             integral=[self._integral(entry) for entry in problem.integral],

@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.disturbances import Classes, apart
+from sparserob_core.control.problem.disturbances import Breakpoints, Classes, apart
 from sparserob_core.control.response.response import TimeGrid
-from sparserob_core.control.sets.sets import NormBall, Polytope
+from sparserob_core.control.sets.sets import NormBall, Polytope, Product, product
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -30,8 +30,10 @@ class DisturbanceModel:
 
     ``basis (nb, L, q)`` lists for block ``b`` the grid-piece values of its ``q`` functions; a block is a vector of
     ``q mw`` coefficients (channel-major) scaled by ``scale (mw,)``, and it ranges over ``set``. ``pieces`` is a
-    shortcut when the blocks are the pieces themselves. Of ``several`` classes the ``classes`` of the parts of ``bound``
-    are told; the blocks are then those of disturbances that are all constant on pieces, which are admissible.
+    shortcut when the blocks are the pieces themselves. ``lasting``: of which components, and the first of the blocks
+    ``(g,)`` of each of their pieces, where some stay what they are for several blocks; what a functional gives to all
+    of these is then given to the first, whose value they have. Of ``several`` classes the ``classes`` of the parts of
+    ``bound`` are told; the blocks are then those of disturbances that are all constant on pieces, which are admissible.
     """
 
     kind: Literal["piecewise_constant", "measurable", "l1_ball", "several"]
@@ -42,6 +44,7 @@ class DisturbanceModel:
     functions: Array | None = None
     scale: Array | None = None
     classes: Classes = ()
+    lasting: tuple[tuple[slice, np.ndarray], ...] = ()
 
     @cached_property
     def on_blocks(self) -> DisturbanceModel | None:
@@ -81,8 +84,8 @@ class DisturbanceModel:
 
     @property
     def by_piece(self) -> bool:
-        """Whether the blocks are the pieces of the grid, one each."""
-        return self.starts is not None and self.starts.size == self.grid.pieces
+        """Whether the blocks are the pieces of the grid, one each, and no component stays longer what it is."""
+        return self.starts is not None and self.starts.size == self.grid.pieces and not self.lasting
 
     @shaped
     def blocks(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k nb q"]:
@@ -91,15 +94,23 @@ class DisturbanceModel:
         if self.by_piece:
             return weights
         if self.starts is not None:
-            return np.add.reduceat(weights, self.starts, axis=-2)
+            blocks = weights if self.starts.size == self.grid.pieces else np.add.reduceat(weights, self.starts, axis=-2)
+            return self._gathered(blocks)
         assert self.functions is not None
         coefficients = np.einsum("...li,jl->...ij", weights, self.functions)
-        blocks: Array = (
-            coefficients.reshape(*coefficients.shape[:-2], 1, -1)
-            if self.scale is None
-            else coefficients * self.scale[:, None]
-        )
-        return blocks
+        if self.scale is None:
+            return np.asarray(coefficients.reshape(*coefficients.shape[:-2], 1, -1))
+        return np.asarray(coefficients * self.scale[:, None])
+
+    def _gathered(self, blocks: Array) -> Array:
+        """What is given to every block ``(..., nb, mw)``, of components that last longer given to the first."""
+        if not self.lasting:
+            return blocks
+        found = blocks.copy()
+        for columns, first in self.lasting:
+            found[..., columns] = 0.0
+            found[..., first, columns] = np.add.reduceat(blocks[..., columns], first, axis=-2)
+        return found
 
     @shaped
     def support(self, weights: Float[Array, "*k L mw"]) -> Float[Array, " *k"]:
@@ -139,7 +150,11 @@ class DisturbanceModel:
             return np.swapaxes(points, -1, -2)
         if self.starts is not None:
             which = np.searchsorted(self.starts, np.arange(self.grid.pieces), side="right") - 1
-            return np.swapaxes(points[..., which, :], -1, -2)
+            found = points[..., which, :]
+            for columns, first in self.lasting:
+                begun = first[np.searchsorted(first, which, side="right") - 1]
+                found[..., columns] = points[..., begun, columns]
+            return np.swapaxes(found, -1, -2)
         assert self.functions is not None
         coefficients = points if self.scale is not None else points.reshape(*points.shape[:-2], self.channels, -1)
         signal = np.einsum("...ij,jl->...il", coefficients, self.functions)
@@ -147,8 +162,11 @@ class DisturbanceModel:
         return answer
 
 
-def disturbance_model(kind: Classes, bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid) -> DisturbanceModel:
-    """The model of a disturbance class.
+def disturbance_model(
+    kind: Classes, bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid, breakpoints: Breakpoints | None = None
+) -> DisturbanceModel:
+    """The model of a disturbance class; ``breakpoints``: those of every part of a product, among those of the
+    dictionary.
 
     ``piecewise_constant``: every combination of the dictionary's functions whose values stay in ``bound`` on every
     piece; ``measurable``: every measurable function with values in ``bound``; ``l1_ball``: coefficients with
@@ -177,9 +195,10 @@ def disturbance_model(kind: Classes, bound: ConvexSet, dictionary: Dictionary, g
         which = np.clip(
             np.searchsorted(merged.breakpoints, _middles(grid), side="right") - 1, 0, merged.breakpoints.size - 2
         )
-        return DisturbanceModel(
-            "piecewise_constant", bound, bound, grid, starts=np.flatnonzero(np.diff(which, prepend=-1))
-        )
+        starts = np.flatnonzero(np.diff(which, prepend=-1))
+        lasting = _lasting(bound, breakpoints, _middles(grid)[starts])
+        held = product(bound.parts) if isinstance(bound, Product) else bound
+        return DisturbanceModel("piecewise_constant", held, bound, grid, starts=starts, lasting=lasting)
     flat = bound.halfspaces()
     if flat is None:
         raise InputError(
@@ -191,6 +210,19 @@ def disturbance_model(kind: Classes, bound: ConvexSet, dictionary: Dictionary, g
     rows = np.einsum("ri,jk->krij", H, merged.values).reshape(-1, H.shape[1] * merged.values.shape[0])
     coupled = Polytope(rows, np.tile(h, merged.pieces))
     return DisturbanceModel("piecewise_constant", coupled, bound, grid, functions=dictionary.at(grid.disturbance_piece))
+
+
+def _lasting(bound: ConvexSet, breakpoints: Breakpoints | None, middles: Array) -> tuple[tuple[slice, np.ndarray], ...]:
+    """`DisturbanceModel.lasting`, of blocks of which these are times that lie within them."""
+    found, column = list[tuple[slice, np.ndarray]](), 0
+    for part, times in zip(bound.parts, breakpoints, strict=True) if isinstance(bound, Product) and breakpoints else ():
+        columns = slice(column, column + part.dimension)
+        column = columns.stop
+        assert times is not None
+        first = np.flatnonzero(np.diff(np.searchsorted(times, middles), prepend=-1))
+        if first.size < middles.size:
+            found.append((columns, first))
+    return tuple(found)
 
 
 def _middles(grid: TimeGrid) -> Array:

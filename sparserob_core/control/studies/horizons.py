@@ -93,6 +93,9 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
         lasts = horizon - entry.start > SHORTEST * horizon
         if lasts or (entry.start <= horizon and isinstance(entry, PathConstraint)):
             windows.append(replace(entry, stop=None))
+    if problem.disturbance_breakpoints is not None:
+        expected = "disturbances on the pieces of their dictionary, which become shorter with the horizon"
+        raise InputError(path="disturbance", expected=expected, got="breakpoints of their own")
     weights = weights_between(problem.weights, 0.0, horizon)
     system = _until(problem.system, horizon)
     return replace(problem, horizon=horizon, path=windows, system=system, weights=weights)

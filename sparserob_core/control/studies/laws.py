@@ -174,9 +174,8 @@ def admissibility(model: DisturbanceModel, signals: Array) -> Array:
     """By how much disturbances ``(n, mw, L)`` on the merged grid miss being admissible, ``(n,)``; at most rounding when
     they are."""
     if model.starts is not None:
-        which = np.searchsorted(model.starts, np.arange(model.grid.pieces), side="right") - 1
         values = signals.swapaxes(1, 2)
-        uneven = np.abs(values - values[:, model.starts[which]]).max(axis=(1, 2))
+        uneven = np.abs(signals - model.signals(values[:, model.starts])).max(axis=(1, 2))
         return np.asarray(np.maximum(model.bound.violation(values).max(axis=1), uneven))
     functions = np.asarray(model.functions)
     coefficients = signals @ np.linalg.pinv(functions)

@@ -186,7 +186,8 @@ def followed(
     that adds up otherwise."""
     control, disturbance = dictionaries
     system, d = problem.system, problem.system.states
-    if not isinstance(system, LinearSystem) or system.parameter_count or not isinstance(problem.disturbance_class, str):
+    alike = isinstance(problem.disturbance_class, str) and problem.disturbance_breakpoints is None
+    if not isinstance(system, LinearSystem) or system.parameter_count or not alike:
         return None
     changes: Array | None = None
     if problem.disturbance is not None and problem.disturbance_class == "piecewise_constant":

@@ -248,6 +248,8 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         "disturbance of one class, piecewise_constant or measurable, not "
         f"{kind if isinstance(kind, str) else ' and '.join(sorted(set(kind)))}": disturbed
         and kind not in ("piecewise_constant", "measurable"),
+        "disturbance on the pieces of one dictionary, not on some of its own": problem.disturbance_breakpoints
+        is not None,
         f"measurable disturbance in a set with known corners, which the {bound.kind if bound else ''} has not": bool(
             measurable and bound is not None and not has_corners(bound)
         ),

@@ -12,6 +12,7 @@ from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.disturbances import finest
 from sparserob_core.control.problem.problem import (
     Accumulated,
     MixedConstraint,
@@ -95,6 +96,7 @@ def prepare(
             )
     require_representable(problem)
     stated, problem = problem, accumulated(problem)
+    problem, disturbance = _on_one_grid(problem, disturbance)
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
     if problem.execution is not None and mask.any():
@@ -120,6 +122,21 @@ def prepare(
     return replace(model, program=model.program.mirrored(lambda _: _twin(model, *own())), given=stated)
 
 
+def _on_one_grid(problem: OptimalControlProblem, disturbance: Dictionary) -> tuple[OptimalControlProblem, Dictionary]:
+    """The problem with the breakpoints of every disturbance of a list where one has its own, and indicators of the
+    pieces on which all of them are constant; raises `InputError` for a dictionary with fewer functions than pieces
+    beside them."""
+    if problem.disturbance_breakpoints is None:
+        return problem, disturbance
+    if not disturbance.is_complete:
+        raise InputError(
+            "dictionaries.disturbance: fewer functions than pieces are not proven beside disturbances that have"
+            " breakpoints of their own"
+        )
+    own, joint = finest(problem.disturbance_breakpoints, disturbance.merged().breakpoints)
+    return replace(problem, disturbance_breakpoints=own), Dictionary.indicators(joint)
+
+
 def _functionals(
     problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
 ) -> tuple[WorstCase, ParameterIndex]:
@@ -132,7 +149,8 @@ def _functionals(
     )
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
-        model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
+        bound, breakpoints = problem.disturbance, problem.disturbance_breakpoints
+        model = disturbance_model(problem.disturbance_class, bound, disturbance, grid, breakpoints)
     response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
     execution = None
     if problem.execution is not None:

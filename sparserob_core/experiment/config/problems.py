@@ -75,6 +75,7 @@ def _interval(value: object) -> object:
 Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_interval)]
 Rows: TypeAlias = Annotated[list[Annotated[list[Entry], Field(min_length=1)]], Field(min_length=1), OrPacked()]
 Column: TypeAlias = Annotated[list[Entry], Field(min_length=1), OrPacked(column=True)]
+MOST_PIECES = 1_000_000  # as many as a dictionary of equal pieces may have
 Matrix: TypeAlias = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1), OrPacked()]
 
 
@@ -378,6 +379,19 @@ class DisturbanceOptions(Sparse):
     stop: float | None = Field(default=None, alias="to", ge=0.0)
     """When it ends to act; at the horizon unless given."""
 
+    pieces: int | None = Field(default=None, ge=1, le=MOST_PIECES)
+    """Number of equal pieces on which it is constant; those of ``dictionaries.disturbance`` unless ``pieces`` or
+    ``breakpoints`` is given."""
+
+    breakpoints: Annotated[list[float], Field(min_length=2)] | None = None
+    """Ends of the pieces on which it is constant, increasing from 0 to the horizon."""
+
+    def times(self, where: str, horizon: float) -> list[float] | Array | None:
+        """The ends of its pieces, ``None`` where it has none of its own; raises `InputError` where both say them."""
+        if self.pieces is not None and self.breakpoints is not None:
+            raise InputError(path=where, expected="one of pieces and breakpoints", got="both")
+        return self.breakpoints if self.pieces is None else np.linspace(0.0, horizon, self.pieces + 1)
+
 
 Matrices: TypeAlias = tuple[list[list[Any]], list[list[Any]], list[list[Any]] | None, list[Any] | None]
 
@@ -484,7 +498,8 @@ class ProblemKeys(ProblemFactory, Options):
         | None
     ) = None
     """Set that the disturbance takes its values in; none unless given. Or a list of disturbances, each with its set,
-    its ``E`` and its class, such as ``[{set: {box: 0.1}, E: [[0], [1]]}, {set: {box: 0.02}, E: [[1], [0]]}]``."""
+    its ``E``, its class and its pieces, such as ``[{set: {box: 0.1}, E: [[0], [1]]}, {set: {box: 0.02}, E: [[1],
+    [0]], pieces: 8}]``."""
 
     disturbance_class: DisturbanceClass = "piecewise_constant"
     """``piecewise_constant``: in the disturbance's dictionary; ``measurable``: any measurable function; ``l1_ball``:
@@ -537,7 +552,8 @@ class ProblemKeys(ProblemFactory, Options):
             rows = None if one.E is None else one.E + [[0.0] * len(one.E[0])] * below
             E = None if rows is None else parse_matrix(f"{where}.E", rows, tuple(system.names))
             width = system.disturbances if one.E is None else len(one.E[0])
-            found.append(Disturbance(one.bound.build(f"{where}.set", width), E, one.kind, one.start or 0.0, one.stop))
+            bound, times = one.bound.build(f"{where}.set", width), one.times(where, self.horizon)
+            found.append(Disturbance(bound, E, one.kind, one.start or 0.0, one.stop, times))
         return found
 
     def windows(self, states: int) -> list[PathConstraint | MixedConstraint]:

@@ -117,7 +117,8 @@ class VaryingTube:
         block = np.searchsorted(changes, grid, side="right")
         firsts = np.flatnonzero(np.diff(block, prepend=-1))
         rad = rad + rounding(mid.shape[0]) * np.abs(mid)
-        return Enclosed(*(np.add.reduceat(part, firsts, axis=0)[:, :, None] for part in (mid, rad * OUTWARD)))
+        mid, rad = (np.add.reduceat(part, firsts, axis=0)[:, :, None] for part in (mid, rad * OUTWARD))
+        return Enclosed(mid, rad) if self.scene.lasting is None else Enclosed(*self.scene.lasting.gathered(mid, rad))
 
     @property
     def _disturbances(self) -> int:

@@ -35,7 +35,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
     "path", "terminal", "integral", "title", "initial_control", "control_step", "names", "cost", "disturbances",
-    "measurements", "repeat", "execution",
+    "measurements", "repeat", "execution", "disturbance_breakpoints",
 }  # fmt: skip
 """The fields of a problem that are written; one that is added and not named here is refused, not lost."""
 MANY = 2500  # entries of a matrix that nobody reads: of ten times more a config has as many values as it may have
@@ -97,7 +97,8 @@ def _disturbance_keys(problem: OptimalControlProblem, system: dict[str, Any]) ->
         columns = [row[begin : begin + part.dimension] for row in rows]
         begin += part.dimension
         keys = {"set": set_keys(f"disturbance.{i}.set", part), "E": columns, "class": _class_of(problem, i)}
-        found.append(keys)
+        own = None if problem.disturbance_breakpoints is None else problem.disturbance_breakpoints[i]
+        found.append(keys if own is None else {**keys, "breakpoints": own.tolist()})
     return found
 
 

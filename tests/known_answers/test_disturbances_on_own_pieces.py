@@ -1,0 +1,222 @@
+"""Guards disturbances of a list that are constant on pieces of their own (control/response/disturbance.py, `lasting`,
+and checker/reach/lasting.py): values by a linear program of integrals that no line of the package had a part in, and by
+problems in which all of them share the dictionary's pieces."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import yaml
+from scipy.integrate import quad
+from scipy.linalg import expm
+from scipy.optimize import linprog
+
+import sparserob_core as sr
+
+A, B = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.0], [1.0]])
+HORIZON, PIECES, LIMIT = 3.0, 6, 0.4
+FAST, SLOW = np.array([[0.3], [1.0]]), np.array([[1.0, 0.2], [0.0, -0.5]])
+UNEVEN, EVEN, PLAIN = np.array([0.0, 1.0, 1.3, 3.0]), np.linspace(0.0, HORIZON, 6), np.linspace(0.0, HORIZON, 5)
+OTHERS = {"control": {"name": "piecewise_constant", "pieces": PIECES}}
+OTHERS["disturbance"] = {"name": "piecewise_constant", "pieces": PLAIN.size - 1}
+
+
+def pushed(direction, E, begin, end):
+    """``int c'e^{A (T - s)} E ds``."""
+    return np.array(
+        [quad(lambda s, e=e: float(direction @ expm(A * (HORIZON - s)) @ e), begin, end)[0] for e in E.T],
+    )
+
+
+def added(direction):
+    """What three disturbances add at the horizon: in a box of 0.1, a disc of 0.08, and a box of 0.05."""
+    every = [(UNEVEN, FAST, 0.1), (EVEN, SLOW, 0.08), (PLAIN, B, 0.05)]
+    return sum(
+        radius * float(np.linalg.norm(pushed(direction, E, begin, end)))
+        for grid, E, radius in every
+        for begin, end in pairwise(grid)
+    )
+
+
+def stated(**more):
+    """The oscillator that is to be near rest at the end, whatever three disturbances on three grids do."""
+    disturbances = [
+        sr.Disturbance(sr.Box([-0.1], [0.1]), FAST, breakpoints=UNEVEN),
+        sr.Disturbance(sr.NormBall(2.0, 0.08, dimension=2), SLOW, breakpoints=EVEN),
+        sr.Disturbance(sr.Box([-0.05], [0.05]), B),
+    ]
+    given = {
+        "system": sr.LinearSystem(A, B), "horizon": HORIZON, "initial_state": [1.0, 0.0],
+        "control": sr.Box([-2.0], [2.0]), "terminal": [sr.Box([-LIMIT] * 2, [LIMIT] * 2)],
+        "disturbances": disturbances,
+    }  # fmt: skip
+    return sr.OptimalControlProblem(**{**given, **more})
+
+
+@pytest.fixture(scope="module")
+def least():
+    """The value by a linear program."""
+    ends, rows, right = np.linspace(0.0, HORIZON, PIECES + 1), [], []
+    for direction in (*np.eye(2), *-np.eye(2)):
+        row = np.concatenate([pushed(direction, B, *span) for span in pairwise(ends)])
+        rows.append(np.concatenate([row, -row]))
+        right.append(LIMIT - direction @ expm(A * HORIZON) @ [1.0, 0.0] - added(direction))
+    found = linprog(np.full(2 * PIECES, HORIZON / PIECES), A_ub=rows, b_ub=right, bounds=[(0.0, 2.0)] * (2 * PIECES))
+    assert found.status == 0
+    return float(found.fun)
+
+
+def test_each_is_constant_on_its_own_pieces(least, tmp_path):
+    result = sr.solve(stated(), **OTHERS)
+    assert result.status == "certified"
+    assert result.lower_bound <= least + 1e-8 and result.cost >= least - 1e-8
+    assert result.cost == pytest.approx(least, abs=1e-7)
+    directory = result.save(tmp_path / "run", figures=False)
+    assert sr.check(directory).status == "verified"
+    written = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["problem"]["disturbance"]
+    assert [one.get("breakpoints") for one in written] == [UNEVEN.tolist(), EVEN.tolist(), None]
+
+
+def test_pieces_that_are_shared_would_cost_more(least):
+    """On one grid that is as fine as all of them a disturbance may jump where it cannot."""
+    plain = [sr.Disturbance(one.set, one.E) for one in (
+        sr.Disturbance(sr.Box([-0.1], [0.1]), FAST), sr.Disturbance(sr.NormBall(2.0, 0.08, dimension=2), SLOW),
+        sr.Disturbance(sr.Box([-0.05], [0.05]), B),
+    )]  # fmt: skip
+    finer = {"name": "piecewise_constant", "breakpoints": np.unique([*UNEVEN, *EVEN, *PLAIN]).tolist()}
+    result = sr.solve(stated(disturbances=plain), control=OTHERS["control"], disturbance=finer)
+    assert result.lower_bound > least + 1e-3
+
+
+@pytest.fixture(scope="module")
+def bounded(tmp_path_factory):
+    """A run, and the directory of the worst cases of its control."""
+    place = tmp_path_factory.mktemp("bounded")
+    result = sr.solve(stated(), **OTHERS)
+    result.save(place / "run", figures=False)
+    return result, sr.bound(place / "run", out=place / "bound"), place / "bound"
+
+
+def test_worst_cases_are_those_sums_and_their_signals_stay_what_they_are(bounded):
+    result, found, directory = bounded
+    ends, control = np.linspace(0.0, HORIZON, PIECES + 1), np.asarray(result.decision).ravel()
+    for row in found.rows:
+        direction = np.asarray(row.direction)
+        moved = sum(pushed(direction, B, *ends[k : k + 2])[0] * control[k] for k in range(PIECES))
+        value = direction @ expm(A * HORIZON) @ [1.0, 0.0] + moved + added(direction)
+        value = value if row.sense == "sup" else -value
+        assert row.lower - 1e-8 <= value <= row.upper + 1e-8
+        assert row.upper - row.lower < 1e-6
+    assert sr.check(directory).status == "verified"
+
+
+def test_a_signal_that_jumps_within_a_piece_of_its_own_is_refused(bounded, tmp_path):
+    shutil.copytree(bounded[2], tmp_path / "bound")
+    path = tmp_path / "bound" / "bound.json"
+    told = json.loads(path.read_text())
+    signal, changes = np.array(told["rows"][0]["disturbance"]), told["rows"][0]["changes"]
+    inside = next(k for k in range(1, signal.shape[1]) if not np.isclose(UNEVEN, changes[k]).any())
+    signal[0, inside] = 0.9 * signal[0, inside - 1]
+    told["rows"][0]["disturbance"] = signal.tolist()
+    path.write_text(json.dumps(told))
+    checked = sr.check(tmp_path / "bound")
+    assert checked.status == "refuted"
+    assert "the disturbance jumps within a piece" in str(checked.claims)
+
+
+WALLED = {
+    "name": "linear", "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]}, "horizon": 2.0, "initial_state": [1.0, 0.0],
+    "control": {"box": 2.0}, "path": [{"box": [1.15, None]}], "terminal": [{"box": [0.4, 0.4]}],
+}  # fmt: skip
+VARIANTS = {
+    "plain": {},
+    "parameters": {"system": {"A": [[0, 1], ["p", 0]], "B": [[0], [1]], "parameters": {"p": [-0.1, 0.1]}}},
+    "pieces of the system": {
+        "system": {
+            "pieces": [
+                {"until": 0.7, "A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+                {"until": 2.0, "A": [[0, 1], [-1, 0]], "B": [[0], [1.5]]},
+            ]
+        }
+    },
+    "entries in t": {"system": {"A": [[0, 1], ["-0.3 * sin(t)", 0]], "B": [[0], [1]]}},
+    "delay": {
+        "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "delay": 0.1}, "initial_control": 0.0,
+        "control_step": {"box": 4.0},
+    },
+    "initial set": {"initial_state": {"centre": [1.0, 0.0], "box": 0.02}},
+    "curved path": {"path": [{"norm": {"p": 2, "radius": 1.3}}]},
+    "moving set": {"path": [{"box": [1.15, None], "relative_to": [[0, 0, 0], [2, -0.05, 0]]}]},
+    "mixed": {"path": [{"mixed": {"H": [[1, 0]], "G": [[0.1]], "h": [1.2]}}]},
+    "integral": {"integral": [{"H": [[1, 0]], "upper": [1.6]}]},
+    "quadratic cost": {"cost": {"control": {"R": [[0.1]]}}},
+    "repeat": {
+        "system": {"A": [[-1, 1], [0, -1]], "B": [[0], [1]]}, "repeat": True,
+        "initial_state": {"centre": [0.0, 0.0], "box": 0.5}, "path": [{"box": [1.15, None]}], "terminal": [],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.first(5)
+@pytest.mark.parametrize("variant", [*VARIANTS, "literal", "sparsest", "execution", "haar"])
+def test_a_disturbance_on_long_pieces_beside_one_that_does_nothing_is_one_on_a_dictionary_of_long_pieces(
+    variant, tmp_path
+):
+    """The other one has short pieces and the value 0, so that the long ones are parts of a finer grid here, and the
+    dictionary itself there, where nothing of this is met."""
+    E, box = [[0.3], [1]], {"box": 0.1}
+    keys = {**WALLED, **VARIANTS.get(variant, {})}
+    rest = {"dictionaries": {"control": {"name": "piecewise_constant", "pieces": 5}}, "observers": []}
+    if variant == "literal":
+        rest |= {"method": {"name": "sparserob", "formulation": "literal", "indices": 4}}
+        rest |= {"maximiser": {"name": "random_search", "budget": 50}}
+    if variant == "sparsest":
+        rest["method"] = "sparsest"
+    if variant == "execution":
+        keys["execution"] = 0.02
+    if variant == "haar":
+        rest["dictionaries"]["control"] = {"name": "haar", "pieces": 8}
+
+    def made(name, disturbance, pieces, **other):
+        dictionaries = {**rest["dictionaries"], "disturbance": {"name": "piecewise_constant", "pieces": pieces}}
+        problem = {**keys, "disturbance": disturbance}
+        given = {**rest, "problem": problem, "dictionaries": dictionaries, **other}
+        return sr.run(given, out=tmp_path / name, quiet=True, figures=False)
+
+    own = made("own", [{"set": box, "E": E, "pieces": 4}, {"set": {"box": 0.0}, "E": E}], 14)
+    plain = made("plain", [{"set": box, "E": E}, {"set": {"box": 0.0}, "E": E}], 4)
+    if variant == "literal":  # what a search finds differs; what is claimed is checked
+        assert own.result.lower_bound <= made("exact", [{"set": box, "E": E}], 4, method="exchange").result.cost
+        assert sr.check(own.directory).status == "verified"
+        return
+    assert own.result.status == plain.result.status == "certified"
+    assert own.result.cost == pytest.approx(plain.result.cost, rel=1e-6)
+    assert own.result.lower_bound == pytest.approx(plain.result.lower_bound, rel=1e-6)
+    assert sr.check(own.directory).status == "verified"
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"breakpoints": [0.0, 1.0]}, "disturbance.0.breakpoints: expected times that increase from 0 to 2"),
+        ({"breakpoints": [0.0, 1.0, 1.0, 2.0]}, "disturbance.0.breakpoints: expected times that increase"),
+        ({"breakpoints": [0.5, 2.0]}, "disturbance.0.breakpoints: expected times that increase"),
+        ({"pieces": 2, "breakpoints": [0.0, 2.0]}, "disturbance.0: expected one of pieces and breakpoints, got both"),
+        ({"pieces": 0}, "disturbance.0.pieces"),
+        ({"pieces": 2, "class": "measurable"}, "breakpoints: expected none where a disturbance of the list"),
+    ],
+)
+def test_pieces_that_do_not_fit_are_refused(more, said):
+    keys = {**WALLED, "disturbance": [{"set": {"box": 0.1}, "E": [[0], [1]], **more}]}
+    with pytest.raises(sr.InputError) as error:
+        sr.run({"problem": keys, "dictionaries": {"control": OTHERS["control"]}}, quiet=True, figures=False)
+    assert said in str(error.value)
+
+
+def test_feedback_on_pieces_of_their_own_is_refused():
+    with pytest.raises(sr.InputError, match="feedback needs a disturbance on the pieces of one dictionary"):
+        sr.solve(stated(), policy=sr.AffinePolicy(), **OTHERS)
