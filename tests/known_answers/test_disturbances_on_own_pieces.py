@@ -78,7 +78,7 @@ def test_each_is_constant_on_its_own_pieces(least, tmp_path):
     directory = result.save(tmp_path / "run", figures=False)
     assert sr.check(directory).status == "verified"
     written = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())["problem"]["disturbance"]
-    assert [one.get("breakpoints") for one in written] == [UNEVEN.tolist(), EVEN.tolist(), None]
+    assert [one.get("breakpoints") for one in written] == [UNEVEN.tolist(), EVEN.tolist(), PLAIN.tolist()]
 
 
 def test_pieces_that_are_shared_would_cost_more(least):
@@ -197,6 +197,20 @@ def test_a_disturbance_on_long_pieces_beside_one_that_does_nothing_is_one_on_a_d
     assert own.result.cost == pytest.approx(plain.result.cost, rel=1e-6)
     assert own.result.lower_bound == pytest.approx(plain.result.lower_bound, rel=1e-6)
     assert sr.check(own.directory).status == "verified"
+
+
+def test_the_margin_enlarges_all_of_them(bounded):
+    """What they add at the end grows with the factor; of the rows of the end the one with the least room decides, with
+    a control that makes room where it can: the largest factor is that of a linear program in the control and it."""
+    ends, rows, right = np.linspace(0.0, HORIZON, PIECES + 1), [], []
+    for direction in (*np.eye(2), *-np.eye(2)):
+        row = np.concatenate([pushed(direction, B, *span) for span in pairwise(ends)])
+        rows.append(np.append(row, added(direction)))
+        right.append(LIMIT - direction @ expm(A * HORIZON) @ [1.0, 0.0])
+    cost = np.append(np.zeros(PIECES), -1.0)
+    largest = linprog(cost, A_ub=rows, b_ub=right, bounds=[(-2.0, 2.0)] * PIECES + [(0.0, None)])
+    found = sr.margin(bounded[2].parent / "run" / "config.yaml", of="disturbance")
+    assert found.lower - 1e-6 <= -largest.fun <= found.upper + 1e-6 and found.upper - found.lower < 1e-4
 
 
 @pytest.mark.parametrize(
