@@ -140,6 +140,13 @@ def farkas_margin(
     return bound, terms.magnitude
 
 
+def farkas_proof(program: FiniteProgram, y: Array, mu: Array, z: Array | None, tolerance: float) -> float | None:
+    """The `farkas_bound` of multipliers where it is positive by more than a ``tolerance`` of the terms that cancelled
+    in it, and of 1: then they prove that nothing is feasible; ``None`` where they do not."""
+    bound, magnitude = farkas_margin(program, y, mu, z)
+    return bound if bound > tolerance * max(1.0, magnitude) else None
+
+
 def homogeneous(program: FiniteProgram) -> FiniteProgram:
     """The same constraints without a cost."""
     q, weights = np.zeros_like(program.q), np.zeros_like(program.weights)

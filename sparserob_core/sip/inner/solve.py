@@ -33,7 +33,7 @@ from sparserob_core.sip.finite import (
 )
 from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
 from sparserob_core.sip.inner.dual_newton import polish
-from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers, vertex_multipliers
+from sparserob_core.sip.inner.duality import farkas_proof, measure, minimisers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
 from sparserob_core.sip.inner.standard_form import Form, Recovered, has_cones, standard_form
@@ -452,8 +452,8 @@ def _proof(case: _Case, answer: Recovered | None, source: str) -> FiniteSolution
     if answer is None:
         return None
     program, (x, y, mu, z) = case.program, answer
-    bound, magnitude = farkas_margin(program, y, mu, z)
-    if not bound > case.tolerance * max(1.0, magnitude):
+    bound = farkas_proof(program, y, mu, z, case.tolerance)
+    if bound is None:
         return None
     measured = measure(program, x, y, mu, z)
     message = (

@@ -17,7 +17,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import NO_BOUND, Branch, Dual, Leaf
 from sparserob_core.sip.finite import HIGHS, NOBODY, FiniteProgram
-from sparserob_core.sip.inner.duality import farkas_margin, proving
+from sparserob_core.sip.inner.duality import farkas_proof, proving
 from sparserob_core.sip.inner.simplex.interruptible import with_integers
 from sparserob_core.sip.inner.solve import elastic_program, unrelaxed
 from sparserob_core.sip.inner.vertex import Corner, simplex
@@ -138,8 +138,8 @@ class Branching:
         y, mu, z = corner.y, corner.mu, corner.z
         known = replace(part, bound=max(part.bound, 0.0))
         if corner.status == "infeasible":
-            amount, magnitude = farkas_margin(finite, y, mu, z)
-            if not amount > IMPOSSIBLE * max(1.0, magnitude):
+            amount = farkas_proof(finite, y, mu, z, IMPOSSIBLE)
+            if amount is None:
                 return known, leaf
             size = float(y @ np.linalg.norm(finite.G, axis=1) + np.abs(mu) @ np.linalg.norm(finite.A, axis=1))
             z = None if z is None else z / size

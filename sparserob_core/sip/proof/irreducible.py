@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.sip.finite import FiniteSolution
-from sparserob_core.sip.inner.duality import farkas_bound, farkas_margin, homogeneous, measure
+from sparserob_core.sip.inner.duality import farkas_bound, farkas_proof, homogeneous, measure
 from sparserob_core.sip.inner.solve import TURNS, elastic_program, unrelaxed
 from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.proof.reasons import reasons
@@ -59,8 +59,8 @@ def _at_a_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) 
     if corner.status != "optimal":
         return solution
     x, y, mu, z = unrelaxed(finite, (corner.x, corner.y, corner.mu, corner.z))
-    amount, magnitude = farkas_margin(finite, y, mu, z)
-    if not (amount > relaxed.tolerance * max(1.0, magnitude) and np.count_nonzero(y) < size and y[fixed:].any()):
+    amount = farkas_proof(finite, y, mu, z, relaxed.tolerance)
+    if amount is None or np.count_nonzero(y) >= size or not y[fixed:].any():
         return solution
     measured = measure(homogeneous(finite), x, y, mu, z)
     return replace(solution, y=y, mu=mu, z=measured.z, infeasibility=amount)

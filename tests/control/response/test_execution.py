@@ -15,6 +15,7 @@ from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.measurable import Execution, ExecutionCellSupport
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
+from tests.support.enclosed import assert_bounded_on_cells
 
 A = np.array([[0.0, 1.0], [-4.0, -0.3]])
 B = np.array([[0.2, 0.0], [1.0, -0.7]])
@@ -110,17 +111,7 @@ def test_it_is_nowhere_above_its_chord_by_more_than_is_said_and_hardly_less() ->
 
 def test_the_bound_of_a_constraint_holds_on_every_cell_and_closes() -> None:
     one = constraint(model())
-    x = np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()])
-    lower, upper = one.cells
-    for halvings in range(4):
-        bounds = one.enclosure(x, lower, upper).bounds
-        for low, high, bound in zip(lower[:, 0], upper[:, 0], bounds, strict=True):
-            highest = one.at(x, np.linspace(low, high, 5)[:, None]).max()
-            assert highest <= bound + 1e-12
-            if halvings == 3:
-                assert bound <= highest + 0.02
-        middle = (lower + upper) / 2
-        lower, upper = np.vstack([lower, middle]), np.vstack([middle, upper])
+    assert_bounded_on_cells(one, np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()]), halvings=3, near=0.02)
 
 
 def test_rows_at_the_sizes_of_the_control_are_its_worst_case() -> None:

@@ -17,6 +17,7 @@ from sparserob_core.sip.inner.duality import (
     _usable,
     dual_bound,
     farkas_margin,
+    farkas_proof,
     homogeneous,
     measure,
     minimisers,
@@ -108,6 +109,19 @@ def test_what_refutes_is_the_dual_function_of_the_rows_alone_per_size_of_the_mul
             sizes = (y @ np.abs(np.where(finite, program.h, 0.0)) + np.abs(mu) @ np.abs(program.b)) / total
             assert magnitude == pytest.approx(sizes)
     assert farkas_margin(program, 0.0 * y, 0.0 * mu) == (-np.inf, 0.0)
+
+
+def test_what_refutes_is_a_proof_where_it_is_more_than_a_share_of_what_cancelled() -> None:
+    rng, told = np.random.default_rng(5), set[bool]()
+    for _ in range(40):
+        program, y, mu = drawn(rng, "plain")
+        bound, magnitude = farkas_margin(program, y, mu)
+        for tolerance in (0.0, 1e-9, abs(bound) / max(1.0, magnitude) * (1.0 - 1e-9), abs(bound) / max(1.0, magnitude)):
+            expected = bound if bound > tolerance * max(1.0, magnitude) else None
+            assert farkas_proof(program, y, mu, None, tolerance) == expected
+            told.add(expected is None)
+    assert told == {True, False}
+    assert farkas_proof(program, 0.0 * y, 0.0 * mu, None, 1e-9) is None
 
 
 def test_norms_of_blocks_are_replaced_by_what_lies_below_them_and_meets_them() -> None:
