@@ -57,17 +57,47 @@ def stated(**more):
     return sr.OptimalControlProblem(**{**given, **more})
 
 
-@pytest.fixture(scope="module")
-def least():
-    """The value by a linear program."""
-    ends, rows, right = np.linspace(0.0, HORIZON, PIECES + 1), [], []
+def value(ends):
+    """The least cost of a control on pieces between ``ends``, by a linear program."""
+    rows, right, lengths = [], [], np.tile(np.diff(ends), 2)
     for direction in (*np.eye(2), *-np.eye(2)):
         row = np.concatenate([pushed(direction, B, *span) for span in pairwise(ends)])
         rows.append(np.concatenate([row, -row]))
         right.append(LIMIT - direction @ expm(A * HORIZON) @ [1.0, 0.0] - added(direction))
-    found = linprog(np.full(2 * PIECES, HORIZON / PIECES), A_ub=rows, b_ub=right, bounds=[(0.0, 2.0)] * (2 * PIECES))
+    found = linprog(lengths, A_ub=rows, b_ub=right, bounds=[(0.0, 2.0)] * lengths.size)
     assert found.status == 0
     return float(found.fun)
+
+
+@pytest.fixture(scope="module")
+def least():
+    """The value on six equal pieces."""
+    return value(np.linspace(0.0, HORIZON, PIECES + 1))
+
+
+def test_the_pieces_of_the_control_may_be_among_theirs():
+    control = {"name": "piecewise_constant", "breakpoints": EVEN.tolist()}
+    result = sr.solve(stated(), control=control, disturbance=OTHERS["disturbance"])
+    assert result.status == "certified"
+    assert result.cost == pytest.approx(value(EVEN), abs=1e-7)
+
+
+@pytest.mark.parametrize("cut", [0.7, 1.9])
+def test_one_that_jumps_once_less_than_another_is_no_freer(cut):
+    """Of two pieces of the one the other has one."""
+    two = np.array([0.0, cut, HORIZON])
+    disturbances = [
+        sr.Disturbance(sr.Box([-0.1], [0.1]), FAST, breakpoints=two),
+        sr.Disturbance(sr.Box([-0.1], [0.1]), B, breakpoints=[0.0, HORIZON]),
+    ]
+    problem = stated(
+        disturbances=disturbances, control=sr.Box([-1e-9], [1e-9]), terminal=[sr.Box([-9.0] * 2, [9.0] * 2)]
+    )
+    for row in sr.bound(problem).rows:
+        c = np.asarray(row.direction)
+        reach = abs(pushed(c, FAST, 0.0, cut)) + abs(pushed(c, FAST, cut, HORIZON)) + abs(pushed(c, B, 0.0, HORIZON))
+        worst = c @ expm(A * HORIZON) @ [1.0, 0.0] + 0.1 * float(reach[0])
+        assert (row.upper if row.sense == "sup" else -row.lower) == pytest.approx(worst, abs=1e-5)
 
 
 def test_each_is_constant_on_its_own_pieces(least, tmp_path):
@@ -128,35 +158,66 @@ def test_a_signal_that_jumps_within_a_piece_of_its_own_is_refused(bounded, tmp_p
     assert "the disturbance jumps within a piece" in str(checked.claims)
 
 
+@pytest.mark.parametrize("kind", ["known", "entries in t"])
+def test_a_bound_that_a_disturbance_on_shorter_pieces_would_have_is_refuted(kind, tmp_path):
+    """What is derived is what disturbances do that stay what they are; one that is a little larger does not follow."""
+    system = {} if kind == "known" else {"system": {"A": [[0, 1], ["-9 + 0*t", -0.3]], "B": [[0], [1]]}}
+    keys = {**WALLED, **system, "disturbance": [{"set": {"box": 0.1}, "E": LONG, "pieces": 3}, STILL]}
+    given = {"problem": keys, "dictionaries": OTHERS, "observers": []}
+    sr.run(given, out=tmp_path / "run", quiet=True, figures=False)
+    path = tmp_path / "run" / "certificate.json"
+    told = json.loads(path.read_text())
+    told["lower_bound"] += 1e-6
+    path.write_text(json.dumps(told))
+    assert any(one.name == "lower bound" and one.verdict == "fails" for one in sr.check(tmp_path / "run").claims)
+
+
+def test_a_witness_that_jumps_within_a_piece_of_its_own_is_refused(tmp_path):
+    keys = {**WALLED, "disturbance": [{"set": {"box": 0.1}, "E": LONG, "pieces": 3}, STILL]}
+    given = {"problem": keys, "dictionaries": OTHERS, "method": {"name": "nominal"}, "observers": []}
+    assert sr.run(given, out=tmp_path / "run", quiet=True, figures=False).status == "refuted"
+    assert sr.check(tmp_path / "run").status == "verified"
+    path = tmp_path / "run" / "certificate.json"
+    told = json.loads(path.read_text())
+    signal = np.array(told["witness"]["disturbance"])
+    signal[0, 1] = 0.999 * signal[0, 0]
+    told["witness"]["disturbance"] = signal.tolist()
+    path.write_text(json.dumps(told))
+    assert "jumps at" in str(sr.check(tmp_path / "run").claims)
+
+
+LONG, STILL = [[0.3], [1]], {"set": {"box": 0.0}, "E": [[0.3], [1]]}
+# within pieces of 0.5 and more its rows change their signs, so that a disturbance which may jump there does more
 WALLED = {
-    "name": "linear", "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]}, "horizon": 2.0, "initial_state": [1.0, 0.0],
-    "control": {"box": 2.0}, "path": [{"box": [1.15, None]}], "terminal": [{"box": [0.4, 0.4]}],
+    "name": "linear", "system": {"A": [[0, 1], [-9, -0.3]], "B": [[0], [1]]}, "horizon": 2.0,
+    "initial_state": [0.5, 0.0], "control": {"box": 3.0}, "path": [{"box": [0.8, None]}],
+    "terminal": [{"box": [0.2, 0.8]}],
 }  # fmt: skip
 VARIANTS = {
     "plain": {},
-    "parameters": {"system": {"A": [[0, 1], ["p", 0]], "B": [[0], [1]], "parameters": {"p": [-0.1, 0.1]}}},
+    "parameters": {"system": {"A": [[0, 1], ["-9 + p", -0.3]], "B": [[0], [1]], "parameters": {"p": [-0.1, 0.1]}}},
     "pieces of the system": {
         "system": {
             "pieces": [
-                {"until": 0.7, "A": [[0, 1], [0, 0]], "B": [[0], [1]]},
-                {"until": 2.0, "A": [[0, 1], [-1, 0]], "B": [[0], [1.5]]},
+                {"until": 0.7, "A": [[0, 1], [-9, -0.3]], "B": [[0], [1]]},
+                {"until": 2.0, "A": [[0, 1], [-12, 0]], "B": [[0], [1.5]]},
             ]
         }
     },
-    "entries in t": {"system": {"A": [[0, 1], ["-0.3 * sin(t)", 0]], "B": [[0], [1]]}},
+    "entries in t": {"system": {"A": [[0, 1], ["-9 - 2*sin(t)", -0.3]], "B": [[0], [1]]}},
     "delay": {
-        "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "delay": 0.1}, "initial_control": 0.0,
-        "control_step": {"box": 4.0},
+        "system": {"A": [[0, 1], [-9, -0.3]], "B": [[0], [1]], "delay": 0.1}, "initial_control": 0.0,
+        "control_step": {"box": 5.0},
     },
-    "initial set": {"initial_state": {"centre": [1.0, 0.0], "box": 0.02}},
-    "curved path": {"path": [{"norm": {"p": 2, "radius": 1.3}}]},
-    "moving set": {"path": [{"box": [1.15, None], "relative_to": [[0, 0, 0], [2, -0.05, 0]]}]},
-    "mixed": {"path": [{"mixed": {"H": [[1, 0]], "G": [[0.1]], "h": [1.2]}}]},
-    "integral": {"integral": [{"H": [[1, 0]], "upper": [1.6]}]},
+    "initial set": {"initial_state": {"centre": [0.5, 0.0], "box": 0.02}},
+    "curved path": {"path": [{"ellipsoid": {"centre": [0, 0], "shape": [[0.64, 0], [0, 5.0]]}}]},
+    "moving set": {"path": [{"box": [0.8, None], "relative_to": [[0, 0, 0], [2, -0.05, 0]]}]},
+    "mixed": {"path": [{"mixed": {"H": [[1, 0]], "G": [[0.1]], "h": [0.9]}}]},
+    "integral": {"integral": [{"H": [[1, 0]], "upper": [0.5]}]},
     "quadratic cost": {"cost": {"control": {"R": [[0.1]]}}},
     "repeat": {
-        "system": {"A": [[-1, 1], [0, -1]], "B": [[0], [1]]}, "repeat": True,
-        "initial_state": {"centre": [0.0, 0.0], "box": 0.5}, "path": [{"box": [1.15, None]}], "terminal": [],
+        "system": {"A": [[-1, 4], [-4, -1]], "B": [[0], [1]]}, "repeat": True,
+        "initial_state": {"centre": [0.0, 0.0], "box": 0.3}, "path": [{"box": [0.8, None]}], "terminal": [],
     },
 }  # fmt: skip
 
@@ -168,7 +229,7 @@ def test_a_disturbance_on_long_pieces_beside_one_that_does_nothing_is_one_on_a_d
 ):
     """The other one has short pieces and the value 0, so that the long ones are parts of a finer grid here, and the
     dictionary itself there, where nothing of this is met."""
-    E, box = [[0.3], [1]], {"box": 0.1}
+    box = {"box": 0.1}
     keys = {**WALLED, **VARIANTS.get(variant, {})}
     rest = {"dictionaries": {"control": {"name": "piecewise_constant", "pieces": 5}}, "observers": []}
     if variant == "literal":
@@ -187,10 +248,10 @@ def test_a_disturbance_on_long_pieces_beside_one_that_does_nothing_is_one_on_a_d
         given = {**rest, "problem": problem, "dictionaries": dictionaries, **other}
         return sr.run(given, out=tmp_path / name, quiet=True, figures=False)
 
-    own = made("own", [{"set": box, "E": E, "pieces": 4}, {"set": {"box": 0.0}, "E": E}], 14)
-    plain = made("plain", [{"set": box, "E": E}, {"set": {"box": 0.0}, "E": E}], 4)
+    own = made("own", [{"set": box, "E": LONG, "pieces": 3}, STILL], 14)
+    plain = made("plain", [{"set": box, "E": LONG}, STILL], 3)
     if variant == "literal":  # what a search finds differs; what is claimed is checked
-        assert own.result.lower_bound <= made("exact", [{"set": box, "E": E}], 4, method="exchange").result.cost
+        assert own.result.lower_bound <= made("exact", [{"set": box, "E": LONG}], 3, method="exchange").result.cost
         assert sr.check(own.directory).status == "verified"
         return
     assert own.result.status == plain.result.status == "certified"
@@ -225,7 +286,7 @@ def test_the_margin_enlarges_all_of_them(bounded):
     ],
 )
 def test_pieces_that_do_not_fit_are_refused(more, said):
-    keys = {**WALLED, "disturbance": [{"set": {"box": 0.1}, "E": [[0], [1]], **more}]}
+    keys = {**WALLED, "disturbance": [{"set": {"box": 0.1}, "E": LONG, **more}]}
     with pytest.raises(sr.InputError) as error:
         sr.run({"problem": keys, "dictionaries": {"control": OTHERS["control"]}}, quiet=True, figures=False)
     assert said in str(error.value)
