@@ -16,6 +16,7 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.checker.claims.case import Case
 
 A, B = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.0], [1.0]])
 HORIZON, PIECES, LIMIT = 3.0, 6, 0.4
@@ -163,13 +164,63 @@ def test_a_bound_that_a_disturbance_on_shorter_pieces_would_have_is_refuted(kind
     """What is derived is what disturbances do that stay what they are; one that is a little larger does not follow."""
     system = {} if kind == "known" else {"system": {"A": [[0, 1], ["-9 + 0*t", -0.3]], "B": [[0], [1]]}}
     keys = {**WALLED, **system, "disturbance": [{"set": {"box": 0.1}, "E": LONG, "pieces": 3}, STILL]}
-    given = {"problem": keys, "dictionaries": OTHERS, "observers": []}
+    fine = {**OTHERS, "disturbance": {"name": "piecewise_constant", "pieces": 14}}
+    given = {"problem": keys, "dictionaries": fine, "observers": []}
     sr.run(given, out=tmp_path / "run", quiet=True, figures=False)
     path = tmp_path / "run" / "certificate.json"
     told = json.loads(path.read_text())
     told["lower_bound"] += 1e-6
     path.write_text(json.dumps(told))
     assert any(one.name == "lower bound" and one.verdict == "fails" for one in sr.check(tmp_path / "run").claims)
+
+
+def test_the_units_of_rows_are_those_of_what_disturbances_do_on_their_own_pieces():
+    """As on a dictionary of long pieces, and less than where the same disturbance may jump on short ones."""
+    system, box = sr.LinearSystem([[0.0, 1.0], [-9.0, -0.3]], [[0.0], [1.0]]), sr.Box([-0.1], [0.1])
+    still, control = sr.Disturbance(sr.Box([0.0], [0.0]), LONG), sr.Dictionary.indicators(np.linspace(0.0, 2.0, 6))
+    found, none = [], {"decision": np.zeros((1, 5)).tolist()}
+    for pieces, own in ((14, np.linspace(0.0, 2.0, 4)), (3, None), (14, None)):
+        disturbances = [sr.Disturbance(box, LONG, breakpoints=own), still]
+        problem = sr.OptimalControlProblem(
+            system=system, horizon=2.0, initial_state=[0.0, 0.0], control=sr.Box([-1e-6], [1e-6]),
+            terminal=[sr.Box([-1.0] * 2, [1.0] * 2)], disturbances=disturbances,
+        )  # fmt: skip
+        case = Case(problem, control, sr.Dictionary.indicators(np.linspace(0.0, 2.0, pieces + 1)), none)
+        found.append(case.units(case.windows[0]).rows)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
+    assert (found[0] < 0.99 * found[2]).all()
+
+
+def test_ends_of_pieces_that_differ_by_rounding_are_one(tmp_path):
+    """``3 * 0.6`` is not 1.8."""
+    disturbances = [
+        sr.Disturbance(sr.Box([-0.1], [0.1]), FAST, breakpoints=[0.0, 1.8, HORIZON]),
+        sr.Disturbance(sr.Box([-0.1], [0.1]), B, breakpoints=EVEN),
+    ]
+    assert EVEN[3] != 1.8
+    result = sr.solve(stated(disturbances=disturbances), **OTHERS)
+    assert result.status == "certified"
+    assert sr.check(result.save(tmp_path / "run", figures=False)).status == "verified"
+
+
+@pytest.mark.slow
+def test_a_chain_of_many_states_is_checked_on_their_own_pieces(tmp_path):
+    """Where rows are followed by their adjoints when all disturbances share their pieces."""
+    masses = 16
+    stiffness = 9.0 * (2.0 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1))
+    chain = np.block([[np.zeros((masses, masses)), np.eye(masses)], [-stiffness, -0.3 * np.eye(masses)]])
+    first, last = (np.eye(1, 2 * masses, masses + k).T.tolist() for k in (0, masses - 1))
+    keys = {
+        "name": "linear", "system": {"A": chain.tolist(), "B": first}, "horizon": 2.0, "initial_state": 0.0,
+        "control": {"box": 1.0}, "path": [{"polytope": {"H": np.eye(1, 2 * masses).tolist(), "h": [0.02]}}],
+        "disturbance": [{"set": {"box": 0.1}, "E": first, "pieces": 3}, {"set": {"box": 0.1}, "E": last}],
+    }  # fmt: skip
+    fine = {**OTHERS, "disturbance": {"name": "piecewise_constant", "pieces": 14}}
+    run = sr.run(
+        {"problem": keys, "dictionaries": fine, "observers": []}, out=tmp_path / "run", quiet=True, figures=False
+    )
+    assert run.status == "certified"
+    assert sr.check(tmp_path / "run").status == "verified"
 
 
 def test_a_witness_that_jumps_within_a_piece_of_its_own_is_refused(tmp_path):

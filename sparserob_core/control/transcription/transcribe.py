@@ -238,7 +238,6 @@ def _told(model: Transcription, posed: Posed, units: Units) -> tuple[Transcripti
 def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProgram:
     """The program of another problem on the dictionaries of ``own``, with its rows divided by what those of ``own`` are
     divided by, and told as these are: for problems that differ from it in numbers on the right-hand sides only."""
-    problem = replace(problem, disturbance_breakpoints=own.problem.disturbance_breakpoints)
     posed = _posed(problem, problem, own.control, own.disturbance)
     pairs = zip(posed.constraints, own.constraints, strict=True)
     constraints = tuple(one.divided(_shares(one, other)) for one, other in pairs)
