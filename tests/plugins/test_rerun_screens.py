@@ -124,6 +124,20 @@ def test_what_is_on_a_further_page_is_drawn_there(six: sr.Outcome) -> None:
         assert "t" in paper.labels(f"{page.path}/labels")
 
 
+def test_a_constraint_is_marked_where_it_pushes_and_under_the_states_that_it_bounds(six: sr.Outcome) -> None:
+    paper, view = Paper(), sr.Inspection.read(six.directory)
+    active = [cut for cut in six.result.indices if cut.multiplier > 0.0]
+    assert active and six.problem is not None
+    Physics(rr, paper, view).draw(np.asarray(six.result.decision), six.result.indices, six.result.dual.mu)
+    for page in pages(six.problem):
+        dots = paper.kept[f"{page.path}/dots"][0].positions.as_arrow_array().to_pylist()
+        for place, (kind, k) in enumerate(page.plots):
+            top = place * (physics.HEIGHT + physics.GAP)
+            mine = [dot for dot in dots if top <= dot[1] <= top + physics.HEIGHT]
+            told = [cut for cut in active if kind != "state" or f"x{k + 1}(" in words.cut_words(cut, view)]
+            assert len(mine) == len({float(cut.index[0]) for cut in told}), (kind, k)
+
+
 def test_every_signal_has_a_name_and_a_colour_of_its_own(six: sr.Outcome) -> None:
     paper = Paper()
     Physics(rr, paper, sr.Inspection.read(six.directory)).signals(np.asarray(six.result.decision))

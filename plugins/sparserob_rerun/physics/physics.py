@@ -44,8 +44,7 @@ class Physics:
         active = [cut for cut in cuts if cut.multiplier > 0.0]
         # what only says how large the control is, at every piece, is no constraint that decides
         shown = [cut for cut in active if not self.view.program.family(cut.family).defines]
-        times = np.unique([cut.index[0] for cut in shown])
-        data = self.view.picture(decision, times)
+        data = self.view.picture(decision, shown)
         worst = self.view.worst_cases(decision)
         push = self.switching.push(active, mu)
         if push is None and proven:
@@ -60,7 +59,7 @@ class Physics:
                     self._push(drawing, _axes(top, data, (-2.0, 2.0)), data, push, place, last)
                 else:
                     self._state(drawing, _axes(top, data, _state_limits(data, place)), data, worst, place, last)
-            self._marks(drawing, data, times, len(page.plots))
+            self._marks(drawing, data, page.plots)
             drawing.log(self.rr, self.stream, page.path, layers=LAYERS)
         draw_phase(self.rr, self.stream, data, worst)
 
@@ -69,7 +68,7 @@ class Physics:
         seconds; under feedback what it answers, too."""
         from sparserob_rerun.physics.feedback import DRAWS, draw_feedback, send_effort
 
-        rr, data = self.rr, self.view.picture(decision, np.empty(0), draws=DRAWS)
+        rr, data = self.rr, self.view.picture(decision, draws=DRAWS)
         if data.gains is not None:
             draw_feedback(rr, self.stream, data)
             send_effort(rr, self.stream, data)
@@ -166,10 +165,12 @@ class Physics:
             drawing.line("worst", axes.at(worst["state_times"], path[state]), ink.ORANGE, 1.2)
         drawing.line("curve", axes.at(data.times, data.state[state]), ink.SKY, 2.0)
 
-    def _marks(self, drawing: Drawing, data: sr.FigureData, times: Floats, count: int) -> None:
-        """The times of the active constraints, through all plots and as dots on every time axis."""
-        for position in range(count):
+    def _marks(self, drawing: Drawing, data: sr.FigureData, plots: Sequence[tuple[str, int]]) -> None:
+        """The times of the active constraints, through the plots of the control and of what pushes it, and as dots on
+        the time axis; in the plot of a state those of the constraints that bound it."""
+        for position, (kind, place) in enumerate(plots):
             axes = _axes(position, data, (0.0, 1.0))
+            times = data.active_on(place) if kind == "state" else data.active_times
             for time in times:
                 drawing.dashed("marks", axes.at(np.full(2, time), np.array([0.0, 1.0])), ink.PURPLE)
             if times.size:

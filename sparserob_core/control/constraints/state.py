@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import Source, TimedExplanation
+from sparserob_core.control.constraints.explanation import SAME, Source, TimedExplanation
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.functional import WorstCase
@@ -145,6 +145,17 @@ class StateConstraint(Source):
     def index_units(self, units: Units) -> Array:
         """Those of a time and a parameter."""
         return np.concatenate([[units.time], units.parameters])
+
+    def bounded(self, row: int) -> np.ndarray:
+        """Which states ``(d,)`` a row is about, those that the set looks at where it is curved; none where there is no
+        such row."""
+        if self.shape is not None:
+            normals = self.shape.frame
+        else:
+            assert self.sides is not None
+            normals = self.sides[0][row : row + 1]
+        size = np.abs(normals)
+        return np.asarray((size > SAME * size.max(initial=0.0)).any(axis=0))
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from sparserob_core.control.transcription.transcribe import path_names
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
+from sparserob_core.experiment.figures.active import Active
 from sparserob_core.experiment.figures.figure_data import (
     MOST_STATES,
     FigureData,
@@ -39,7 +40,6 @@ TIMES = 400  # drawn at most
 SMOOTH = 200  # drawn at least, about
 ROUGH = 6  # times at which it is told which states move far: with 2 a state that comes back seems to rest; with 60 the
 # figures of 270 states take longer than their control
-NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
 DRAWS = 2000  # of which the quantiles of the control are drawn
 CORNERS = 48  # of the polygon around every place, which reaches 0.2 % beyond a disc, and 3 % of its length beside a
 # segment: with a tenth a path is twice as wide as it is; ten times takes seconds and looks the same
@@ -50,7 +50,7 @@ QUANTILES = (0.05, 0.5, 0.95)
 def draw_experiment(
     experiment: Experiment,
     theta: Array,
-    active_times: Array,
+    active: Active | None,
     history: Sequence[RoundFinished],
     directory: Path,
     cost: float | None,
@@ -68,7 +68,7 @@ def draw_experiment(
     from sparserob_core.experiment.figures.run_figures import write_figures
 
     shown = _shown(experiment, theta)
-    data = figure_data(experiment, theta, active_times, history, cost, draws=DRAWS, status=status, states=shown)
+    data = figure_data(experiment, theta, active, history, cost, draws=DRAWS, status=status, states=shown)
     data = replace(data, push=push)
     files = write_figures(directory / "figures", data)
     if worst:
@@ -79,7 +79,7 @@ def draw_experiment(
 def figure_data(
     experiment: Experiment,
     theta: Array,
-    active_times: Array,
+    active: Active | None,
     history: Sequence[RoundFinished],
     cost: float | None,
     draws: int = 0,
@@ -91,23 +91,15 @@ def figure_data(
     ``status`` claims no proof. Raises `InputError` when the program is no control problem."""
     if not isinstance(experiment, ControlExperiment):
         raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
-    data = _data(experiment, theta, active_times, history, cost, draws, states)
+    data = _data(experiment, theta, active, history, cost, draws, states)
     unproven = f"{data.title}: {status}, not proven" if status not in ("", "certified", "verified") else data.title
     return replace(data, title=unproven)
-
-
-def active_times(solution: Mapping[str, Array]) -> Array:
-    """The times of the imposed constraints that carry a multiplier, from ``solution.npz``; none where it has none."""
-    if not {"times", "multipliers"} <= set(solution):
-        return np.empty(0)
-    multipliers = solution["multipliers"]
-    return np.unique(solution["times"][multipliers > NOTHING * multipliers.max(initial=0.0)])
 
 
 def _data(
     experiment: ControlExperiment,
     theta: Array,
-    active_times: Array,
+    active: Active | None,
     history: Sequence[RoundFinished],
     cost: float | None,
     draws: int,
@@ -133,7 +125,8 @@ def _data(
         tube_lower=around.lower,
         tube_upper=around.upper,
         walls=list(_walls(problem)),
-        active_times=active_times,
+        active_times=np.empty(0) if active is None else active.times,
+        active_states=None if active is None else active.states,
         history=history,
         cost_scale=program.added(decision) if decision.size == program.n and not counts else 0.0,
         counts=counts,

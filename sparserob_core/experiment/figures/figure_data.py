@@ -103,7 +103,8 @@ class FigureData:
     ``breakpoints (K+1,)`` with the control ``(m, K)`` on the pieces and its bounds ``(m,)`` (infinite: none);
     ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
     every disturbance and parameter, rows of NaN for states that nobody asked for; ``walls`` the path and terminal
-    constraints on single components; ``active_times`` the times of the imposed constraints that carry a multiplier;
+    constraints on single components; ``active_times (k,)`` the times of the imposed constraints that carry a
+    multiplier, ``active_states (k, d)`` which states those of a time bound, ``None`` where that is not known;
     ``history`` the rounds of the method. ``tolerance`` is the relative gap that was asked for, ``cost_scale`` what is
     added up to the cost, ``cost_of`` what is added up to it, where that is not the L1 norm alone, ``cost_unit``
     what it is measured in, where that is known, ``counts`` whether cost means the time that the control acts, ``names``
@@ -129,6 +130,7 @@ class FigureData:
     tube_upper: Array
     walls: Sequence[Wall] = ()
     active_times: Array = field(default_factory=lambda: np.empty(0))
+    active_states: np.ndarray | None = None
     history: Sequence[RoundFinished] = ()
     active_fraction: float | None = None
     cost: float | None = None
@@ -165,6 +167,10 @@ class FigureData:
         """The states that figures show, in their order: all that are known, or `MOST_STATES` of them, `telling`."""
         reach = self.tube_upper.max(axis=1) - self.tube_lower.min(axis=1)
         return tuple(sorted(one for one in telling(reach, self.walls)[:MOST_STATES] if not np.isnan(reach[one])))
+
+    def active_on(self, component: int) -> Array:
+        """When a constraint on a state is active."""
+        return self.active_times if self.active_states is None else self.active_times[self.active_states[:, component]]
 
     @property
     def of_states(self) -> str:

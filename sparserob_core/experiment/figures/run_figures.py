@@ -156,7 +156,7 @@ def draw_states(data: FigureData) -> Figure:
         walls = [wall for wall in data.walls if wall.state == component]
         ax.set_ylim(*_limits(data, component, walls))
         draw_walls(ax, walls)
-        _rug(ax, data.active_times)
+        _rug(ax, data.active_on(component))
         ax.set_ylabel(data.state_label(component))
     draw_time_axis(axes[-1], data)
     axes[0].set_title(data.title + data.of_states)

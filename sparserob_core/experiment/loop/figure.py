@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.active import stored_active
 from sparserob_core.experiment.figures.adversary_figure import caption, draw_tube, finish_panel
-from sparserob_core.experiment.figures.drawing import active_times, figure_data
+from sparserob_core.experiment.figures.drawing import figure_data
 from sparserob_core.experiment.figures.figure_data import FigureData
 from sparserob_core.experiment.figures.style import panels, style, write_figure
 from sparserob_core.experiment.simulation.simulation import ADVERSARY
@@ -33,7 +34,8 @@ COLOURS = {
 def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
     """Draw loops over the tube of their plan into a file (.png, .pdf, .svg); raises `InputError` when it cannot be
     written."""
-    active, status = active_times(finished.solution), str(finished.summary["status"])
+    active = stored_active(finished.experiment, finished.solution)
+    status = str(finished.summary["status"])
     data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
     with style():
         write_figure(file, draw_loops(loops, data))

@@ -17,6 +17,7 @@ from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.finished import read_finished, stored_run
+from sparserob_core.experiment.figures.active import active_of
 from sparserob_core.experiment.figures.figure_data import plain
 from sparserob_core.experiment.figures.landscape_figure import LandscapeData, write_landscape
 from sparserob_core.experiment.figures.switching import Switching
@@ -94,7 +95,7 @@ def drawings(
     if isinstance(experiment, ControlExperiment) and result.status == "infeasible":
         yield lambda: draw_clash(experiment, result, directory)
     elif isinstance(experiment, ControlExperiment) and result.decision is not None:
-        active, decision = _active(experiment, result), np.asarray(result.decision, dtype=float).ravel()
+        active, decision = active_of(experiment, result.indices), np.asarray(result.decision, dtype=float).ravel()
         yield lambda: draw_experiment(
             experiment,
             decision,
@@ -134,7 +135,7 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
         known["clash"] = lambda: clash_figure(experiment, result)
     elif isinstance(experiment, ControlExperiment) and result.decision is not None:
         decision = np.asarray(result.decision, dtype=float).ravel()
-        active = _active(experiment, result)
+        active = active_of(experiment, result.indices)
         data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status)
         known |= run_pictures(replace(data, push=switching(experiment, result)))
         worst = adversaries(experiment, decision)
@@ -192,13 +193,6 @@ def picture(experiment: Experiment, result: Result) -> bytes | None:
 
 def _cost_unit(experiment: Experiment) -> str:
     return experiment.problem.cost_unit if isinstance(experiment, ControlExperiment) else ""
-
-
-def _active(experiment: ControlExperiment, result: Result) -> Array:
-    """The times of the constraints that carry a multiplier."""
-    about = {one.name for one in experiment.transcription.constraints}
-    kept = [cut for cut in result.indices if cut.family in about or experiment.transcription.feedback is None]
-    return np.unique([cut.index[0] for cut in kept if cut.multiplier > 0])
 
 
 def switching(experiment: ControlExperiment, result: Result) -> Array | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -111,15 +111,16 @@ class Inspection:
         built: Method = self._loaded.registry.build("method", method.name, method.options)
         return bool(built.searches)
 
-    def picture(self, decision: Array, active_times: Array | None = None, draws: int = 0) -> FigureData:
-        """Control, nominal states, worst-case tube and walls at a decision ``(m N,)``; under feedback also the effort
-        under so many random ``draws``, and what moves the control in the worst case. Raises `InputError` for a program
-        that is no control problem."""
+    def picture(self, decision: Array, cuts: Sequence[Cut] = (), draws: int = 0) -> FigureData:
+        """Control, nominal states, worst-case tube and walls at a decision ``(m N,)``, and when and on which states the
+        constraints ``cuts`` are active; under feedback also the effort under so many random ``draws``, and what moves
+        the control in the worst case. Raises `InputError` for a program that is no control problem."""
+        from sparserob_core.experiment.figures.active import marks_of
         from sparserob_core.experiment.figures.drawing import figure_data
 
-        theta = np.asarray(decision, dtype=float)
-        times = np.empty(0) if active_times is None else active_times
-        return figure_data(self._experiment, theta, times, (), None, draws)
+        experiment, theta = self._experiment, np.asarray(decision, dtype=float)
+        active = marks_of(experiment.transcription, cuts) if isinstance(experiment, ControlExperiment) else None
+        return figure_data(experiment, theta, active, (), None, draws)
 
     def clash(self, result: Result) -> list[Strip]:
         """Of an infeasible result the quantities that clash: what is allowed, where the control can bring them, and

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.active import stored_active
 from sparserob_core.experiment.figures.adversary_figure import caption, draw_tube, finish_panel, write_adversary
-from sparserob_core.experiment.figures.drawing import active_times, figure_data
+from sparserob_core.experiment.figures.drawing import figure_data
 from sparserob_core.experiment.figures.figure_data import FigureData
 from sparserob_core.experiment.figures.style import panels, style, write_figure
 from sparserob_core.sip.convex_set import Array
@@ -28,7 +29,8 @@ def write_simulation(
 
     Raises `InputError` when the file cannot be written.
     """
-    active, status = active_times(finished.solution), str(finished.summary["status"])
+    active = stored_active(finished.experiment, finished.solution)
+    status = str(finished.summary["status"])
     data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
     if worst is not None:
         write_adversary(file, worst, data)

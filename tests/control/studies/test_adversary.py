@@ -197,7 +197,7 @@ def test_a_replay_attains_what_is_stored_and_shows_what_was_changed(outcome, com
 def test_the_figure_shows_every_state_and_every_disturbance(outcome):
     arrays = adversaries(outcome.experiment, outcome.result.decision)
     theta = np.asarray(outcome.result.decision).reshape(1, -1)
-    figure = draw_adversary(arrays, figure_data(outcome.experiment, theta, np.zeros(0), (), None))
+    figure = draw_adversary(arrays, figure_data(outcome.experiment, theta, None, (), None))
     assert len(figure.axes) == 4
     labels = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     assert {"worst case of path", "worst case of terminal"} <= labels

@@ -16,7 +16,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.directory.finished import StoredRun, read_arrays, read_finished, read_json
-from sparserob_core.experiment.figures.drawing import active_times
+from sparserob_core.experiment.figures.active import stored_active
 from sparserob_core.experiment.run.drawing import draw_run
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.replay import events, replay, stored_result
@@ -302,7 +302,7 @@ def test_whatever_is_wrong_with_an_array_is_an_error_of_the_input_or_none(
         return sr.compare([directory])
 
     readers: dict[str, tuple[Callable[[], object], ...]] = {
-        "solution.npz": (replayed, lambda: active_times(StoredRun(directory).solution)),
+        "solution.npz": (replayed, lambda: stored_active(inspection._experiment, StoredRun(directory).solution)),
         "trace.npz": (replayed, compared),
         "rounds.npz": (replayed,),
         "evaluations.npz": (replayed, compared),

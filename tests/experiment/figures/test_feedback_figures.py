@@ -31,7 +31,7 @@ def data(outcome: sr.Outcome) -> FigureData:
     assert isinstance(outcome.experiment, ControlExperiment)
     decision = outcome.result.decision
     assert decision is not None
-    return drawing.figure_data(outcome.experiment, decision, np.empty(0), (), None, draws=500)
+    return drawing.figure_data(outcome.experiment, decision, None, (), None, draws=500)
 
 
 @pytest.mark.slow
@@ -104,7 +104,7 @@ def test_what_answers_a_measurable_disturbance_is_drawn_too(tmp_path: Path) -> N
     decision = outcome.result.decision
     assert decision is not None and isinstance(outcome.experiment, ControlExperiment)
     assert outcome.result.message.endswith("which sparserob check encloses")
-    data = drawing.figure_data(outcome.experiment, decision, np.empty(0), (), None, draws=500)
+    data = drawing.figure_data(outcome.experiment, decision, None, (), None, draws=500)
     worst = outcome.result.adversary("terminal")
     assert data.answers is not None and np.abs(data.answers).max() > 1e-3
     np.testing.assert_allclose(data.control.T + data.answers.sum(axis=1), driven(outcome, worst), atol=1e-7)
@@ -131,7 +131,7 @@ def test_gains_have_units_where_both_are_known(data: FigureData) -> None:
 
 def test_the_pictures_of_a_round_draw_nothing_at_random(outcome: sr.Outcome) -> None:
     assert outcome.experiment is not None and outcome.result.decision is not None
-    plain = drawing.figure_data(outcome.experiment, outcome.result.decision, np.empty(0), (), None)
+    plain = drawing.figure_data(outcome.experiment, outcome.result.decision, None, (), None)
     assert plain.effort is None and plain.answers is None and plain.gains is not None
 
 
@@ -159,7 +159,7 @@ def test_readings_are_outputs_in_the_worst_case_and_their_noise(tmp_path: Path) 
     config = {"problem": problem, "dictionaries": pieces, "policy": {"name": "affine", "causal_signals": 0}}
     result = sr.run(config, quiet=True, figures=False, out=tmp_path / "run")
     assert isinstance(result.experiment, ControlExperiment) and result.result.decision is not None
-    drawn = drawing.figure_data(result.experiment, result.result.decision, np.empty(0), (), None)
+    drawn = drawing.figure_data(result.experiment, result.result.decision, None, (), None)
     outputs = drawn.outputs
     assert outputs is not None and outputs.latency == 0.5
     assert outputs.instants.tolist() == [0.0, 0.5, 1.0]

@@ -13,7 +13,10 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import ControlExperiment, assemble
+from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.figures import drawing
+from sparserob_core.experiment.figures.active import active_of, stored_active
 from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
 from sparserob_core.experiment.figures.style import _letters_told, held
@@ -65,6 +68,49 @@ def test_the_same_data_gives_the_same_bytes(files: list[Path], data: FigureData,
     with whole():
         again = write_figures(tmp_path, data)
     assert [file.read_bytes() for file in files] == [file.read_bytes() for file in again]
+
+
+def test_an_active_constraint_is_marked_under_the_states_that_it_bounds(data: FigureData) -> None:
+    some = replace(data, active_states=np.array([[True, False], [False, False]]))
+    for drawn, counts in ((data, (2, 2)), (some, (1, 0))):
+        for axes, count in zip(draw_states(drawn).axes, counts, strict=True):
+            marks = [line for line in axes.lines if line.get_label() == "active constraint"]
+            assert sum(len(np.ravel(line.get_xdata())) for line in marks) == count
+    figure = draw_control(some)
+    assert all("active constraint" in [line.get_label() for line in axes.lines] for axes in figure.axes)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "about"),
+    [
+        ({"box": [None, 0.5]}, {1}),
+        ({"polytope": {"H": [[1, 1], [-1, -1]], "h": [2, 2]}}, {0, 1}),
+        ({"ellipsoid": {"centre": [0, 0], "shape": [[9, 0], [0, 9]]}}, {0, 1}),
+    ],
+)
+def test_a_constraint_says_which_states_it_bounds(bounds: dict[str, Any], about: set[int]) -> None:
+    config = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+            "horizon": 2.0,
+            "initial_state": [1, 0],
+            "control": {"box": 1.0},
+            "path": [bounds],
+            "terminal": [{"box": [0.5, 0.5]}],
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+        "method": {"name": "exchange"},
+    }
+    experiment = assemble(load_config(config))
+    assert isinstance(experiment, ControlExperiment)
+    cuts = [sr.Cut("path", np.array([0.5, 0.0]), row, 1.0) for row in (0, 9)]
+    cuts.append(sr.Cut("terminal", np.array([2.0]), 1, 0.0))
+    found = active_of(experiment, cuts)
+    assert found.times.tolist() == [0.5] and set(np.flatnonzero(found.states[0])) == about
+    kept = {"families": np.array(["path", "terminal"]), "times": np.array([0.5, 2.0]), "rows": np.array([0, 1])}
+    stored = stored_active(experiment, {**kept, "multipliers": np.array([1.0, 1e-12])})
+    assert (stored.times.tolist(), stored.states.tolist()) == ([0.5], found.states.tolist())
 
 
 def test_the_drawn_steps_are_the_control(data: FigureData) -> None:
@@ -167,7 +213,7 @@ def test_of_very_many_states_no_more_is_computed_than_is_drawn(policy: str, monk
     experiment, decision = result.experiment, np.asarray(result.decision)
     shown = drawing._shown(experiment, decision)
     assert shown is not None and set(shown) == {*range(MOST_STATES)}
-    data = drawing.figure_data(experiment, decision, np.empty(0), (), None, states=shown)
+    data = drawing.figure_data(experiment, decision, None, (), None, states=shown)
     assert data.drawn_states == tuple(shown) and data.of_states == f", {MOST_STATES} of {n} states"
     assert np.isnan(data.tube_lower[MOST_STATES:]).all()
     assert asked[0] == drawing.ROUGH * n and max(asked[1:]) == MOST_STATES * data.times.size

@@ -11,6 +11,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.studies.answer import supports
+from sparserob_core.experiment.figures.active import Active
 from sparserob_core.experiment.figures.drawing import CORNERS, figure_data
 from sparserob_core.experiment.figures.figure_data import Limit
 from sparserob_core.experiment.figures.plane_figure import clipped
@@ -49,7 +50,14 @@ def solved(request: pytest.FixtureRequest) -> sr.SolvedProblem:
 
 def drawn(result: sr.SolvedProblem) -> Any:
     decision = np.asarray(result.decision)
-    return figure_data(result.experiment, decision, np.array([1.0]), (), result.cost, status=result.status)
+    return figure_data(
+        result.experiment,
+        decision,
+        Active(np.array([1.0]), np.zeros((1, result.experiment.problem.system.states), dtype=bool)),
+        (),
+        result.cost,
+        status=result.status,
+    )
 
 
 def test_places_touch_the_worst_case_in_every_direction_and_nothing_reaches_beyond(solved: sr.SolvedProblem) -> None:

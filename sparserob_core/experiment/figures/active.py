@@ -1,0 +1,67 @@
+"""The constraints that carry a multiplier, as figures mark them: when each holds with equality, and of which states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from sparserob_core.control.transcription.record import Transcription
+    from sparserob_core.experiment.assemble import ControlExperiment
+    from sparserob_core.sip.evidence import Cut
+
+NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Active:
+    """The ``times (k,)`` of constraints, each once and in order, and which ``states (k, d)`` those of a time bound:
+    none where they are about the control."""
+
+    times: Array
+    states: np.ndarray
+
+
+def active_of(experiment: ControlExperiment, cuts: Sequence[Cut]) -> Active:
+    """Where imposed constraints that carry a multiplier are active; of a policy those on the state."""
+    return marks_of(
+        experiment.transcription, [cut for cut in cuts if cut.multiplier > 0.0 and _told(experiment, cut.family)]
+    )
+
+
+def stored_active(experiment: ControlExperiment, solution: Mapping[str, Array]) -> Active:
+    """The same from ``solution.npz``; none where it has no multipliers."""
+    if not {"times", "multipliers", "families", "rows"} <= set(solution):
+        return marks_of(experiment.transcription, ())
+    multipliers = solution["multipliers"]
+    kept = multipliers > NOTHING * multipliers.max(initial=0.0)
+    found = zip(*(solution[name][kept].tolist() for name in ("families", "times", "rows")), strict=True)
+    return _marks(experiment.transcription, [one for one in found if _told(experiment, one[0])])
+
+
+def marks_of(model: Transcription, cuts: Sequence[Cut]) -> Active:
+    """Where constraints are active."""
+    return _marks(model, [(cut.family, float(cut.index[0]), cut.row) for cut in cuts])
+
+
+def _marks(model: Transcription, found: Sequence[tuple[str, float, int]]) -> Active:
+    """Those of families, times and rows."""
+    times, which = np.unique(np.array([time for _, time, _ in found], dtype=float), return_inverse=True)
+    states = np.zeros((times.size, model.problem.system.states), dtype=bool)
+    constraints = {one.name: one for one in model.constraints}
+    for place, (family, _, row) in zip(which.tolist(), found, strict=True):
+        if family in constraints:
+            states[place] |= constraints[family].bounded(row)[: states.shape[1]]
+    return Active(times, states)
+
+
+def _told(experiment: ControlExperiment, family: str) -> bool:
+    """Whether the first coordinate of a family's indices is a time: under feedback those of states."""
+    model = experiment.transcription
+    return model.feedback is None or family in {one.name for one in model.constraints}
