@@ -132,12 +132,18 @@ class Batch:
         return gains(self.trace.values, self.accepted, self.stood)
 
     @property
+    def changes(self) -> np.ndarray:
+        """Which of the values ``(k,)`` are others than that where the walk stood: a proposal that leaves the value as
+        it is says nothing of a walk."""
+        return np.asarray(np.nan_to_num(self.gains) != 0.0)
+
+    @property
     def acceptance(self) -> float:
         """Of the moves that changed the value, the share that the walk accepted; NaN where there was none, or no
         walk."""
         judged = self.trace.notes.get("accepted", np.empty((0, 2)))[:, 0].astype(int) - 1 - self.first
         judged = judged[(judged >= 0) & (judged < self.gains.size)]
-        changing = judged[np.nan_to_num(self.gains[judged]) != 0.0]
+        changing = judged[self.changes[judged]]
         return float(self.accepted[changing].mean()) if changing.size else np.nan
 
     @cached_property

@@ -115,6 +115,48 @@ def test_the_first_move_of_a_batch_is_from_where_the_walk_stood_before_it() -> N
     assert projector.of(thin(later)).moves.tolist() == [[0.0, 0.0, 0.5], [1.0, 0.0, 0.8]]
 
 
+class Columns:
+    """A stream that keeps the values of every column, and nothing of how it is drawn."""
+
+    def __init__(self) -> None:
+        self.values = dict[str, list[float]]()
+
+    def log(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def set_time(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def send_columns(self, path: str, _: Any, columns: Any) -> None:
+        (scalars,) = columns
+        self.values.setdefault(path, []).extend(np.ravel(scalars.as_arrow_array().to_pylist()))
+
+
+def test_of_the_moves_of_a_walk_those_are_told_that_changed_g() -> None:
+    import rerun as rr
+
+    from sparserob_rerun.drawing.timelines import Timelines
+    from sparserob_rerun.search.projection import Projector, thin
+    from sparserob_rerun.search.search import SearchView
+    from sparserob_rerun.search.way import Stage
+
+    times, values = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], np.array([1.0, 1.5, 1.5, 1.2, 1.6, 1.4])
+    points = np.array([[t, 0, 0.5, 0, 0.9, 0] for t in times])
+    told = {"accepted": [1, 1, 1, 0, 1, 0], "move": [0, 1, 1, 1, 3, 3], "stands": [1, 2, 3, 3, 5, 5]}
+    notes = {name: [(k + 1.0, float(value)) for k, value in enumerate(row)] for name, row in told.items()}
+    event = thin(batch_of(points, [[0, 1, -1, -1]] * 6))
+    event = replace(event, best_value=1.6, batch=replace(event.batch, values=[values], notes=notes))
+    # the third is accepted and leaves g as it is, the fourth and the sixth are refused
+    assert event.batch.changes.tolist() == [False, True, False, True, True, True]
+    stream, stage, projection = Columns(), Stage(1, 0.1, 0), Projector().of(event)
+    stage.add(event, projection)
+    SearchView(rr, stream, Timelines(rr, stream)).show(event, stage, 0.0, {0: "t"}, projection)
+    assert stream.values["search/moves/t"] == [0.2, 0.5]
+    np.testing.assert_allclose(stream.values["search/notes/accepted"], [1.0, 0.5, 2 / 3, 0.5])
+    shares = {path[-1]: found for path, found in stream.values.items() if path.startswith("search/notes/move/")}
+    assert shares == {"1": [1.0, 0.5], "3": [1.0, 0.5]}
+
+
 def test_a_curve_of_many_values_keeps_the_lowest_and_the_highest_of_every_stretch() -> None:
     from sparserob_rerun.search.climb import CORNERS, _corners
 

@@ -22,7 +22,7 @@ NOTES = {  # what a maximiser notes: the words for it, and its colour
     "temperature": ("log10 of the temperature", ink.VERMILLION),
     "accepted": ("share accepted of the last 50 moves that changed g", ink.GREEN),
     "scale": ("log10 of the size of a move, in widths of the box", ink.SKY),
-    "move": ("moves: 0 all, 1 one coordinate, 2 some, 3 index", ink.PURPLE),
+    "move": ("share accepted of the last 50, by what was moved", ink.PURPLE),
     "acting": ("indices with a multiplier, in the polish", ink.ORANGE),
     "depth": ("depth of the opened cell", ink.SKY),
     "openings": ("cells opened", ink.GREEN),
@@ -38,6 +38,12 @@ NOTES = {  # what a maximiser notes: the words for it, and its colour
     "step": ("log10 of the local step", ink.GREEN),
     "local": ("0: global, 1: local step", ink.GREEN),
     "cycle": ("how often it was heated again", ink.GREY),
+}
+KINDS = {  # of the moves of a walk, as `move` numbers them: the words for what is moved, and the colour
+    0: ("everything, drawn anew", ink.GREY),
+    1: ("one coordinate", ink.SKY),
+    2: ("several", ink.ORANGE),
+    3: ("all, or all of an index", ink.PURPLE),
 }
 SILENT = ("stands",)  # what says where the walk is, and is drawn as such
 SERIES: dict[str, tuple[str, Colour, float]] = {
@@ -57,7 +63,7 @@ class SearchView:
         self.rr, self.stream, self.timelines = rr, stream, timelines
         self.known = set[str]()
         self.notes, self.moved = set[str](), set[str]()  # what the maximiser has told, and what has moved
-        self.recent = np.empty(0)
+        self.recent = dict[str, Floats]()  # of each share what it is the mean of, the last of it
         self.of: Stage | None = None
 
     def show(
@@ -73,7 +79,7 @@ class SearchView:
         batch = event.batch.trace
         count = batch.values.size
         if stage is not self.of:
-            self.of, self.recent = stage, np.empty(0)
+            self.of, self.recent = stage, {}
         numbers = stage.base + event.total - count + 1 + np.arange(count)
 
         def at(which: np.ndarray) -> list[Any]:
@@ -117,9 +123,9 @@ class SearchView:
             words, colour = NOTES.get(name, (name, ink.GREY))
             where = np.clip(rows[:, 0].astype(int) + stage.base - numbers[0], 0, numbers.size - 1)
             values = rows[:, 1]
-            if name == "accepted":  # a proposal that leaves g as it is says nothing of a walk
-                counts = np.nan_to_num(event.batch.gains)[where] != 0.0
-                where, values = where[counts], self._share(values[counts])
+            if name == "accepted":
+                counts = event.batch.changes[where]
+                where, values = where[counts], self._share(name, values[counts])
             if not values.size:
                 continue
             if name in LOGARITHMIC:
@@ -131,19 +137,37 @@ class SearchView:
                 return self.timelines.columns(numbers[mine], began + batch.seconds[mine], event.round)
 
             if name == "move":
-                self._cloud(path, at, values, (words, colour))
+                self._kinds(event, path, where, values, at)
                 continue
             self._line(path, words, colour)
             rows_shown = self.rr.Scalars.columns(scalars=_shown(values))
             self.stream.send_columns(path, at(np.arange(values.size)), rows_shown)
 
-    def _share(self, accepted: Floats) -> Floats:
-        """The mean of the last accepted flags at each of the new ones."""
-        joined = np.concatenate([self.recent, accepted])
+    def _kinds(
+        self,
+        event: sr.EvaluationsFinished,
+        path: str,
+        where: np.ndarray,
+        kinds: Floats,
+        at: Callable[[np.ndarray], list[Any]],
+    ) -> None:
+        """Which share of the moves of each of the ``kinds (k,)``, of those that changed g, the walk accepted."""
+        changes, accepted = event.batch.changes[where], event.batch.accepted[where].astype(float)
+        for kind, (words, colour) in KINDS.items():
+            mine = np.flatnonzero(changes & (kinds == kind))
+            if mine.size:
+                self._line(f"{path}/{kind}", words, colour)
+                shares = self._share(f"{path}/{kind}", accepted[mine])
+                self.stream.send_columns(f"{path}/{kind}", at(mine), self.rr.Scalars.columns(scalars=shares))
+
+    def _share(self, of: str, accepted: Floats) -> Floats:
+        """The mean of the last accepted flags ``of`` one kind at each of the new ones."""
+        recent = self.recent.get(of, np.empty(0))
+        joined = np.concatenate([recent, accepted])
         sums = np.concatenate([[0.0], np.cumsum(joined)])
-        ends = np.arange(self.recent.size + 1, joined.size + 1)
+        ends = np.arange(recent.size + 1, joined.size + 1)
         starts = np.maximum(ends - WINDOW, 0)
-        self.recent = joined[-WINDOW:]
+        self.recent[of] = joined[-WINDOW:]
         return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
     def _moves(
@@ -156,9 +180,10 @@ class SearchView:
         moves: Floats,
     ) -> None:
         """Where the coordinates went that moved ``(m, 3)``, one series for each kind: to which time or parameter. Of
-        a walk the moves that it accepted."""
+        a walk the moves that it accepted and that changed g."""
         rows = moves[:, 0].astype(int)
-        moves = moves[~stage.refused[stage.values.size - event.batch.trace.values.size :][rows]]
+        kept = ~stage.refused[stage.values.size - event.batch.trace.values.size :]
+        moves = moves[(kept & event.batch.changes if stage.walks else kept)[rows]]
         for kind, name in moving.items():
             mine = _few(moves[moves[:, 1] == kind])
             if not len(mine):

@@ -66,7 +66,9 @@ def notes(rrb: Any, told: Collection[str]) -> list[Any]:
 
 def _note(rrb: Any, name: str) -> Any:
     words = NOTES.get(name, (name, ink.GREY))[0]
-    limits = WHOLE if name in SHARES else None
+    limits = WHOLE if name in (*SHARES, "move") else None
+    if name == "move":  # a line for each kind
+        return series(rrb, "/search/notes/move", words[0].upper() + words[1:], limits=limits)
     return series(rrb, "/search/notes", words[0].upper() + words[1:], [f"+ /search/notes/{name}"], limits=limits)
 
 
