@@ -558,7 +558,12 @@ def test_replay_and_watch_refuse_what_they_cannot_do(
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     config, kept = str(CONFIGS / "experiment1_repaired.yaml"), tmp_path / "kept.rrd"
     kept.write_bytes(b"a recording of yesterday")
+    faulty, new = tmp_path / "faulty.yaml", str(tmp_path / "new.rrd")
+    faulty.write_text("title: one\nproblem: {name: linear, horizon: five}\n")
     for arguments, said in (
+        (["watch", str(faulty), "--save", new], f"{faulty}:2:25: problem.horizon: must be a number"),
+        (["watch", str(faulty), "problem.horizon=2", "--save", new], f"error: {faulty}:2:"),
+        (["watch", str(tmp_path / "none.yaml"), "--save", new], "none.yaml"),
         (["replay", str(tmp_path / "none")], "expected the directory of a run, got nothing"),
         (["replay", str(tmp_path)], "got one without config.yaml"),
         (["watch", config, "--save", str(tmp_path)], "save: expected a file, got the directory"),
@@ -572,7 +577,7 @@ def test_replay_and_watch_refuse_what_they_cannot_do(
     ):
         assert command(*arguments) == 2
         assert said in capsys.readouterr().err
-    assert [one.name for one in tmp_path.iterdir()] == ["kept.rrd"]
+    assert {one.name for one in tmp_path.iterdir()} == {"kept.rrd", "faulty.yaml"}
     assert kept.read_bytes() == b"a recording of yesterday"
 
 

@@ -157,6 +157,19 @@ def test_of_the_moves_of_a_walk_those_are_told_that_changed_g() -> None:
     assert shares == {"1": [1.0, 0.5], "3": [1.0, 0.5]}
 
 
+def test_beside_a_literal_tuple_it_is_said_how_far_below_the_map_it_is() -> None:
+    from sparserob_rerun.search.explorer import Aim
+    from sparserob_rerun.search.terrain import _own
+
+    landscape: Any = SimpleNamespace(value=0.632, level=1)
+    aim = Aim(np.zeros((2, 1)), 0.1, 0.482, "")
+    assert _own(landscape, aim) == [
+        "orange: the best tuple, g = 0.632 on the map",
+        "its own g is 0.482, 0.15 below the map",
+    ]
+    assert _own(landscape, replace(aim, value=0.632)) == ["orange: the best tuple, g = 0.632"]
+
+
 def test_a_curve_of_many_values_keeps_the_lowest_and_the_highest_of_every_stretch() -> None:
     from sparserob_rerun.search.climb import CORNERS, _corners
 

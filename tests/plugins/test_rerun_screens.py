@@ -28,6 +28,7 @@ from sparserob_rerun.physics.pages import heading, pages
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
 from sparserob_rerun.recording.layout import Shown, layout
+from tests.support.places import CONFIGS
 
 SIX: dict[str, Any] = {
     "title": "Three carts",
@@ -299,6 +300,31 @@ def test_the_numbers_of_two_walls_that_are_near_one_another_stand_beside_one_ano
     assert _beside([100.0], ["7"], 1.0) == [100.0]
 
 
+@pytest.mark.slow
+def test_maps_of_the_violation_are_within_their_panel_which_says_before_what_it_waits_for() -> None:
+    from sparserob_core.experiment.config.load import load_config
+    from sparserob_rerun.recording.recorder import shown_of
+    from sparserob_rerun.recording.waiting import CLASH, VIOLATIONS, Waiting
+
+    view, paper = sr.Inspection(load_config(CONFIGS / "experiment2_repaired.yaml")), Paper()
+    shown = shown_of(view, None)
+    waiting = Waiting(rr, paper, shown)
+    assert {"violation/names/waiting/labels", "clash/waiting/labels"} <= set(paper.kept)
+    Rounds(rr, paper, view).violations(np.zeros(view.program.n), (), (), {})
+    maps = [parts for path, parts in paper.kept.items() if path.startswith("violation/maps/")]
+    left, right, top, bottom = rounds.extent_of_maps(shown.maps)
+    assert shown.maps == len(maps) == 1 and top < -20.0
+    for place, image in maps:
+        ((x, y, _),) = place.translation.as_arrow_array().to_pylist()
+        ((across, down, _),) = place.scale.as_arrow_array().to_pylist()
+        size = image.format.as_arrow_array().to_pylist()[0]
+        assert left <= x and x + across * size["width"] <= right
+        assert top <= y and y + down * size["height"] <= bottom
+    for panel in (VIOLATIONS, CLASH):
+        waiting.arrived(panel)
+    assert all(isinstance(paper.kept[f"{at}/waiting"][0], rr.Clear) for at in ("violation/names", "clash"))
+
+
 def test_an_infeasible_run_has_no_empty_panel_and_no_bound(infeasible: sr.Outcome) -> None:
     shown = Shown(infeasible.problem, 1, False, False, clash=(0.0, 1.0, 0.0, 1.0), drawn=False)
     tabs = layout(shown).root_container.contents
@@ -316,6 +342,8 @@ def test_what_is_proven_is_never_called_violated(small: sr.Outcome) -> None:
         result = replace(small.result, worst=replace(small.result.worst, violation=violation))
         said = " ".join(words.verdict_lines(replace(event, result=result)))
         assert "violated" not in said and "holds" in said
+    one = replace(event, result=replace(small.result, indices=small.result.indices[:1]))
+    assert "; 1 constraint decides, found in" in " ".join(words.verdict_lines(one))
     inspection = sr.Inspection.read(small.directory)
     for value, proven, word in ((1e-11, True, "proven"), (1e-11, False, "holds"), (1e-3, False, "violated")):
         rounds = Rounds(rr, Paper(), inspection)

@@ -212,13 +212,15 @@ def ticks(low: float, high: float, most: int = 5) -> Floats:
     return np.where(np.abs(values) < 1e-12 * span, 0.0, values)
 
 
-def view(origin: str, name: str, extent: tuple[float, float, float, float]) -> Any:
-    """A view of what is drawn below ``origin``: left, right, top and bottom of it are the ``extent``."""
+def view(origin: str, name: str, extent: tuple[float, float, float, float], contents: str = "$origin/**") -> Any:
+    """A view of the ``contents``, in all what is drawn below ``origin``: left, right, top and bottom of it are the
+    ``extent``."""
     import rerun.blueprint as rrb
 
     left, right, top, bottom = extent
     return rrb.Spatial2DView(
         origin=origin,
+        contents=contents.split(),
         name=name,
         background=list(GROUND[:3]),
         visual_bounds=rrb.VisualBounds2D(x_range=(left, right), y_range=(top, bottom)),

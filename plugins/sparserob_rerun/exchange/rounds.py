@@ -22,6 +22,9 @@ LEFT, WIDTH, HEIGHT = 60.0, 640.0, 112.0
 GAP, NUMBERS = 52.0, 24.0  # between two plots, and as much more where each has the numbers of an axis of its own
 ROOM = 1.15  # of words, in a panel that is smaller than its drawing
 SMALLEST = 1e-12
+ACROSS, UPWARDS = 4.0, 16.0  # how large a cell of a map is: about as wide as high, for the numbers of them
+WORDS, MARGIN = 70.0, 16.0  # above a map, where it has its name, and around the maps
+MAP = UPWARDS * PARAMETERS + WORDS  # from one map to the next
 SERIES = {
     "rounds/bounds": {"lower bound (proven)": ink.GREEN, "upper bound": ink.VERMILLION},
     "rounds/log10": {"log10 of the violation": ink.VERMILLION, "log10 of the relative gap": ink.SKY},
@@ -33,6 +36,17 @@ def extent(families: int, shared: bool) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of the violation plots; ``shared``: over one axis, that of time."""
     bottom = max(1, min(FAMILIES, families)) * _below(shared) - (GAP if shared else GAP + NUMBERS)
     return -42.0, LEFT + WIDTH + 76.0, -40.0, bottom + 60.0
+
+
+def extent_of_maps(maps: int) -> tuple[float, float, float, float]:
+    """Left, right, top and bottom of so many maps above one another."""
+    return -MARGIN, ACROSS * INSTANTS + MARGIN, -WORDS, maps * MAP - WORDS + MARGIN
+
+
+def mapped(program: sr.SemiInfiniteProgram) -> int:
+    """How many families have a map: those whose first two coordinates both move."""
+    boxes = [family.index_set for family in shown_families(program)[:FAMILIES] if family.index_set.dimension > 1]
+    return sum(bool((box.upper[:2] > box.lower[:2]).all()) for box in boxes)
 
 
 def _below(shared: bool) -> float:
@@ -151,23 +165,25 @@ class Rounds:
             if times.size:
                 drawing.dot(axes.at(times, 0.0), colour, size)
 
-    def _map(self, place: int, family: sr.ConstraintFamily, found: tuple[Floats, Floats, Floats]) -> None:
+    def _map(self, number: int, family: sr.ConstraintFamily, found: tuple[Floats, Floats, Floats]) -> None:
         """Time from left to right, the first parameter upwards; red is violated."""
         assert self.inspection is not None
         across, along, field = found
-        rr, reach, top = self.rr, max(float(np.abs(field).max()), SMALLEST), place * (16.0 * PARAMETERS + 70.0)
+        rr, reach, top = self.rr, max(float(np.abs(field).max()), SMALLEST), number * MAP
         image = np.ascontiguousarray(ink.diverging(np.flipud(field.T) / reach)[:, :, :3])
         path = f"violation/maps/{family.name.replace('[', '_').replace(']', '')}"
-        self.stream.log(path, rr.Transform3D(translation=(0.0, top, 0.0), scale=(4.0, 16.0, 1.0)), rr.Image(image))
+        self.stream.log(
+            path, rr.Transform3D(translation=(0.0, top, 0.0), scale=(ACROSS, UPWARDS, 1.0)), rr.Image(image)
+        )
         one, other = self.inspection.names(family.index_set.dimension)[:2]
         words = (
             f"{family.name}: {one} from {across[0]:.4g} to {across[-1]:.4g}, "
             f"upwards {other} from {along[0]:.4g} to {along[-1]:.4g}"
         )
         self.stream.log(
-            f"violation/names/{place}",
+            f"violation/names/{number}",
             rr.Points2D(
-                [(2.0 * INSTANTS, top - 20.0)],
+                [(ACROSS * INSTANTS / 2.0, top - 20.0)],
                 labels=[words],
                 colors=[ink.INK],
                 radii=rr.Radius.ui_points(0.0),

@@ -25,7 +25,8 @@ class Shown:
     """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
     the landscape; of a search what the maximiser has ``told`` of itself, and the coordinates that have ``moved``.
     ``clash``, once a run is infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn;
-    ``drawn``: whether there were decisions before that; ``answers``: whether the control answers what it measures."""
+    ``drawn``: whether there were decisions before that; ``maps``: how many families have a map of their violation;
+    ``answers``: whether the control answers what it measures."""
 
     problem: sr.OptimalControlProblem | None
     families: int
@@ -35,6 +36,7 @@ class Shown:
     moved: frozenset[str] = frozenset()
     clash: tuple[float, ...] | None = None
     drawn: bool = True
+    maps: int = 0
     answers: bool = False
 
 
@@ -179,16 +181,17 @@ def _violation(rrb: Any, shown: Shown) -> Any:
 
 
 def _exchange(rrb: Any, shown: Shown) -> Any:
-    counts = search.series(rrb, "/rounds/counts", "Numbers of active indices and of new cuts", legend="left")
+    counts = search.series(
+        rrb,
+        "/rounds/counts",
+        f"Numbers of active indices and of new cuts, after every {'search' if shown.searches else 'round'}",
+        legend="left",
+    )
     both = view("/rounds/picture", "Bounds on the cost, the gap and the violation, round by round", bounds.BOTH)
     left = rrb.Vertical(both, counts, row_shares=[2, 1])
     right = [_violation(rrb, shown)]
-    if shown.problem is not None and shown.problem.system.parameter_count:
-        right.append(
-            rrb.Spatial2DView(
-                origin="/violation",
-                contents=["/violation/maps/**", "/violation/names/**"],
-                name="Violation over time and the first parameter: red is forbidden",
-            )
-        )
+    if shown.problem is not None and shown.problem.system.parameter_count and shown.maps:
+        name = "Violation over time and the first parameter: red is forbidden"
+        extent = rounds.extent_of_maps(shown.maps)
+        right.append(view("/violation", name, extent, "/violation/maps/** /violation/names/**"))
     return rrb.Horizontal(left, rrb.Vertical(*right), name="Exchange")

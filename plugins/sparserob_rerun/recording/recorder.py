@@ -15,12 +15,12 @@ import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.drawing.timelines import Timelines
 from sparserob_rerun.exchange.clash import draw_clash, extent
-from sparserob_rerun.exchange.rounds import Rounds, shown_families, told_by_result, told_by_round
+from sparserob_rerun.exchange.rounds import Rounds, mapped, shown_families, told_by_result, told_by_round
 from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
 from sparserob_rerun.recording.layout import Shown, layout
-from sparserob_rerun.recording.waiting import BOUNDS, CLIMB, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
+from sparserob_rerun.recording.waiting import BOUNDS, CLASH, CLIMB, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
 from sparserob_rerun.search.climb import Climb
 from sparserob_rerun.search.explorer import Aim, Explorer
 from sparserob_rerun.search.projection import Projector
@@ -316,7 +316,7 @@ class Recorder:
         if result is not None:
             if event.status != "infeasible":
                 self.draw(BOUNDS, self.rounds.picture.end, result.lower_bound, result.upper_bound, result.gap)
-            self.draw("what clashes", self._clash, result)
+            self.draw(CLASH, self._clash, result)
             if result.decision is not None and self.physics is not None:
                 known = (result.decision, result.indices, result.dual.mu, result.dual.cuts)
                 self.draw(CONTROL, self.physics.draw, *known)
@@ -370,7 +370,14 @@ def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | Non
         return Shown(None, 0, True, False)
     program, answers = inspection.program, inspection.problem is not None and inspection.program.spread is not None
     families = len(shown_families(program))
-    return Shown(inspection.problem, families, inspection.searches, landscape is not None, answers=answers)
+    return Shown(
+        inspection.problem,
+        families,
+        inspection.searches,
+        landscape is not None,
+        answers=answers,
+        maps=mapped(program),
+    )
 
 
 def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:

@@ -6,14 +6,14 @@ from typing import Any, final
 
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Drawing
-from sparserob_rerun.exchange import bounds, rounds
+from sparserob_rerun.exchange import bounds, clash, rounds
 from sparserob_rerun.physics import physics
 from sparserob_rerun.physics.pages import pages
 from sparserob_rerun.recording.layout import PHASE, Shown
 from sparserob_rerun.search import climb, views
 
 CONTROL, LANDSCAPE, CLIMB = "control and states", "the landscape", "the climb"
-VIOLATIONS, BOUNDS = "the violations", "the bounds"
+VIOLATIONS, BOUNDS, CLASH = "the violations", "the bounds", "what clashes"
 
 
 @final
@@ -42,6 +42,9 @@ class Waiting:
             rounds.extent(shown.families, shown.problem is not None),
             f"drawn when {first}",
         )
+        if shown.maps:
+            self._write(VIOLATIONS, "violation/names", rounds.extent_of_maps(shown.maps), f"drawn when {first}")
+        self._write(CLASH, "clash", clash.extent(()), "drawn when it is known that nothing is feasible")
         self._write(BOUNDS, "rounds/picture/bounds", bounds.ONE, f"no bound yet: {first} with the first one")
 
     def arrived(self, panel: str) -> None:

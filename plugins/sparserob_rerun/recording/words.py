@@ -68,6 +68,10 @@ def page(title: str, status: str, lower: float, upper: float, more: list[str]) -
     return "\n\n".join([f"### {title}", f"**{status}**: {bounds}", *more, LEGEND])
 
 
+def _decide(count: int) -> str:
+    return "1 constraint decides" if count == 1 else f"{count} constraints decide"
+
+
 def _number(value: float) -> str:
     return f"{value:.8g}" if math.isfinite(value) else ("∞" if value > 0 else "−∞")
 
@@ -77,9 +81,7 @@ def verdict_lines(event: sr.RunFinished) -> list[str]:
     lines = [event.message] if event.message else []
     result = event.result
     if result is not None and result.decision is not None:
-        lines.append(
-            f"cost J = {result.cost:.8g}; {len(result.indices)} constraints decide, found in {event.seconds:.2f} s"
-        )
+        lines.append(f"cost J = {result.cost:.8g}; {_decide(len(result.indices))}, found in {event.seconds:.2f} s")
     # of an infeasible result the drawing says what is missed; of two sides the worst constraint has the sum
     if result is not None and result.worst is not None and result.worst.constraint and result.status != "infeasible":
         lines.append(_worst_words(result, result.worst))

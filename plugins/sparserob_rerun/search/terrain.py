@@ -26,6 +26,9 @@ LIFT = 0.015  # points stand this share of the height above the surface
 POLE = 0.32
 """How far above the best point its value is written, in heights of the surface. Much lower, the bright surface is
 behind the words, which cannot be read in a light theme; twice as high, they are outside the panel."""
+WORDS = 0.08
+"""How far below the place of these words the line from the point to them ends, which the viewer writes below their
+place. With 0 the line crosses them, with 0.2 it is too short to lead to them."""
 SHOWN = 60  # boxes of a sketch that are drawn
 
 
@@ -280,7 +283,7 @@ class Terrain:
         self.stream.log(
             "landscape/surface/pole",
             self.rr.LineStrips3D(
-                [[[*at, top], [*at, top + POLE]]], colors=[ink.ORANGE], radii=self.rr.Radius.ui_points(0.6)
+                [[[*at, top], [*at, top + POLE - WORDS]]], colors=[ink.ORANGE], radii=self.rr.Radius.ui_points(0.6)
             ),
         )
         names = landscape.names(self.unit)

@@ -12,6 +12,9 @@ from sparserob_rerun.search.search import LOGARITHMIC, NOTES
 
 FIRST = ("temperature", "depth", "constant", "radius", "reach", "spread", "slope")  # of what is noted, for the overview
 SHARES = ("accepted", "rejected")
+TALL = 2
+"""How much higher a panel is whose lines have their names in its corner: with 1 the names lie on the lines, with 4 the
+others are too low for the numbers beside them."""
 WHOLE = (-0.1, 1.1)  # of a share; of a narrower range the viewer writes one number only, and none at its ends
 
 
@@ -38,11 +41,12 @@ def series(
     origin: str,
     name: str,
     contents: list[str] | None = None,
-    legend: Literal["left", "right"] = "right",
+    legend: Literal["left", "right", "below"] = "right",
     limits: tuple[float, float] | None = None,
 ) -> Any:
-    """A plot against the timeline that shows the whole of it, however long it is. ``legend``: the upper corner in which
-    the names of its lines are; ``limits``: of the axis upwards, where they are known before."""
+    """A plot against the timeline that shows the whole of it, however long it is. ``legend``: the corner in which
+    the names of its lines are, an upper one or the lower left one; ``limits``: of the axis upwards, where they are
+    known before."""
     from rerun.encodings import TimeRange
 
     everything = TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
@@ -51,7 +55,10 @@ def series(
         contents=contents or ["+ $origin/**"],
         name=name,
         plot_legend=rrb.PlotLegend(
-            corner=rrb.Corner2D.RightTop if legend == "right" else rrb.Corner2D.LeftTop, visible=contents is None
+            corner={"right": rrb.Corner2D.RightTop, "left": rrb.Corner2D.LeftTop, "below": rrb.Corner2D.LeftBottom}[
+                legend
+            ],
+            visible=contents is None,
         ),
         axis_x=rrb.TimeAxis(view_range=everything),
         axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
@@ -76,16 +83,19 @@ def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:
     """The tab of a search: what the maximiser has ``told`` of itself, and the coordinates that have ``moved``, each on
     an axis of its own."""
     order = [name for name in (*LOGARITHMIC, *NOTES) if name in told]
-    mine = [_note(rrb, name) for name in dict.fromkeys([*order, *sorted(told)])]
+    names = [*dict.fromkeys([*order, *sorted(told)])]
+    mine = [_note(rrb, name) for name in names]
     where = [
         series(rrb, "/search/moves", f"Where it moves: {name}", [f"+ /search/moves/{name}"]) for name in sorted(moved)
     ]
     left = rrb.Vertical(
         climb(),
-        series(rrb, "/search/g", "g, with the share of the regulariser, over the evaluations"),
+        series(rrb, "/search/g", "g, with the share of the regulariser, over the evaluations", legend="below"),
         row_shares=[3, 2],
     )
-    columns = [rrb.Vertical(*group) for group in (mine, where) if group]
+    rows = [TALL if name == "move" else 1 for name in names]
+    columns = [rrb.Vertical(*mine, row_shares=rows)] if mine else []
+    columns += [rrb.Vertical(*where)] if where else []
     return rrb.Horizontal(left, *columns, column_shares=[5, 3, 3][: 1 + len(columns)], name="Search")
 
 
