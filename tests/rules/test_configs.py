@@ -190,6 +190,23 @@ def test_an_infeasible_config_says_which_constraint_is_at_fault_and_when(name: s
     assert re.search(r"x\d\(\d", message), message
 
 
+PROPOSED = re.compile(r"""^\s*#.*?: ([a-z_.0-9]+)=("[^"]+"|[^\s"]+)\s*$""", re.MULTILINE)
+
+
+@pytest.mark.slow
+def test_what_a_comment_of_a_config_proposes_can_be_given_to_it() -> None:
+    from sparserob_core.experiment.config.load import load_config
+
+    proposed = {path.stem: PROPOSED.findall(path.read_text("utf-8")) for path in sorted(CONFIGS.glob("*.yaml"))}
+    assert {"experiment1_literal", "experiment1_reduced"} <= {name for name, found in proposed.items() if found}
+    for name, found in proposed.items():
+        for key, value in found:
+            if "schema" not in key:
+                change = f"{key}={value}".replace('"', "")
+                config = load_config(CONFIGS / f"{name}.yaml", [change]).config
+                assert config.maximiser.name == "sequool"
+
+
 @pytest.mark.slow
 def test_the_schema_in_the_folder_is_the_schema_of_the_program() -> None:
     import jsonschema

@@ -25,7 +25,7 @@ from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Obs
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.solver import AUTO, whole_name
+from sparserob_core.sip.solver import AUTO, Unanswered, whole_name
 
 
 @final
@@ -179,8 +179,12 @@ def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str,
 def _on_solver(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
     chosen = loaded.config.solver.name
     name = whole_name(build(loaded, "solver", loaded.config.solver), chosen)
+    reasons: dict[tuple[str, str], list[Unanswered]] = {}
     for missed in result.unanswered:
-        said = f"{name} did not answer {missed.count} of the {missed.kind} programs, {missed.by} did: {missed.reason}"
+        reasons.setdefault((missed.kind, missed.by), []).append(missed)
+    for (kind, by), found in reasons.items():  # as many as the table says, whatever the reasons
+        why = found[0].reason if len(found) == 1 else "; ".join(f"{one.count} of them: {one.reason}" for one in found)
+        said = f"{name} did not answer {sum(one.count for one in found)} of the {kind} programs, {by} did: {why}"
         yield from _of(loaded, ("solver",), said)
     if chosen != AUTO and not result.counts.get("solver_calls"):
         yield from _of(loaded, ("solver",), f"{name} was not asked: this run came to its end without a finite program")

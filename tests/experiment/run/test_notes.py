@@ -4,11 +4,15 @@ place; what nobody has named is not."""
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.config.load import load_config
 
 CONFIG = """\
 problem:
@@ -70,6 +74,27 @@ def test_a_run_says_who_answered_and_what_the_named_solver_did_not(tmp_path: Pat
     assert said
     assert all(text.startswith("piqp did not answer ") for text in said)
     assert any("MAX_ITER" in text or "misses its rows by" in text for text in said)
+
+
+def test_notes_count_as_many_programs_as_the_table_whatever_the_reasons(tmp_path: Path) -> None:
+    from sparserob_core.experiment.run.journal import _on_solver
+    from sparserob_core.sip.solver import Unanswered
+
+    outcome = run(tmp_path, solver={"name": "piqp", "max_iterations": 1})
+    others = {name: count for name, count in outcome.summary["counts"]["solved_by"].items() if name != "piqp"}
+    assert others and counted(note["note"] for note in outcome.summary["notes"]) == others
+    loaded = load_config(tmp_path / "small.yaml", {"solver": {"name": "piqp"}})
+    missed = [Unanswered("relaxed", 7, "no digits", "highs"), Unanswered("relaxed", 2, "slow", "dual_newton")]
+    missed.append(Unanswered("relaxed", 1, "no rows", "highs"))
+    told = [note["note"] for note in _on_solver(loaded, replace(outcome.result, unanswered=tuple(missed)))]
+    assert counted(told) == {"highs": 8, "dual_newton": 2}
+    assert told[0].endswith("highs did: 7 of them: no digits; 1 of them: no rows") and told[1].endswith("did: slow")
+
+
+def counted(notes: Iterable[str]) -> dict[str, int]:
+    """How many programs each solver answered for another one, as notes say."""
+    found = [re.match(r"\w+ did not answer (\d+) of the relaxed programs, (\w+) did: ", note) for note in notes]
+    return {match[2]: int(match[1]) for match in found if match is not None}
 
 
 @pytest.mark.parametrize(
