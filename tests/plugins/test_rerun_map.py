@@ -143,6 +143,7 @@ def test_of_the_moves_of_a_walk_those_are_told_that_changed_g() -> None:
     times, values = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], np.array([1.0, 1.5, 1.5, 1.2, 1.6, 1.4])
     points = np.array([[t, 0, 0.5, 0, 0.9, 0] for t in times])
     told = {"accepted": [1, 1, 1, 0, 1, 0], "move": [0, 1, 1, 1, 3, 3], "stands": [1, 2, 3, 3, 5, 5]}
+    told["local"] = [0, 1, 1, 0, 0, 1]  # of another maximiser
     notes = {name: [(k + 1.0, float(value)) for k, value in enumerate(row)] for name, row in told.items()}
     event = thin(batch_of(points, [[0, 1, -1, -1]] * 6))
     event = replace(event, best_value=1.6, batch=replace(event.batch, values=[values], notes=notes))
@@ -153,6 +154,7 @@ def test_of_the_moves_of_a_walk_those_are_told_that_changed_g() -> None:
     SearchView(rr, stream, Timelines(rr, stream)).show(event, stage, 0.0, {0: "t"}, projection)
     assert stream.values["search/moves/t"] == [0.2, 0.5]
     np.testing.assert_allclose(stream.values["search/notes/accepted"], [1.0, 0.5, 2 / 3, 0.5])
+    np.testing.assert_allclose(stream.values["search/notes/local"], [0.0, 1 / 2, 2 / 3, 1 / 2, 2 / 5, 1 / 2])
     shares = {path[-1]: found for path, found in stream.values.items() if path.startswith("search/notes/move/")}
     assert shares == {"1": [1.0, 0.5], "3": [1.0, 0.5]}
 

@@ -36,7 +36,7 @@ NOTES = {  # what a maximiser notes: the words for it, and its colour
     "radius": ("log10 of the radius of the trust region", ink.SKY),
     "reach": ("log10 of the reach of a local step", ink.SKY),
     "step": ("log10 of the local step", ink.GREEN),
-    "local": ("0: global, 1: local step", ink.GREEN),
+    "local": ("share of local steps among the last 50", ink.GREEN),
     "cycle": ("how often it was heated again", ink.GREY),
 }
 KINDS = {  # of the moves of a walk, as `move` numbers them: the words for what is moved, and the colour
@@ -52,6 +52,7 @@ SERIES: dict[str, tuple[str, Colour, float]] = {
     "bound": ("proven lower bound", ink.GREEN, 2.0),
 }
 CLOUDS: dict[str, tuple[str, Colour]] = {"tried": ("tried", ink.SKY), "refused": ("tried, refused", ink.VERMILLION)}
+MEANS = ("accepted", "local")  # 0 or 1 at every evaluation, of which a mean says more
 WINDOW = 50
 
 
@@ -123,8 +124,8 @@ class SearchView:
             words, colour = NOTES.get(name, (name, ink.GREY))
             where = np.clip(rows[:, 0].astype(int) + stage.base - numbers[0], 0, numbers.size - 1)
             values = rows[:, 1]
-            if name == "accepted":
-                counts = event.batch.changes[where]
+            if name in MEANS:
+                counts = event.batch.changes[where] if name == "accepted" else np.ones(where.size, dtype=bool)
                 where, values = where[counts], self._share(name, values[counts])
             if not values.size:
                 continue
@@ -160,10 +161,10 @@ class SearchView:
                 shares = self._share(f"{path}/{kind}", accepted[mine])
                 self.stream.send_columns(f"{path}/{kind}", at(mine), self.rr.Scalars.columns(scalars=shares))
 
-    def _share(self, of: str, accepted: Floats) -> Floats:
-        """The mean of the last accepted flags ``of`` one kind at each of the new ones."""
+    def _share(self, of: str, flags: Floats) -> Floats:
+        """The mean of the last flags ``of`` one kind at each of the new ones."""
         recent = self.recent.get(of, np.empty(0))
-        joined = np.concatenate([recent, accepted])
+        joined = np.concatenate([recent, flags])
         sums = np.concatenate([[0.0], np.cumsum(joined)])
         ends = np.arange(recent.size + 1, joined.size + 1)
         starts = np.maximum(ends - WINDOW, 0)

@@ -11,7 +11,7 @@ from sparserob_rerun.search import climb as stages
 from sparserob_rerun.search.search import LOGARITHMIC, NOTES
 
 FIRST = ("temperature", "depth", "constant", "radius", "reach", "spread", "slope")  # of what is noted, for the overview
-SHARES = ("accepted", "rejected")
+SHARES = ("accepted", "rejected", "local")
 TALL = 2
 """How much higher a panel is whose lines have their names in its corner: with 1 the names lie on the lines, with 4 the
 others are too low for the numbers beside them."""
