@@ -172,6 +172,29 @@ def test_beside_a_literal_tuple_it_is_said_how_far_below_the_map_it_is() -> None
     assert _own(landscape, replace(aim, value=0.632)) == ["orange: the best tuple, g = 0.632"]
 
 
+@pytest.mark.parametrize("value", [0.0, 0.4, 1.0])
+def test_the_value_of_the_best_point_is_above_the_whole_surface_and_no_line_crosses_it(value: float) -> None:
+    import rerun as rr
+
+    from sparserob_rerun.search.terrain import WORDS, Terrain
+
+    kept: dict[str, Any] = {}
+    stream = SimpleNamespace(log=lambda path, *parts, **_: kept.update({path: parts[0]}))
+    line = np.array([0.0, 1.0])
+    landscape: Any = SimpleNamespace(
+        axes=(line, line), at=(1, 0), shown=(line, line, np.eye(2)), flat=False, value=value, names=lambda _: ("t", "t")
+    )
+    Terrain(rr, stream)._mesh(landscape, (0.0, 1.0))
+    labels = kept["landscape/surface/labels"]
+    words = labels.labels.as_arrow_array().to_pylist()
+    (place,) = [
+        at for at, said in zip(labels.positions.as_arrow_array().to_pylist(), words, strict=True) if "best" in said
+    ]
+    ((foot, end),) = kept["landscape/surface/pole"].strips.as_arrow_array().to_pylist()
+    assert place[:2] == foot[:2] == end[:2] == [1.0, 0.0] and place[2] > 1.3
+    assert foot[2] == pytest.approx(value, abs=0.02) and end[2] == pytest.approx(place[2] - WORDS)
+
+
 def test_a_curve_of_many_values_keeps_the_lowest_and_the_highest_of_every_stretch() -> None:
     from sparserob_rerun.search.climb import CORNERS, _corners
 

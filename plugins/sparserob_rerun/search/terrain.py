@@ -24,8 +24,9 @@ LETTERS = 46  # in a line; a word more does not fit there
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 LIFT = 0.015  # points stand this share of the height above the surface
 POLE = 0.32
-"""How far above the best point its value is written, in heights of the surface. Much lower, the bright surface is
-behind the words, which cannot be read in a light theme; twice as high, they are outside the panel."""
+"""How far above the surface the value of the best point is written, in heights of it, wherever that point is. Much
+lower, the bright surface is behind the words, which cannot be read in a light theme; twice as high, they are outside
+the panel."""
 WORDS = 0.08
 """How far below the place of these words the line from the point to them ends, which the viewer writes below their
 place. With 0 the line crosses them, with 0.2 it is too short to lead to them."""
@@ -272,6 +273,7 @@ class Terrain:
         )
         at = [float((landscape.axes[k][landscape.at[k]] - a[0]) / (a[-1] - a[0])) for k, a in enumerate((across, up))]
         top = float(np.clip((landscape.value - scale[0]) / (scale[1] - scale[0]), 0.0, 1.0)) + LIFT
+        above = 1.0 + LIFT + POLE
         self.stream.log(
             "landscape/surface/best",
             self.rr.Points3D(
@@ -283,13 +285,13 @@ class Terrain:
         self.stream.log(
             "landscape/surface/pole",
             self.rr.LineStrips3D(
-                [[[*at, top], [*at, top + POLE - WORDS]]], colors=[ink.ORANGE], radii=self.rr.Radius.ui_points(0.6)
+                [[[*at, top], [*at, above - WORDS]]], colors=[ink.ORANGE], radii=self.rr.Radius.ui_points(0.6)
             ),
         )
         names = landscape.names(self.unit)
         flat = landscape.flat
         corners = {  # words are bright, so that each has the dark ground behind it
-            (at[0], at[1], top + POLE): f"best {landscape.value:.6g}",
+            (at[0], at[1], above): f"best {landscape.value:.6g}",
             (0.5, -0.12, 0.0): f"{names[0]}: {across[0]:.3g} to {across[-1]:.3g}",
             (1.12, 0.5, 0.0): f"{names[1]}: {up[0]:.3g} to {up[-1]:.3g}",
             (0.0, 0.0, 1.05): ", ".join(_said(landscape)) if flat else f"g = {scale[1]:.4g}",
