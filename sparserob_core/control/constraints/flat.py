@@ -60,6 +60,8 @@ class Samples:
     parameters: ParameterIndex
     reference: Reference | None = None
     gains: Array | None = None
+    undivided: tuple[Samples, Array] | None = None
+    """Those of which they are, and what their rows are divided by, ``(r,)``."""
     _supports: dict[bytes, list[Supports | None]] = field(default_factory=dict, repr=False)
 
     def serve(self, constraint: FlatConstraint) -> bool:
@@ -99,6 +101,8 @@ class Samples:
     @cached_property
     def times(self) -> Array:
         """Sampled times: the window's ends, the breakpoints in it, and a few times in every piece, increasing."""
+        if self.undivided is not None:
+            return self.undivided[0].times
         grid, (start, stop) = self._response.grid, self.window
         pace = float(np.linalg.norm(self._response.steps(self.lattice[0]).A, axis=(2, 3)).max())
         counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
@@ -120,6 +124,8 @@ class Samples:
     @cached_property
     def margins(self) -> Array:
         """``h - sigma`` on the lattice, ``(v, r, times)``: what the worst disturbance leaves of every side."""
+        if self.undivided is not None:
+            return self.undivided[0].margins / self.undivided[1][None, :, None]
         points, _ = self.lattice
         if not self.functionals.disturbed:
             return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
@@ -134,6 +140,8 @@ class Samples:
 
     def along(self, response: Response, control: Array) -> Array:
         """``H x (v, r, times)`` from the initial state of a response, under a control ``(m, K)``."""
+        if self.undivided is not None:
+            return self.undivided[0].along(response, control) / self.undivided[1][None, :, None]
         _, which, signs = self._apart
         return np.asarray(self.outputs.at(response, control)[:, which] * signs[:, None])
 
@@ -217,6 +225,11 @@ class FlatConstraint(StateConstraint):
     def divided(self, units: Float[Array, " r"]) -> FlatConstraint:
         gains = None if self.gains is None else self.gains / units[:, None]
         return replace(self, H=self.H / units[:, None], h=self.h / units, gains=gains, shared=None)
+
+    @shaped
+    def looked_at_in(self, units: Float[Array, " r"]) -> FlatConstraint:
+        made, known = self.divided(units), self.samples
+        return replace(made, shared=replace(known, H=made.H, h=made.h, gains=made.gains, undivided=(known, units)))
 
     @shaped
     def functionals_at(

@@ -93,6 +93,11 @@ class StateConstraint(Source):
     def divided(self, units: Float[Array, " r"]) -> StateConstraint:
         """The same constraint with its rows divided by ``units (r,)``, one for a curved set."""
 
+    @shaped
+    def looked_at_in(self, units: Float[Array, " r"]) -> StateConstraint:
+        """`divided`, of a constraint that has been looked at: what is known of it at samples is shared."""
+        return self.divided(units)
+
     @abstractmethod
     def directions(
         self, z: Float[Array, "k b"], rows: Int[np.ndarray, " k"]

@@ -17,8 +17,9 @@ from sparserob_core.control.enclosures.flows import Leaps
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.response.varying_motion import VaryingMotion
-from sparserob_core.control.transcription.record import Feedback
+from sparserob_core.control.transcription.record import Feedback, Transcription
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.program import OwnUnits, Separation
 
 if TYPE_CHECKING:
     from sparserob_core.control.feedback.closed_loop import ClosedLoop
@@ -56,12 +57,21 @@ class Adversary:
     __repr__ = brief
 
 
-def find_adversary(constraint: StateConstraint, decision: Array, feedback: Feedback | None = None) -> Adversary | None:
+def find_adversaries(model: Transcription, decision: Array) -> list[Adversary]:
+    """The worst case of every constraint on the state of a problem, as far as there is one."""
+    every = [find_adversary(one, decision, model.feedback, model.program.own_units) for one in model.constraints]
+    return [one for one in every if one is not None]
+
+
+def find_adversary(
+    constraint: StateConstraint, decision: Array, feedback: Feedback | None = None, own: OwnUnits | None = None
+) -> Adversary | None:
     """The `Adversary` of a constraint, at the largest violation that its separation finds; ``None`` if it finds
-    none. Under ``feedback`` that of the closed loop."""
+    none. Under ``feedback`` that of the closed loop. Where the program is known in its ``own`` units, in which a method
+    has looked at every sample before, it is sought there."""
     if feedback is not None:
         return _of_loop(constraint, decision, feedback.loop)
-    found = constraint.worst(decision)
+    found = constraint.worst(decision) if own is None else _sought(constraint, decision, own)
     if not found.violations.size:
         return None
     row = int(found.rows[0])
@@ -82,6 +92,18 @@ def find_adversary(constraint: StateConstraint, decision: Array, feedback: Feedb
         initial_state=constraint.functionals.response.initial_state
         + constraint.functionals.worst_deviations(np.array([time]), directions[None], parameters[None])[0],
     )
+
+
+def _sought(constraint: StateConstraint, decision: Array, own: OwnUnits) -> Separation:
+    """The largest violation of all rows in the user's units, its place found in the program's ``own``."""
+    family = own.program.family(constraint.name)
+    family = family.reduced or family
+    source, rows, begins = family.source, family.row_units, family.index_units
+    assert isinstance(source, StateConstraint) and rows is not None and begins is not None
+    looked_at = source if (rows == rows[0]).all() else source.looked_at_in(1.0 / rows)  # one row may be in metres
+    found = looked_at.worst(decision / own.decision[: decision.size])
+    place, row = found.indices[:1] * begins, found.rows[:1]
+    return Separation(place, row, constraint.violations(decision, place, row))
 
 
 def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:

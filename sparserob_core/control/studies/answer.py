@@ -114,7 +114,7 @@ class ControlResult(Result):
         if constraint not in named:
             known = ", ".join(named) or "none on the state"
             raise InputError(path="constraint", expected=f"one of {known}", got=f"{constraint!r}")
-        found = find_adversary(named[constraint], self._decided(), self.model.feedback)
+        found = find_adversary(named[constraint], self._decided(), self.model.feedback, self.model.program.own_units)
         if found is None:
             raise InputError(f"the constraint {constraint} has no worst case at this decision")
         return found

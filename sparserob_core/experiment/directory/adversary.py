@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sparserob_core.control.response.response import Response
-from sparserob_core.control.studies.adversary import Adversary, find_adversary
+from sparserob_core.control.studies.adversary import Adversary, find_adversaries
 from sparserob_core.control.studies.simulate import delivered, fine_times, finer, walk, worst_errors
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
@@ -45,8 +45,7 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
     if not isinstance(experiment, ControlExperiment):
         return {}
     model, theta = experiment.transcription, np.asarray(decision, dtype=float).ravel()
-    found = [find_adversary(constraint, theta, model.feedback) for constraint in model.constraints]
-    kept = [one for one in found if one is not None]
+    kept = find_adversaries(model, theta)
     if not kept:
         return {}
     arrays = _stacked(kept, model)

@@ -14,7 +14,7 @@ from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
-from sparserob_core.control.studies.adversary import find_adversary
+from sparserob_core.control.studies.adversary import find_adversaries
 from sparserob_core.control.studies.answer import Tube, supports, tube
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import path_names
@@ -232,8 +232,7 @@ def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
     """What every innovation adds to the control on every piece, in the worst case of the constraint that comes nearest
     to being violated."""
     assert model.feedback is not None
-    found = [find_adversary(constraint, decision, model.feedback) for constraint in model.constraints]
-    worst = max((one for one in found if one is not None), key=lambda one: one.violation, default=None)
+    worst = max(find_adversaries(model, decision), key=lambda one: one.violation, default=None)
     if worst is None or worst.deviation is None:
         return {}
     loop = model.feedback.loop

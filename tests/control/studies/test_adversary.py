@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 import sparserob_core as sr
-from sparserob_core.control.studies.adversary import find_adversary, worst_signal
+from sparserob_core.control.studies.adversary import find_adversaries, find_adversary, worst_signal
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.assemble import PlainExperiment
 from sparserob_core.experiment.directory.adversary import FILE, adversaries, attained
@@ -98,10 +98,39 @@ def test_the_adversary_attains_the_worst_of_its_family(name, parameters):
         one = find_adversary(constraint, u)
         assert one.violation == program.family(one.name).worst(u).violations[0]
         assert one.direction @ reached(model, one, u[None]) - one.bound == pytest.approx(one.violation, abs=1e-9)
+        sought = find_adversary(constraint, u, own=program.own_units)
+        assert sought.violation == pytest.approx(one.violation, abs=1e-9) and sought.row == one.row
         if one.disturbance is not None:
             assert CASES[name][0].contains(one.disturbance.T, 1e-12).all()
         if parameters != "known":
             assert PARAMETERS[parameters].contains(one.parameter, 1e-9)
+
+
+def test_the_worst_case_is_sought_in_own_units_and_is_that_of_the_users():
+    system = sr.LinearSystem(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1e-3]]), np.array([[0.0], [1e-6]]))
+    problem = sr.OptimalControlProblem(
+        system=system,
+        horizon=1000.0,
+        initial_state=[0.0, 0.0],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=sr.Box([-1.0], [1.0]),
+        path=[sr.PathConstraint(sr.Box([-400.0, -1.0], [400.0, 0.5]), name="metres and metres a second")],
+    )
+    model = prepare(problem, uniform(8, 1000.0), uniform(8, 1000.0))
+    u = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
+    (constraint,), own = model.constraints, model.program.own_units
+    units = own.program.families[0].row_units
+    assert units.max() > 100 * units.min()  # the row that is worst in the user's units is not the worst in its own
+    assert own.program.families[0].worst(u / own.decision).rows[0] == 1
+    one = find_adversary(constraint, u, own=own)
+    assert "margins" not in constraint.samples.__dict__  # what was looked at before is not looked at again
+    again = find_adversary(constraint, u)
+    assert (
+        one.row == again.row == 0
+        and one.time == again.time
+        and one.violation == pytest.approx(again.violation, rel=1e-12)
+    )
+    assert find_adversaries(model, u)[0].violation == one.violation
 
 
 def test_the_worst_measurable_disturbance_switches_where_the_adjoint_changes_its_sign():
