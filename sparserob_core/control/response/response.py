@@ -97,7 +97,9 @@ class TimeGrid:
 
     def of_modes(self, matrices: Array) -> Array:
         """The matrices ``(J, d, m)`` of every mode, from ``(d, J m)`` side by side."""
-        return np.stack(np.split(matrices, len(self.turns), axis=-1))
+        rows, several, modes = *matrices.shape, len(self.turns)
+        apart = matrices.reshape(rows, modes, several // modes)
+        return np.ascontiguousarray(apart.swapaxes(0, 1))
 
     @cached_property
     def turns(self) -> list[slice]:
@@ -353,17 +355,24 @@ class Propagator:
         found = np.zeros((times.size, self.grid.pieces, both.shape[2]))
         found[np.arange(times.size), at] = (rows[:, None] @ both[which])[:, 0]
         rows = (rows[:, None] @ over.state[which])[:, 0]
-        pushes = np.concatenate([self.grid.of_modes(part[0]) for part in (steps.B, steps.E)], axis=2)
+        pushes, Phi = self._pushes, steps.Phi[0]
         last = int(at[0]) if at.size else 0
         reaching = np.searchsorted(-at, -np.arange(last)).tolist()
         for piece in range(last - 1, -1, -1):
             part = rows[: reaching[piece]]
-            found[: reaching[piece], piece] = part @ (pushes[piece] * self.grid.lengths[piece])
-            rows[: reaching[piece]] = part @ steps.Phi[0, piece]
+            found[: reaching[piece], piece] = part @ pushes[piece]
+            rows[: reaching[piece]] = part @ Phi[piece]
         back = np.empty_like(order)
         back[order] = np.arange(order.size)
         channels = over.control.shape[2]
         return Weights(rows[back], found[back, :, :channels], found[back, :, channels:])
+
+    @cached_property
+    def _pushes(self) -> Array:
+        """What a piece of a system that changes with time makes of an input, ``(L, d, m + mw)``."""
+        steps = self.steps(np.zeros((1, 0)))
+        both = np.concatenate([self.grid.of_modes(part[0]) for part in (steps.B, steps.E)], axis=2)
+        return np.asarray(both * self.grid.lengths[:, None, None])
 
     @cached_property
     def marks(self) -> Array:

@@ -33,6 +33,13 @@ class Untouched(sr.Solver):
         raise AssertionError("asked")
 
 
+class Asking(sr.Solver):
+    """Ends a test when it is asked."""
+
+    def solve(self, program, accuracy):
+        pytest.fail("asked")
+
+
 def separable(seed: int, rows: int, entries: int, curvature: float) -> FiniteProgram:
     """A feasible program of that size, with equalities, fixed entries and bounds of very different widths."""
     from scipy.sparse import csc_array, eye_array
@@ -66,6 +73,21 @@ def test_from_nothing_it_finds_the_optimum_to_round_off(seed: int, curvature: fl
     other = solve_finite(program, sr.load_registry().build("solver", "clarabel"))
     assert other.status == "optimal"
     assert found.value == pytest.approx(other.value, rel=1e-7, abs=1e-7)
+
+
+def test_a_large_program_is_solved_from_nothing_before_anybody_is_asked() -> None:
+    program = separable(5, 100, 2000, 1e-2)
+    program = replace(program, h=program.h + np.where(np.arange(100) < 5, 0.0, 100.0))
+    found = solve_finite(program, Untouched())
+    assert (found.status, found.by) == ("optimal", "dual_newton")
+    assert found.residual <= 1e-9
+    assert abs(found.gap) <= 1e-8 * max(1.0, abs(found.value))
+
+
+@pytest.mark.parametrize(("rows", "entries", "curvature"), [(20, 2000, 1e-2), (100, 200, 1e-2), (100, 2000, 0.0)])
+def test_one_that_is_not_large_or_not_bent_is_left_to_the_solver(rows: int, entries: int, curvature: float) -> None:
+    with pytest.raises(pytest.fail.Exception, match="asked"):
+        solve_finite(separable(5, rows, entries, curvature), Asking())
 
 
 def test_under_a_lighter_curvature_the_free_entries_of_the_last_optimum_lead_to_the_next_one_in_fewer_steps() -> None:
