@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from sparserob_core.control.enclosures.comparison import ComparisonSystem, block_norms, block_sizes, comparison_matrix
-from sparserob_core.control.enclosures.decoupling import decoupled, decoupled_transitions
+from sparserob_core.control.enclosures.decoupling import MANY, decoupled, decoupled_transitions
 
 MATRICES = {
     "a number": [[-3.0]],
@@ -77,6 +77,30 @@ def test_the_exponential_by_modes_is_that_of_the_matrix(name):
 def test_far_modes_do_not_share_a_group():
     assert decoupled(np.array(MATRICES["chemistry"])).groups.tolist() == [0, 1, 2]
     assert decoupled(np.array(MATRICES["a fast mode beside integrators"])).groups.tolist() == [0, 2]
+
+
+def leaning(states, condition):
+    """Lightly damped modes, closer than a hundredth of the fastest, in coordinates of that condition."""
+    rng = np.random.default_rng(3)
+    left, right = (np.linalg.qr(rng.standard_normal((states, states)))[0] for _ in range(2))
+    T, D = left @ np.diag(np.geomspace(1.0, condition, states)) @ right, np.zeros((states, states))
+    for mode in range(states // 2):
+        at, turn = 2 * mode, 10.0 + 0.05 * mode
+        D[at : at + 2, at : at + 2] = [[-0.1, turn], [-turn, -0.1]]
+    return T @ D @ np.linalg.inv(T)
+
+
+def test_modes_of_many_states_come_apart_though_they_lean_towards_each_other():
+    A = leaning(MANY, 2e4)
+    basis, D, slack = made(A)
+    assert basis.groups.size == basis.starts.size == MANY // 2
+    with flint.ctx.workprec(200):
+        T = flint.arb_mat(basis.transform.tolist())
+        rest = T.inv() * flint.arb_mat(A.tolist()) * T - flint.arb_mat(D.tolist())
+        assert all(abs(rest[i, j]) <= slack[i, j] for i in range(MANY) for j in range(MANY))
+    assert slack.max() <= 1e-9 * np.abs(D).max()
+    fewer, more = decoupled(leaning(MANY - 2, 2e4)), decoupled(leaning(MANY, 1e9))
+    assert fewer.groups.size == more.groups.size == 1  # of few states, or where rounding would be felt, the Schur form
 
 
 def test_a_fast_mode_does_not_cost_the_slow_one_its_digits():
