@@ -391,6 +391,18 @@ class ConvexSet(ABC):
         return excess
 
     @shaped
+    def support_majorant(
+        self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
+    ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
+        """A linear function of ``y`` above the support function over ``y = centre + sum_j s_j spread_j``,
+        ``|s_j| <= 1``: a point ``(..., d)`` that ``y`` is multiplied by, and what is added, ``(...,)``.
+
+        ``centre (..., d)``, ``spread (..., J, d)``. The linearisation with its excess will do; of a box the chord is
+        lower.
+        """
+        return self.support_point(centre), self.linearisation_excess(centre, spread)
+
+    @shaped
     def support_minorant(
         self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
     ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
@@ -402,6 +414,15 @@ class ConvexSet(ABC):
         """
         point = self.support_point(centre[None])[0]
         return float(self.support(centre[None])[0]), spread @ point, np.zeros((spread.shape[0], spread.shape[0]))
+
+
+def chords(centre: Array, reach: Array) -> tuple[Array, Array]:
+    """``share`` and ``excess`` of the chords ``|y| <= share y + excess`` over ``|y - centre| <= reach``: where ``y``
+    keeps its sign, that sign and nothing."""
+    size = np.abs(centre)
+    turns = reach > size
+    share = np.where(turns, centre / np.where(turns, reach, 1.0), np.sign(centre))
+    return share, np.where(turns, (reach - size) * (1.0 + np.abs(share)), 0.0)
 
 
 def ratios(sizes: Array, room: Array | float) -> Array:
@@ -499,6 +520,15 @@ class Box(ConvexSet):
         return excess
 
     @shaped
+    def support_majorant(
+        self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
+    ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
+        fixed = self.upper == self.lower
+        half = np.where(fixed, 0.0, self.upper - self.lower) / 2
+        share, excess = chords(np.asarray(centre), np.abs(spread).sum(axis=-2))
+        return np.where(fixed, self.lower, self.upper - half) + half * share, (half * excess).sum(axis=-1)
+
+    @shaped
     def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]]:
         identity = np.eye(self.dimension)
         rows, bounds = np.vstack([identity, -identity]), np.concatenate([self.upper, -self.lower])
@@ -580,6 +610,13 @@ class SetInUnits(ConvexSet):
     @shaped
     def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         return self.base.linearisation_excess(np.asarray(centre) / self.units, np.asarray(spread) / self.units)
+
+    @shaped
+    def support_majorant(
+        self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
+    ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
+        point, excess = self.base.support_majorant(np.asarray(centre) / self.units, np.asarray(spread) / self.units)
+        return point / self.units, excess
 
     @shaped
     def support_minorant(
@@ -676,6 +713,13 @@ class Scaled(ConvexSet):
     @shaped
     def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         return self.factor * self.base.linearisation_excess(centre, spread)
+
+    @shaped
+    def support_majorant(
+        self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
+    ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
+        point, excess = self.base.support_majorant(centre, spread)
+        return self._moved(point), self.factor * excess
 
     @shaped
     def support_minorant(

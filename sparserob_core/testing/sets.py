@@ -333,6 +333,13 @@ class SetContract(Contract[ConvexSet], kind="set"):
                 "linearisation_excess says: what it proves is not true",
                 "bound `h(c + s'D) - (c + s'D)'x(c)` for all s in [-1, 1]^k, from above; or leave it out",
             )
+            point, added = convex.support_majorant(centre, spread)
+            demand(
+                (truth - (centre + shifts @ spread) @ point).max() <= added + tolerance,
+                "around a direction the support function is above what support_majorant says",
+                "bound `h(c + s'D) - (c + s'D)'x` for all s in [-1, 1]^k, from above, by the x that you return; or "
+                "leave it out",
+            )
             value, gradient, hessian = convex.support_minorant(centre, spread)
             below = value + shifts @ gradient + np.einsum("si,ij,sj->s", shifts, hessian, shifts) / 2
             demand(

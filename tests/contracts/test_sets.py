@@ -228,6 +228,12 @@ class ExcessTooSmall(Disc):
         return 0.1 * super().linearisation_excess(centre, spread)
 
 
+class MajorantTooLow(Disc):
+    def support_majorant(self, centre, spread):
+        point, excess = super().support_majorant(centre, spread)
+        return point, 0.1 * excess
+
+
 class MinorantTooHigh(Disc):
     def support_minorant(self, centre, spread):
         value, gradient, hessian = super().support_minorant(centre, spread)
@@ -258,6 +264,7 @@ FAULTS = {
     ScaledAboutTheOrigin: "test_scaled_about_its_middle_it_is_larger_in_proportion",
     UnitsUpsideDown: "test_in_other_units_it_is_the_same_set",
     ExcessTooSmall: "test_the_support_function_stays_between_its_bounds_around_a_direction",
+    MajorantTooLow: "test_the_support_function_stays_between_its_bounds_around_a_direction",
     MinorantTooHigh: "test_the_support_function_stays_between_its_bounds_around_a_direction",
     AnotherBall: "test_an_image_of_the_ball_has_the_support_function_of_one",
 }

@@ -32,6 +32,9 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Separation
 
 SAMPLED = 8  # samples in any direction that are climbed from, beside the maxima along time
+# Of the longest direction of a cell, what its shortest is taken for when it is said where to halve; a bound that may be
+# 0 would say nothing of the others.
+SHORTEST, TINY = 1e-3, float(np.finfo(float).tiny)
 STEP = 0.1  # first step of directions, on the cube of edge 2
 
 
@@ -203,6 +206,13 @@ class CurvedConstraint(StateConstraint):
         return answer
 
     @shaped
+    def _lengthening(self, H: Float[Array, "r d"], shortest: float) -> Float[Array, " j"]:
+        """By which share ``h(c) - c'm`` is larger than ``shortest`` where one coordinate of the directions
+        ``c = H[0] + sum_j eta_j H[j]`` is at an end."""
+        ends = np.maximum(*(self.set.support(c) - c @ self.set.interior_point() for c in (H[0] + H[1:], H[0] - H[1:])))
+        return np.asarray(ends / max(shortest, SHORTEST * ends.max(initial=0.0), TINY) - 1.0)
+
+    @shaped
     def explain(self, index: Float[Array, " j"], row: int) -> TimedExplanation:
         times, directions, parameters, rhs = self.functionals_at(index[None])
         at = (float(times[0]), parameters[0])
@@ -254,13 +264,15 @@ class CurvedConstraint(StateConstraint):
             legs = self.functionals.legs(low[:nu], high[:nu])
             joined = self._combination(legs[0], free.size)
             rhs, looseness = self._minorant(H, joined, nu)
+            shortest = self._rooms(low[None, nu:], high[None, nu:])[0]
+            lengthening = np.concatenate([np.zeros(nu), self._lengthening(H, shortest / self.unit)])
             control = self.functionals.dictionary.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
             moving = None if self.reference is None else Moving(self.reference, H)
 
             def cell(leg: Leg) -> CellEnclosure:
                 sigma = self.functionals.support_over(leg, H, joined)
-                return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, cuts, moving)
+                return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, lengthening, cuts, moving)
 
             remember(self._cells, key, over_legs(legs, cell), kept(control))
         return self._cells[key]

@@ -387,11 +387,12 @@ def summed(
         kept, onto = face.onto(kept)
         blocks = (onto @ blocks.reshape(k, r, given, count * width)).reshape(k, r, kept.size, count, width)
     size = given if monomials is None else size
-    point = bound.support_point(blocks[:, :, 0])
     polynomials = np.zeros((k, r, count, size + 1))
-    polynomials[..., kept] = np.einsum("krbq,krabq->krba", point, blocks)
     if kept.size > 1:
-        polynomials[..., -1] = bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
+        point, polynomials[..., -1] = bound.support_majorant(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
+    else:
+        point = bound.support_point(blocks[:, :, 0])
+    polynomials[..., kept] = np.einsum("krbq,krabq->krba", point, blocks)
     return polynomials
 
 

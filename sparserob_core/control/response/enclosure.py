@@ -19,7 +19,13 @@ import numpy as np
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_of, monotone_ends, polynomial_bound
+from sparserob_core.control.enclosures.polynomial import (
+    distinct_patterns,
+    face_of,
+    monotone_ends,
+    polynomial_bound,
+    quadratic_part,
+)
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.response.initial_support import Supports
@@ -36,6 +42,7 @@ TIME_FIRST = (
     0.25  # times are halved before anything else unless that gains less than this share: their cells share all work
 )
 TINY = 1e-4  # of a cell of parameters: a cell on which a system that can be enclosed at all will be
+TINIEST = float(np.finfo(float).tiny)  # instead of nothing to divide by
 FEW_CELLS = 64  # of which only neighbours are asked whether they share an end
 
 
@@ -98,8 +105,9 @@ class CellEnclosure:
     ``H (r, d)``; ``rhs (r', M')``, polynomials over the cell; ``control (m, K)`` on the pieces of the control's
     dictionary. Without a combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one they are the
     parts of a single constraint. ``looseness (nu',)``: how far ``rhs`` may be below the truth at the ends of every
-    coordinate; it only guides the halving. ``cuts``: beyond them the cell holds no parameters. ``moving``,
-    ``direct``: what is added to the rows, linear in time or constant on every cell of times.
+    coordinate, and ``lengthening (nu',)``, by which share longer than the shortest direction of the cell, whose length
+    a violation is told in, those there are; they only guide the halving. ``cuts``: beyond them the cell holds no
+    parameters. ``moving``, ``direct``: what is added to the rows, linear in time or constant on every cell of times.
     """
 
     lifted: Motion
@@ -109,6 +117,7 @@ class CellEnclosure:
     control: Array
     combination: Combination | None = None
     looseness: Array | float = 0.0
+    lengthening: Array | float = 0.0
     cuts: Cuts | None = None
     moving: Moving | None = None
     direct: Direct | None = None
@@ -143,7 +152,7 @@ class CellEnclosure:
         short = self.lifted.norm * (stop - start) < 1.0
         wild = short & ~(bend[pick] <= WILD * (1.0 + np.abs(left[pick]) + np.abs(right[pick])))
         gain = np.where(wild, 0.0, bend[pick]) if spread.shape[1] else bend[pick]
-        return total[pick], gain, spread + self.looseness
+        return total[pick], gain, spread
 
     def _at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
@@ -169,7 +178,27 @@ class CellEnclosure:
         bound, spread = polynomial_bound(space, coefficients)
         blame = np.where(ends == 0, steepness, 0.0) + np.finfo(float).tiny
         spread = spread if gain is None else gain
+        if self.combination is not None:
+            spread = self._of_directions(space, coefficients, ends, spread, np.maximum(bound + excess, 0.0))
         return bound + excess, spread + excess[..., None] * blame / blame.sum(axis=2, keepdims=True)
+
+    def _of_directions(
+        self, space: TaylorSpace, coefficients: Array, ends: Array, spread: Array, violated: Array
+    ) -> Array:
+        """The ``spread (k, r, nu')`` with what halving each direction would gain: a polynomial that bends downwards is
+        bounded exactly, however wide the cell, so that only what is lost where it is highest counts: what ``rhs`` is
+        below the truth there, and the length in which what is ``violated (k, r)`` is told; beside products with other
+        variables."""
+        nu = self.lifted.space.nu
+        gradient, hessian = (
+            part.reshape(*ends.shape, *part.shape[2:])
+            for part in quadratic_part(space, coefficients.reshape(-1, space.size))
+        )
+        own = np.einsum("...ii->...i", hessian)
+        highest = np.where(ends == 0, np.clip(gradient / np.maximum(-own, TINIEST), -1.0, 1.0), ends)
+        lost = self.looseness + violated[..., None] * self.lengthening
+        found = np.abs(hessian).sum(axis=3) - np.abs(own) + lost * highest**2
+        return np.concatenate([spread[..., :nu], found[..., nu:]], axis=2)
 
     def _cut_off(self, space: TaylorSpace, coefficients: Array, times: Array) -> tuple[Array, Array | None]:
         """Polynomials above ``coefficients (k, r, M)`` where the parameters are, and what halving the cell would gain

@@ -235,6 +235,14 @@ class NormBall(ConvexSet):
         return self.radius * _round_excess(np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
 
     @shaped
+    def support_majorant(
+        self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
+    ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
+        if self.p == np.inf:
+            return Box(self.centre - self.radius, self.centre + self.radius).support_majorant(centre, spread)
+        return super().support_majorant(centre, spread)
+
+    @shaped
     def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
         d = self.dimension
         if self.p == np.inf or d == 1:
@@ -383,18 +391,38 @@ def norm_curvature(centre: Float[Array, " b"], spread: Float[Array, "J b"]) -> F
     """``H (J, J)`` with ``|a + B's| >= |a| + a'B's / |a| + s'H s / 2`` for ``|s_j| <= 1``; ``centre`` is ``a (b,)``,
     ``spread`` is ``B (J, b)``.
 
-    With the part of ``B's`` along ``a`` at most ``p`` and the part across at most ``q``:
-    ``sqrt(u^2 + v^2) >= u + v^2 / (2 u) - v^4 / (8 u^3)`` for ``|a| - p <= u <= |a| + p`` and ``v <= q``. Zero where
-    that is not positive.
+    With ``u`` the part of ``a + B's`` along ``a``, at most ``U``, and ``v`` the length of the part across:
+    ``sqrt(u^2 + v^2) - u`` decreases in ``u``, so it is at least ``g(v^2) = sqrt(U^2 + v^2) - U``, which is concave. Of
+    ``v^2 = sum_k t_k``, ``t_k = (c_k's)^2`` from 0 to ``m_k``, ``g`` is above ``sum_k a_k t_k`` with the ``a_k`` of the
+    greedy algorithm, ``a_k m_k = g(m_1 + ... + m_k) - g(m_1 + ... + m_{k-1})``, for ``g`` of a sum of numbers is
+    submodular (Edmonds 1970). The narrowest come first: what is wide leaves what is narrow as curved as it is. The
+    ``c_k`` are columns of a pivoted Cholesky factor, which begins with what is widest.
     """
     size = float(np.linalg.norm(centre))
     if size == 0.0:
         return np.zeros((spread.shape[0], spread.shape[0]))
     along = spread @ centre / size
     across = spread - np.outer(along, centre / size)
-    p, q = float(np.abs(along).sum()), float(np.linalg.norm(across, axis=1).sum())
-    factor = 0.0 if p >= size else 1.0 / (size + p) - q**2 / (4.0 * (size - p) ** 3)
-    return max(0.0, factor) * (across @ across.T)
+    columns = _pivoted(across @ across.T)
+    widths = np.abs(columns).sum(axis=1) ** 2
+    # Those that are as wide but for a factor of 2 have the mean of their slopes, which is as good as any order of them.
+    _, group = np.unique(np.frexp(widths)[1], return_inverse=True)
+    most, totals = size + float(np.abs(along).sum()), np.cumsum(np.bincount(group, widths))
+    slopes = np.diff(totals / (most + np.sqrt(most**2 + totals)), prepend=0.0) / np.diff(totals, prepend=0.0)
+    return np.asarray((2.0 * slopes[group] * columns.T) @ columns)
+
+
+def _pivoted(matrix: Array) -> Array:
+    """Rows ``c_k (b, J)`` with ``sum_k c_k c_k'`` the positive semidefinite ``matrix (J, J)`` but for rounding, the
+    widest first."""
+    rest, least, columns = matrix, matrix.shape[0] * np.finfo(float).eps * matrix.diagonal().max(initial=0.0), []
+    for _ in range(matrix.shape[0]):
+        pivot = int(rest.diagonal().argmax())
+        if rest[pivot, pivot] <= least:
+            break
+        columns.append(rest[pivot] / np.sqrt(rest[pivot, pivot]))
+        rest = rest - np.outer(columns[-1], columns[-1])
+    return np.array(columns).reshape(-1, matrix.shape[0])
 
 
 @shaped

@@ -287,6 +287,14 @@ class Product(ConvexSet):
         return np.asarray(sum(part.linearisation_excess(own, moved) for (part, own), (_, moved) in pairs))
 
     @shaped
+    def support_majorant(
+        self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
+    ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
+        pairs = zip(self.split(centre), self.split(spread), strict=True)
+        each = [part.support_majorant(own, moved) for (part, own), (_, moved) in pairs]
+        return np.concatenate([point for point, _ in each], axis=-1), np.sum([excess for _, excess in each], axis=0)
+
+    @shaped
     def support_minorant(
         self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
     ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.brief import noun
 from sparserob_core.shapes import sealed
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet, chords
 
 MOST_SIDES = 500  # pairs of half-spaces that are listed; beyond, the set is left to its support function
 PARALLEL = 1e-10  # of its generators' size, a normal that is none
@@ -59,6 +59,12 @@ class Zonotope(ConvexSet):
         moved = np.abs(np.asarray(spread) @ self.generators.T).sum(axis=-2)
         excess: Array = np.where(along > 0, 2.0 * np.maximum(moved - along, 0.0), moved).sum(axis=-1)
         return excess
+
+    def support_majorant(self, centre: Array, spread: Array) -> tuple[Array, Array]:
+        share, excess = chords(
+            np.asarray(centre) @ self.generators.T, np.abs(np.asarray(spread) @ self.generators.T).sum(axis=-2)
+        )
+        return self.centre + share @ self.generators, excess.sum(axis=-1)
 
     def halfspaces(self) -> tuple[Array, Array] | None:
         return self._sides

@@ -111,6 +111,20 @@ def test_the_excess_of_a_round_set_is_the_length_that_it_is_by_hand():
     assert ball.linearisation_excess(np.zeros((1, 2)), np.array([[[3.0, 4.0]]]))[0] == pytest.approx(3.0 * 5.0)
 
 
+def test_a_box_has_the_chord_of_its_support_function_where_a_coordinate_turns():
+    """By hand: ``|y| <= y / 2 + 3 / 2`` from -1 to 3, ``|y| <= 1`` from -1 to 1, ``y`` itself from 1 to 3; in units, as
+    a zonotope, and about another middle."""
+    box = Box([-1.0], [1.0])
+    for centre, spread, share, excess in ((1.0, 2.0, 0.5, 1.5), (0.0, 1.0, 0.0, 1.0), (2.0, 1.0, 1.0, 0.0)):
+        asked = np.array([[centre]]), np.array([[[spread / 2], [-spread / 2]]])
+        for member in (box, Zonotope(np.zeros(1), np.eye(1)), NormBall(np.inf, 1.0, dimension=1)):
+            point, added = member.support_majorant(*asked)
+            assert point[0, 0] == pytest.approx(share) and added[0] == pytest.approx(excess)
+        point, added = Box([1.0], [5.0]).support_majorant(*asked)
+        assert point[0, 0] == pytest.approx(3.0 + 2.0 * share) and added[0] == pytest.approx(2.0 * excess)
+    assert Box([2.0], [2.0]).support_majorant(*asked)[0][0, 0] == 2.0
+
+
 def test_the_curvature_of_a_length_is_below_it_and_near_the_true_one_where_the_spread_is_small():
     rng = np.random.default_rng(3)
     for width in (1e-4, 0.03, 0.1, 0.3, 2.0):
@@ -125,9 +139,27 @@ def test_the_curvature_of_a_length_is_below_it_and_near_the_true_one_where_the_s
                 flat = B - np.outer(B @ a, a) / size**2
                 np.testing.assert_allclose(H, flat @ flat.T / size, rtol=0.02, atol=1e-14)
     assert (norm_curvature(np.zeros(2), np.eye(2)) == 0.0).all()
-    # by hand: p = 1/2 along, q = 1 across, |a| = 4
+    # by hand: U = 4 + 1/2, and 1 across
     H = norm_curvature(np.array([4.0, 0.0]), np.array([[0.5, 0.0], [0.0, 1.0]]))
-    assert np.diag([0.0, 1.0 / 4.5 - 1.0 / (4.0 * 3.5**3)]) == pytest.approx(H)
+    assert np.diag([0.0, 2.0 / (4.5 + np.sqrt(4.5**2 + 1.0))]) == pytest.approx(H)
+
+
+def test_the_curvature_of_a_length_is_below_it_in_many_dimensions_and_what_is_wide_leaves_the_narrow_as_curved():
+    rng = np.random.default_rng(5)
+    corners = np.array(list(product((-1.0, 1.0), repeat=5)))
+    s = np.vstack([corners, rng.uniform(-1.0, 1.0, (300, 5)), np.eye(5), -np.eye(5), np.zeros((1, 5))])
+    for _ in range(60):
+        a, B = rng.normal(size=4), rng.normal(size=(5, 4)) * 10.0 ** rng.uniform(-3, 1, (5, 1))
+        size, H = np.linalg.norm(a), norm_curvature(a, B)
+        truth = np.linalg.norm(a + s @ B, axis=1) - size - s @ B @ a / size
+        assert (0.5 * np.einsum("si,ij,sj->s", s, H, s) <= truth + 1e-13 * (1.0 + truth)).all()
+        assert (np.linalg.eigvalsh(H) >= -1e-13 * np.abs(H).max()).all()
+    # by hand, beside (1, 0, 0): 1/10 and 1 across, slopes g(0.01) / 0.01 and (g(1.01) - g(0.01)) / 1
+    H = norm_curvature(np.eye(3)[0], np.array([[0.0, 0.1, 0.0], [0.0, 0.0, 1.0]]))
+    narrow, wide = np.sqrt(1.01) - 1.0, np.sqrt(2.01) - np.sqrt(1.01)
+    np.testing.assert_allclose(H, 2.0 * np.diag([narrow, wide]), rtol=1e-12)
+    # and three as wide as each other have the chord to the corner
+    np.testing.assert_allclose(norm_curvature(np.eye(4)[0], np.eye(4)[1:]), 2.0 / 3.0 * np.eye(3), rtol=1e-12)
 
 
 def test_a_sum_of_segments_is_the_hull_of_its_corners():
