@@ -135,15 +135,21 @@ class Samples:
 
     @cached_property
     def outputs(self) -> Outputs:
-        """``H x`` at the sampled times and parameters; of rows that are opposite to others by these."""
-        return Outputs(self._response.propagator, self.H[self._apart[0]], self.times, self.lattice[0])
+        """``H x`` at the sampled times and parameters; of rows that are opposite to others by these. The states
+        themselves where there are fewer of them than rows."""
+        rows = np.eye(self.H.shape[1]) if self._by_states else self.H[self._apart[0]]
+        return Outputs(self._response.propagator, rows, self.times, self.lattice[0])
 
     def along(self, response: Response, control: Array) -> Array:
         """``H x (v, r, times)`` from the initial state of a response, under a control ``(m, K)``."""
         if self.undivided is not None:
             return self.undivided[0].along(response, control) / self.undivided[1][None, :, None]
-        _, which, signs = self._apart
-        return np.asarray(self.outputs.at(response, control)[:, which] * signs[:, None])
+        found, (_, which, signs) = self.outputs.at(response, control), self._apart
+        return np.asarray(self.H @ found if self._by_states else found[:, which] * signs[:, None])
+
+    @property
+    def _by_states(self) -> bool:
+        return bool(self._apart[0].size > self.H.shape[1])
 
     @cached_property
     def _apart(self) -> tuple[np.ndarray, np.ndarray, Array]:
