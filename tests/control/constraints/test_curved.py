@@ -11,6 +11,7 @@ from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurved
 from sparserob_core.control.constraints.local_maxima import MOST, along_spans, beside_kinks, ridden
 from sparserob_core.control.sets.directions import sampled
+from sparserob_core.sip.proof.branch_and_bound import prove_family
 from tests.known_answers.test_walls import ridden as problem
 from tests.support.transcribed import family_of
 
@@ -84,6 +85,25 @@ def test_what_a_direction_makes_of_the_worst_case_is_linear_in_weights_of_the_ax
     which = np.array([5, 5, 0, 0, 3, 3])
     found = functionals.turning(x, times, parameters)(c, which)
     np.testing.assert_allclose(found, functionals.values(x, times[which], c, parameters[which]), rtol=1e-12)
+
+
+def test_speeds_that_a_round_wall_hardly_limits_take_no_cells() -> None:
+    """Of twelve faces of directions in six states the six of positions are open at first; speeds need not be halved."""
+    at = 0.9 * 0.35 / np.sqrt(3.0)  # the vehicle rests there, nine tenths of the way to the wall
+    A, B = np.eye(6, k=3), np.eye(6)[:, 3:]
+    shape = np.diag([0.35**2] * 3 + [1e4] * 3)
+    stated = {
+        "name": "linear",
+        "system": {"A": A.tolist(), "B": B.tolist(), "E": B.tolist()},
+        "horizon": 4.0,
+        "initial_state": [at, at, -at, 0.0, 0.0, 0.0],
+        "control": {"box": 6.0},
+        "disturbance": {"box": 0.001},
+        "path": [{"ellipsoid": {"shape": shape.tolist()}, "from": 1.0}],
+    }
+    pieces = {name: {"name": "piecewise_constant", "pieces": 8} for name in ("control", "disturbance")}
+    family = family_of({"problem": stated, "dictionaries": pieces}, "path")
+    assert prove_family(family, np.zeros(24), cells=400).verdict == "proven"
 
 
 def test_under_feedback_too_a_set_that_is_left_is_imposed_all_along() -> None:
