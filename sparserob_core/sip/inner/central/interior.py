@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import final
+from typing import cast, final
 
 import numpy as np
 
@@ -26,7 +26,9 @@ from sparserob_core.sip.inner.simplex.counterpart import RobustAnswer
 from sparserob_core.workers import one_thread
 
 STEPS = 80  # Newton steps of one solve at most
-CORRECTIONS = 2  # of a step at most (Gondzio 1996)
+CORRECTIONS = 3  # of a step at most (Gondzio 1996): as many as take about half as long as what is factorised for it
+FURTHER = 0.3  # of the way, by which a correction is to make a step longer
+LEAST, SHARES = 0.01, 9  # share of a correction at least, and how many are tried: its length is little work
 SHARE = 0.995  # of the way to the boundary
 PROXIMAL = 1e-9  # weight of the distance from the last iterate: directions that change nothing have no length
 FIRST = 0.1  # products that the method begins with, in units of the largest cost
@@ -84,18 +86,21 @@ class Interior:
         until = time.monotonic() + seconds
         if self._stale:
             self._extend(margin)
-        first = self._limits.size
+        first, left = self._limits.size, np.inf
         self._h[first:] = self._layout.h - self._layout.rest - margin
-        # half of the gap that is small enough: one that only tends to it is met by chance
-        self._floor = 0.5 * SPENT * accuracy / (self._y.size + 2 * self._plus.size)
         with np.errstate(all="ignore"), one_thread():  # threads for thousands of small matrices wait for each other
             for _ in range(STEPS):
                 gap, lost, missed = self._residuals()
                 close = gap + lost <= accuracy or gap <= SPENT * accuracy
+                # half of the gap that is small enough: one that only tends to it is met by chance. Smaller products
+                # would make steps short while residuals are still large; where these are rounding, only they help
+                enough = SPENT if lost > 2.0 * left else 1.0
+                self._floor = 0.5 * enough * accuracy / (self._y.size + 2 * self._plus.size)
                 if close and missed <= max(MET, SPENT * accuracy):
                     return self._answer(True, "interior point method: optimal")
                 if not self._y.max() < ENDLESS or not self._step():
                     return self._answer(False, "the interior point method came to a halt")
+                left = (1.0 - self._went) * lost
                 if time.monotonic() > until:
                     return self._answer(False, "the interior point method is out of time")
                 self.steps += 1
@@ -145,39 +150,48 @@ class Interior:
         self._G = csr_array(vstack([self._plain, self._g]))
         self._h = np.concatenate([self._limits, L.h - L.rest - margin])
         self._Phi = csr_array((L.scale, (np.arange(L.of.size), L.of)), shape=(L.of.size, L.parts))
+        self._room = np.bincount(L.of, np.abs(self._h[first:]), L.parts) / np.bincount(L.of, L.scale, L.parts)
         had = self._s.size - first
         a = L.C @ self._f + L.offset
         worst = np.bincount(L.part, L.radius * np.abs(a), L.parts)
         free = self._h[first:] - self._g @ self._z - L.scale * worst[L.of]
         many = np.bincount(L.part, minlength=L.parts) + 2.0  # a slack is as large as that of each absolute value
         violation = max(0.0, -float(free[had:].min(initial=0.0)))
+        before = np.bincount(L.of[:had], L.scale[:had] * self._y[first:], L.parts)
         if had:
             aim = SLACK * violation * float(self._y[first:].max()) / float(many.max())
             self._mu = max(self._mu, aim)
-            self._s = np.maximum(self._s, self._mu / self._y)
+            # the smaller one grows: the other would leave residuals as large as what it is
+            self._s = np.where(self._y > self._s, np.maximum(self._s, self._mu / self._y), self._s)
             self._y = np.maximum(self._y, self._mu / self._s)
         else:
             violation = max(ROOM, AROUND * violation)
-        self._appear(had, a, free, np.maximum(free, violation) / many[L.of])
+        self._appear(had, before, a, free, np.maximum(free, violation) / many[L.of])
         self._stale = False
 
-    def _appear(self, had: int, a: Array, free: Array, room: Array) -> None:
+    def _appear(self, had: int, before: Array, a: Array, free: Array, room: Array) -> None:
         """Slacks and multipliers of new rows, and those of all absolute values; ``room (r,)``: what a row of this
         freedom ``free`` has as slack in the middle."""
         L, first = self._layout, self._limits.size
-        y = np.concatenate([self._y[first:], self._mu / room[had:]])
+        y, old = np.concatenate([self._y[first:], self._mu / room[had:]]), self._plus.size
         eta = np.bincount(L.of, L.scale * y, L.parts)
+        weight = (eta / np.maximum(before, TINY))[L.part[:old]]
+        self._alpha, self._beta = weight * self._alpha, weight * self._beta
+        near = np.where(self._alpha > self._beta, self._plus, self._minus)
+        grown = np.maximum(self._mu / np.maximum(self._alpha, self._beta) - near, 0.0)
+        self._plus, self._minus = self._plus + grown, self._minus + grown
         most = np.full(L.parts, np.inf)
         np.minimum.at(most, L.of, room / np.maximum(L.scale, TINY))
         t = np.abs(a) + np.minimum(self._mu / np.maximum(eta, TINY), most)[L.part] / L.radius
-        old = self._plus.size
-        t[:old] = np.maximum(t[:old], (self._plus + self._minus) / 2)
+        t[:old] = (self._plus + self._minus) / 2
         used = np.bincount(L.part, L.radius * (t - np.abs(a)), L.parts)
         left = np.maximum(free - L.scale * used[L.of], room)[had:]
         self._s = np.concatenate([self._s, left])
         self._y = np.concatenate([self._y, self._mu / left])
-        self._plus, self._minus = t - a, t + a
-        self._alpha, self._beta = self._mu / self._plus, self._mu / self._minus
+        self._plus, self._minus = np.append(self._plus, (t - a)[old:]), np.append(self._minus, (t + a)[old:])
+        none = np.zeros(t.size - old)
+        self._alpha = np.maximum(np.append(self._alpha, none), self._mu / self._plus)
+        self._beta = np.maximum(np.append(self._beta, none), self._mu / self._minus)
 
     def _residuals(self) -> tuple[float, float, float]:
         """The gap, what the residuals of the dual take from a bound, and the largest of the primal."""
@@ -191,7 +205,8 @@ class Interior:
         self._rp[first:] += L.scale * tau[L.of]
         gap = float(self._y @ self._s + self._alpha @ self._plus + self._beta @ self._minus)
         self._mu = gap / (self._y.size + 2 * self._plus.size)
-        lost = float(np.abs(self._rz) @ self._reach[0] + np.abs(self._rf) @ self._reach[1])
+        weight, _, slope = self._balanced(eta)
+        lost = float(np.abs(self._rz) @ self._reach[0] + (weight - eta) @ self._room + np.abs(slope) @ self._reach[1])
         return gap, lost, float(np.abs(self._rp).max())
 
     def _step(self) -> bool:
@@ -204,21 +219,19 @@ class Interior:
         products = [value * price for value, price in zip(values, prices, strict=True)]
         predicted = self._direction(*(-one for one in products))
         changes = list(zip(values, prices, *_moves(predicted), strict=True))
-        primal, dual = self._lengths(predicted, 1.0)
+        primal, dual = (_length(one, 1.0) for one in self._relative(predicted))
         after = sum(float((s + primal * ds) @ (y + dual * dy)) for s, y, ds, dy in changes)
         share = after / sum(float(one.sum()) for one in products)
         aim = max(self._mu * min(1.0, max(share, 0.0)) ** 3, self._floor)
         terms = [aim - s * y - ds * dy for s, y, ds, dy in changes]
-        move = self._direction(*terms)
-        primal, dual = self._lengths(move, SHARE)
+        move, primal, dual = self._between(predicted, self._direction(*terms), primal * dual)
         for _ in range(CORRECTIONS):  # products that a longer step would make far from the middle are brought back
             if min(primal, dual) > 0.9:
                 break
-            further = min(1.0, 1.08 * primal + 0.08), min(1.0, 1.08 * dual + 0.08)
+            further = min(1.0, primal + FURTHER), min(1.0, dual + FURTHER)
             changes = list(zip(values, prices, *_moves(move), strict=True))
-            terms = [term + _back(*one, *further, aim) for term, one in zip(terms, changes, strict=True)]
-            other = self._direction(*terms)
-            lengths = self._lengths(other, SHARE)
+            terms = [s * dy + y * ds + _back(s, y, ds, dy, *further, aim) for s, y, ds, dy in changes]
+            other, *lengths = self._between(move, self._direction(*terms), primal * dual)
             if not sum(lengths) > primal + dual + 0.01:
                 break
             move, (primal, dual) = other, lengths
@@ -228,20 +241,29 @@ class Interior:
         self._z, self._f, self._s = self._z + primal * dz, self._f + primal * df, self._s + primal * ds
         self._plus, self._minus = self._plus + primal * dplus, self._minus + primal * dminus
         self._y, self._alpha, self._beta = self._y + dual * dy, self._alpha + dual * dalpha, self._beta + dual * dbeta
+        self._went = dual
         return True
 
-    def _lengths(self, move: Direction, share: float) -> tuple[float, float]:
-        """How far slacks and multipliers can go."""
+    def _between(self, move: Direction, corrected: Direction, least: float) -> tuple[Direction, float, float]:
+        """As much of a correction as makes the longest step, of slacks and of multipliers each, with their lengths:
+        what is corrected is what a whole step would do, and short ones need less of it (Colombo and Gondzio 2008)."""
+        lengths, weights = list[float](), list[float]()
+        for before, after in zip(self._relative(move), self._relative(corrected), strict=True):
+            tried = np.linspace(1.0, max(least, LEAST), SHARES).tolist()
+            length, weight = max((_length(before + one * (after - before), SHARE), one) for one in tried)
+            lengths.append(length)
+            weights.append(weight)
+        primal, dual = weights
+        shares = (primal, primal, primal, dual, primal, primal, dual, dual)
+        found = tuple(a + share * (b - a) for a, b, share in zip(move, corrected, shares, strict=True))
+        return cast(Direction, found), lengths[0], lengths[1]
+
+    def _relative(self, move: Direction) -> tuple[Array, Array]:
+        """The changes of all slacks and of all multipliers, relative to what they are."""
         slacks, prices = _moves(move)
-
-        def most(values: tuple[Array, Array, Array], changes: tuple[Array, Array, Array]) -> float:
-            least = min(float((d / v).min(initial=0.0)) for v, d in zip(values, changes, strict=True))
-            return min(1.0, share / -least) if least < 0.0 else 1.0
-
-        return (
-            most((self._s, self._plus, self._minus), slacks),
-            most((self._y, self._alpha, self._beta), prices),
-        )
+        over = np.concatenate([d / v for v, d in zip((self._s, self._plus, self._minus), slacks, strict=True)])
+        under = np.concatenate([d / v for v, d in zip((self._y, self._alpha, self._beta), prices, strict=True)])
+        return over, under
 
     def _factorise(self) -> None:
         """Blocks, then what they leave of the rows, then the joint variables."""
@@ -309,37 +331,42 @@ class Interior:
         x[L.joint], x[L.answering] = self._z[: self._n], self._f
         y = self._y[self._limits.size :]
         y = np.where(y > NOTHING * y.max(), y, 0.0)
-        leaning = L.radius * (self._alpha - self._beta) / np.maximum(self._alpha + self._beta, TINY)
-        y, leaning = self._balanced(y, np.clip(leaning, -L.radius, L.radius))
+        eta = np.bincount(L.of, L.scale * y, L.parts)
+        weight, aim, _ = self._balanced(eta)
+        y = y + ((weight - eta) / np.maximum(np.bincount(L.of, L.scale, L.parts), TINY))[L.of]
+        leaning = np.divide(aim, weight[L.part], out=np.zeros(aim.size), where=weight[L.part] > 0.0)
         table = L.at_rest.copy()
-        table[L.part, L.entry] = leaning
+        table[L.part, L.entry] = np.clip(leaning, -L.radius, L.radius)
         signs = np.concatenate([np.sign(block.factor) for block in self.blocks])
         return RobustAnswer(solved, said, x, y, signs[:, None] * table[L.of], np.zeros(0))
 
-    def _balanced(self, y: Array, leaning: Array) -> tuple[Array, Array]:
-        """Multipliers ``(r,)`` and deviations ``(J,)`` that leave no slope in the variables that answer.
+    def _balanced(self, eta: Array) -> tuple[Array, Array, Array]:
+        """Weights ``(p,)`` of parts that weigh ``eta``, with the multipliers ``(J,)`` of what is in their absolute
+        values, such that variables that answer have no slope, and the slopes ``(n,)`` that some have all the same.
 
-        What rounding leaves of ten thousand slopes, times how far each variable can go, is more than the tolerated
-        gap. Every such variable is alone in an absolute value, of its effect on the control, whose deviation takes the
-        slope; where that is at its end the part weighs more, by all its rows alike, so that opposite ones move no joint
+        What is left of ten thousand slopes, times how far each variable can go, is more than the tolerated gap. Every
+        such variable is alone in an absolute value, of its effect on the control, whose deviation takes the slope;
+        where that is at its end the part weighs more, by all its rows alike, so that opposite ones move no joint
         variable.
         """
         L = self._layout
-        eta = np.bincount(L.of, L.scale * y, L.parts)
-        aim = eta[L.part] * leaning
-        single = np.flatnonzero(np.diff(L.C.indptr) == 1)
-        single = single[np.lexsort((eta[L.part[single]], L.offset[single] == 0.0))]  # the best ones are written last
+        leaning = L.radius * (self._alpha - self._beta) / np.maximum(self._alpha + self._beta, TINY)
+        aim = eta[L.part] * np.clip(leaning, -L.radius, L.radius)
+        single = L.single[np.lexsort((eta[L.part[L.single]], L.offset[L.single] == 0.0))]  # the best are written last
         taker = np.full(self._f.size, -1)
         taker[L.C.indices[L.C.indptr[single]]] = single
         takes = taker >= 0
-        taker = taker[takes]
-        aim[taker] -= (L.C.T @ aim)[takes] / L.C.data[L.C.indptr[taker]]
+        taker, slope = taker[takes], L.C.T @ aim
+        aim[taker] -= slope[takes] / L.C.data[L.C.indptr[taker]]
         weight = eta.copy()
-        np.maximum.at(weight, L.part, np.abs(aim) / L.radius)
-        rows = np.bincount(L.of, L.scale, L.parts)
-        y = y + ((weight - eta) / np.maximum(rows, TINY))[L.of]
-        moved = np.divide(aim, weight[L.part], out=leaning.copy(), where=weight[L.part] > 0.0)
-        return y, np.clip(moved, -L.radius, L.radius)
+        np.maximum.at(weight, L.part[taker], np.abs(aim[taker]) / L.radius[taker])
+        return weight, aim, np.where(takes, 0.0, slope)
+
+
+def _length(changes: Array, share: float) -> float:
+    """A step of which these relative changes leave a share of the way to 0."""
+    least = float(changes.min(initial=0.0))
+    return min(1.0, share / -least) if least < 0.0 else 1.0
 
 
 def _moves(move: Direction) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:

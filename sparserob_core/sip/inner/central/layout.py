@@ -60,10 +60,10 @@ class Layout:
     """The rows that were added, taken apart.
 
     Absolute values ``j``: ``entry``, ``part``, ``radius`` and ``offset (J,)``, and ``a = C f + offset`` of the
-    answering variables ``f``, whose numbers are ``answering``; ``squares (n, J)`` of what is in ``C`` where a variable
-    stands alone. Rows: coefficients ``g (r, z)`` of the joint variables, whose numbers are ``joint``; ``of (r,)`` their
-    part, ``scale (r,)`` its weight, ``h (r,)`` their limits and ``rest (r,)`` the worst case of entries that no
-    variable enters, with ``at_rest (p, Q)`` these entries of it.
+    answering variables ``f``, whose numbers are ``answering``; ``single`` are those in which a variable stands alone,
+    and ``squares (n, J)`` what is in ``C`` there. Rows: coefficients ``g (r, z)`` of the joint variables, whose numbers
+    are ``joint``; ``of (r,)`` their part, ``scale (r,)`` its weight, ``h (r,)`` their limits and ``rest (r,)`` the
+    worst case of entries that no variable enters, with ``at_rest (p, Q)`` these entries of it.
     """
 
     def __init__(self, program: FiniteProgram, spread: Spread) -> None:
@@ -116,6 +116,7 @@ class Layout:
             self._partition(row, variable)
         self.C = csr_array((value, (row, self._place[variable])), shape=(self.count, self.answering.size))
         self._blocks()
+        self.single = np.flatnonzero(np.diff(self.C.indptr) == 1)
         alone = np.concatenate([block.single for block in self.blocks])
         at = self.C.indptr[alone]
         place = (self.C.data[at] ** 2, (self.C.indices[at], alone))
