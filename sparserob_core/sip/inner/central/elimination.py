@@ -80,23 +80,33 @@ class Left:
 @final
 @dataclass(eq=False)
 class Whole:
-    """A block by the Cholesky factor ``F`` of its matrix, and ``X = F^-1 B``."""
+    """A block by the Cholesky factor of its matrix. Its coupling is kept as it is, ``single`` of single absolute values
+    and ``rows`` of the others: solved for, it would be as tall as the block and as wide as all parts."""
 
+    block: Block
     factor: Array
-    X: Array
+    single: Array
+    rows: Array
+    parts: int
 
     def forward(self, r: Array) -> tuple[State, Array]:
         """A right-hand side among the pivots, and what it makes of the parts."""
-        from scipy.linalg import lapack
-
-        one, _ = lapack.dtrtrs(self.factor, r, lower=1)
-        return (one,), self.X.T @ one
+        block, u = self.block, self._solved(r)
+        parts = np.bincount(block.columns, self.single * u[block.of], self.parts)
+        parts += np.bincount(block.mixed, self.rows @ u, self.parts)
+        return (r,), parts
 
     def back(self, state: State, parts: Array) -> Array:
         """The variables."""
+        block = self.block
+        r = state[0] - np.bincount(block.of, self.single * parts[block.columns], state[0].size)
+        return self._solved(r - parts[block.mixed] @ self.rows)
+
+    def _solved(self, r: Array) -> Array:
         from scipy.linalg import lapack
 
-        u, _ = lapack.dtrtrs(self.factor, state[0] - self.X @ parts, lower=1, trans=1)
+        one, _ = lapack.dtrtrs(self.factor, r, lower=1)
+        u, _ = lapack.dtrtrs(self.factor, one, lower=1, trans=1)
         return np.asarray(u)
 
 
@@ -172,15 +182,16 @@ def _whole(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Wh
     M = scaled.T @ scaled
     M.reshape(-1)[:: n + 1] += D
     factor = cholesky(M)
+    single, rows = block.value * lean[block.single], A * lean[block.at][:, None]
     B = np.zeros((n, left.parts), order="F")
     if block.once:
-        B[:, block.mixed] = (A * lean[block.at][:, None]).T
+        B[:, block.mixed] = rows.T
     else:
-        np.add.at(B.T, block.mixed, A * lean[block.at][:, None])
-    np.add.at(B, (block.of, block.columns), block.value * lean[block.single])
+        np.add.at(B.T, block.mixed, rows)
+    np.add.at(B, (block.of, block.columns), single)
     X, _ = lapack.dtrtrs(factor, B, lower=1, overwrite_b=1)
     left.more(X)
-    return Whole(factor, X)
+    return Whole(block, factor, single, rows, left.parts)
 
 
 def _lean(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Lean | None:
