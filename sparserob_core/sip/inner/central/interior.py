@@ -41,6 +41,7 @@ ENDLESS = 1e9  # multipliers of rows that nothing meets
 TINY = 1e-300
 
 Direction = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
+Iterate = tuple[float, Array, Array, Array, Array, Array, Array, Array, Array]
 
 
 @final
@@ -57,6 +58,8 @@ class Interior:
     def __post_init__(self) -> None:
         self._layout = Layout(self.program, self.spread)
         self._begun, self._stale = False, True
+        self._margin, self._tightened = 0.0, 0.0  # of the last solve, and by how much more rows are tightened now
+        self._elsewhere: tuple[float, Iterate] | None = None  # where the last solve with another margin ended
 
     def add(self, block: UncertainRows) -> None:
         """Impose rows from now on."""
@@ -84,6 +87,8 @@ class Interior:
         """The optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost. It is not solved where
         ``seconds`` do not suffice, and says how far it has come."""
         until = time.monotonic() + seconds
+        if self._begun and margin != self._margin:
+            self._change(margin)
         if self._stale:
             self._extend(margin)
         first, left = self._limits.size, np.inf
@@ -106,7 +111,18 @@ class Interior:
                 self.steps += 1
         return self._answer(False, f"the interior point method took {STEPS} steps")
 
-    def _begin(self) -> None:
+    def _change(self, margin: float) -> None:
+        """Go on with another margin: where the last solve with it ended, for the way back from rows that were tightened
+        for one decision is as long as the way there, or else in the middle of rows that the difference violates."""
+        here = self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta
+        there, self._elsewhere = self._elsewhere, (self._margin, here)
+        if there is not None and there[0] == margin:
+            self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta = there[1]
+        else:
+            self._tightened = max(0.0, margin - self._margin)
+        self._margin, self._stale = margin, True
+
+    def _begin(self, margin: float) -> None:
         """Joint variables, absolute values of those that cost, and the rows that bound them."""
         from scipy.sparse import coo_array, csr_array
 
@@ -136,7 +152,7 @@ class Interior:
         self._s = np.maximum(self._limits - self._plain @ self._z, ROOM)
         self._y = self._mu / self._s
         self._plus = self._minus = self._alpha = self._beta = np.zeros(0)
-        self._begun = True
+        self._begun, self._margin, self._elsewhere = True, margin, None
 
     def _extend(self, margin: float) -> None:
         """Places, slacks and multipliers of what is new."""
@@ -144,7 +160,7 @@ class Interior:
 
         kept, L = self._layout.arrange(), self._layout
         if not (self._begun and kept):
-            self._begin()
+            self._begin(margin)
         first = self._limits.size
         self._g = csr_array(hstack([L.g, csr_array((L.g.shape[0], self._size - self._n))]))
         self._G = csr_array(vstack([self._plain, self._g]))
@@ -156,7 +172,7 @@ class Interior:
         worst = np.bincount(L.part, L.radius * np.abs(a), L.parts)
         free = self._h[first:] - self._g @ self._z - L.scale * worst[L.of]
         many = np.bincount(L.part, minlength=L.parts) + 2.0  # a slack is as large as that of each absolute value
-        violation = max(0.0, -float(free[had:].min(initial=0.0)))
+        violation = max(self._tightened, -float(free[had:].min(initial=0.0)))
         before = np.bincount(L.of[:had], L.scale[:had] * self._y[first:], L.parts)
         if had:
             aim = SLACK * violation * float(self._y[first:].max()) / float(many.max())
@@ -167,7 +183,7 @@ class Interior:
         else:
             violation = max(ROOM, AROUND * violation)
         self._appear(had, before, a, free, np.maximum(free, violation) / many[L.of])
-        self._stale = False
+        self._stale, self._tightened = False, 0.0
 
     def _appear(self, had: int, before: Array, a: Array, free: Array, room: Array) -> None:
         """Slacks and multipliers of new rows, and those of all absolute values; ``room (r,)``: what a row of this
@@ -178,7 +194,8 @@ class Interior:
         weight = (eta / np.maximum(before, TINY))[L.part[:old]]
         self._alpha, self._beta = weight * self._alpha, weight * self._beta
         near = np.where(self._alpha > self._beta, self._plus, self._minus)
-        grown = np.maximum(self._mu / np.maximum(self._alpha, self._beta) - near, 0.0)
+        price = np.maximum(self._alpha, self._beta)
+        grown = np.where(price > near, np.maximum(self._mu / price - near, 0.0), 0.0)
         self._plus, self._minus = self._plus + grown, self._minus + grown
         most = np.full(L.parts, np.inf)
         np.minimum.at(most, L.of, room / np.maximum(L.scale, TINY))

@@ -136,6 +136,46 @@ def test_a_solve_that_is_out_of_time_says_how_far_it_has_come() -> None:
     assert bound(central, broken_off.y, broken_off.deviations) <= least + 1e-7
 
 
+@pytest.mark.parametrize("fresh", [0, 1])
+def test_the_way_back_from_rows_that_were_tightened_is_not_walked(fresh: int) -> None:
+    """Rows that come in between are there on the way back too, and both optima are those of a program begun anew."""
+
+    def begun(count: int) -> Interior:
+        rng, central = np.random.default_rng(5), Interior(program(), spread())
+        for block in [answering(k, k) for k in range(EACH)] + [rows(rng, 2.0) for _ in range(6 + count)]:
+            central.add(block)
+        return central
+
+    central, anew = begun(0), begun(fresh)
+    assert central.solve(0.0, 1e-6).solved
+    if fresh:
+        central.add(anew.blocks[-1])
+    tightened, before = central.solve(0.05, 1e-6), central.steps
+    back = central.solve(0.0, 1e-6)
+    assert tightened.solved and back.solved
+    assert fresh or central.steps - before <= 1
+    for found, margin in ((tightened, 0.05), (back, 0.0)):
+        wanted = anew.solve(margin, 1e-9)
+        assert program().objective(found.x) == pytest.approx(program().objective(wanted.x), abs=2e-6)
+        assert max(float(block.excess(found.x, spread()).max()) for block in anew.blocks) <= 1e-6 - margin
+    assert bound(central, back.y, back.deviations) <= program().objective(anew.solve(0.0, 1e-9).x) + 1e-9
+
+
+def test_a_new_row_leaves_residuals_of_the_size_of_its_violation() -> None:
+    """Slacks that are large stay as they are: multipliers grow instead."""
+    rng, central = np.random.default_rng(5), Interior(program(), spread())
+    for block in [answering(k, k) for k in range(EACH)] + [rows(rng, 2.0) for _ in range(6)]:
+        central.add(block)
+    x = central.solve(0.0, 1e-9).x
+    fresh = rows(rng, 2.0)
+    violated = float(fresh.excess(x, spread()).max())
+    fresh = replace(fresh, h=fresh.h + violated - 1e-3)
+    assert fresh.excess(x, spread()).max() == pytest.approx(1e-3)
+    central.add(fresh)
+    central._extend(0.0)
+    assert central._residuals()[2] < 10 * 1e-3
+
+
 def test_rows_that_are_there_already_are_known_by_a_short_name() -> None:
     rng = np.random.default_rng(3)
     central = Interior(program(), spread())
