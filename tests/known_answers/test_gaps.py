@@ -130,6 +130,41 @@ def test_dust_in_coefficients_of_waves_is_put_to_exactly_zero(number):
     assert not result.decision.any()
 
 
+SQUARES = {"control": {"R": [[2.0]]}, "l1": 0.0}, {"state": {"Q": [[1.0, 0.0], [0.0, 0.5]]}, "l1": 0.0}
+
+
+@pytest.mark.parametrize("policy", [None, pytest.param("nominal", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cost", SQUARES, ids=["of the control", "of the state"])
+def test_squares_that_need_not_be_anything_cost_exactly_nothing(policy, cost, tmp_path):
+    """Solvers leave dust of a decision whose squares are to be 0, and no relative gap is closed at 1e-10."""
+    stated = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": SPRING.tolist(), "B": [[0.0], [1.0]], "E": [[0.0], [1.0]]},
+            "horizon": 2.0,
+            "initial_state": [0.1, 0.0] if "control" in cost else [0.0, 0.0],
+            "control": {"box": [1.0]},
+            "disturbance": {"box": [0.01]},
+            "terminal": [{"box": [1.0, 1.0]}],
+            "cost": cost,
+        },
+        "dictionaries": {
+            "control": {"name": "piecewise_constant", "pieces": 4},
+            "disturbance": {"name": "piecewise_constant", "pieces": 4},
+        },
+        **({"policy": {"name": "affine", "cost": policy}} if policy else {}),
+    }
+    result = sr.run(stated, out=tmp_path / "run", quiet=True, figures=False).result
+    assert (result.status, result.lower_bound, result.upper_bound, result.gap) == ("certified", 0.0, 0.0, 0.0)
+    assert [claim.verdict for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"] == []
+
+
+@pytest.mark.slow
+def test_squares_of_a_random_instance_that_solvers_leave_at_1e_90_are_exactly_zero():
+    result = sr.run(config(*instance(3400141)), {"solver.name": "clarabel"}, quiet=True, figures=False).result
+    assert (result.status, result.lower_bound, result.upper_bound, result.gap) == ("certified", 0.0, 0.0, 0.0)
+
+
 @pytest.mark.first(11)
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("tolerance", [1e-7, 1e-9])

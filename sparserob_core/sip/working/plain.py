@@ -10,16 +10,17 @@ from typing import TypeAlias, final
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import Tools
-from sparserob_core.sip.program import EQUALITY, SemiInfiniteProgram
+from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.counting import count, met, tidied
 from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above
-from sparserob_core.sip.working.working import Missed, Working
+from sparserob_core.sip.working.working import Missed, Working, fits
 
 # Rounds that a row may stay without a multiplier before it is dropped. With one, rows come and go; with ten times as
 # many, solving takes longer the more rounds there were.
@@ -189,11 +190,15 @@ class PlainRows(Working):
     def candidate(self, answer: Answer) -> Answer | None:
         return None
 
+    def bounded(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+        return ledger.relaxed.lower_bound(answer.rows, replace(answer.solution, x=x))
+
     def choose(
         self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
     ) -> tuple[Answer, Found, Violated]:
         """One of which fewer entries count, where solvers leave dust or any optimum will do: the answer without its
         dust, or a vertex of the relaxed program where no regulariser chooses another optimum."""
+        answer, found = self.rested(ledger, answer, found, number)
         answer, found, violated = self._sparser(ledger, answer, found, number)
         if not self.exact:
             self._plain(ledger)
@@ -212,7 +217,7 @@ class PlainRows(Working):
             candidates += [] if corner is None else [met(program, tidied(program, corner), held, held @ corner)]
         kept, violated, least = (answer, found), list[tuple[Array, np.ndarray, str]](), count(program, x)
         for other in candidates:
-            if other is x or count(program, other) >= least or not _fits(ledger, other):
+            if other is x or count(program, other) >= least or not fits(ledger, other):
                 continue
             looked = separate(program, other, ledger.tools, ALLOWED, number)
             beyond = [one for family, separation in looked if (one := above(family, separation))[1].size]
@@ -223,12 +228,6 @@ class PlainRows(Working):
             elif answer.epsilon == 0.0:
                 violated = beyond
         return *kept, violated
-
-
-def _fits(ledger: Ledger, x: Array) -> bool:
-    """Whether a decision closes the gap and keeps everything that is no family."""
-    base = ledger.program.finite
-    return not ledger.open(x) and base.missed(x) <= EQUALITY and base.residual(x) <= ALLOWED
 
 
 def _with_more(solution: FiniteSolution, rows: int) -> FiniteSolution:

@@ -359,11 +359,15 @@ class RobustRows(Working):
             ledger.relaxed.counted.calls = ledger.relaxed.solves
         ledger.relaxed.solved_by.update(self.calls - ledger.relaxed.solved_by)
 
+    def bounded(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+        return self.at_rest
+
     def choose(
         self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
     ) -> tuple[Answer, Found, Violated]:
         """The one that is best by the second objective of the program, `SemiInfiniteProgram.among`, among those that
         cost at most the lower bound and half of the tolerance more, once this one has been proven."""
+        answer, found = self.rested(ledger, answer, found, number)
         second, x = self.program.among, answer.solution.x
         violated = any(above(*one)[1].size for one in found)
         if second is None or second[0].n > MANY or violated or ledger.open(x):

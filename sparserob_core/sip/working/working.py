@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.evidence import Dual, Proof
+from sparserob_core.sip.program import EQUALITY, ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.result import SMALL_COST, Result
-from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated
+from sparserob_core.sip.separation.separation import separate
+from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above
 
 # The least margin but 0, and the largest, in units of the decision's bounds where those are below 1. A least one that
 # is a thousand times larger is more than a gap of 1e-10 pays for where rows are dear; one that is smaller is below
@@ -93,6 +94,10 @@ class Working(ABC):
         is left to try."""
 
     @abstractmethod
+    def bounded(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+        """What is proven with the multipliers of an answer, or none, where the cost is touched at ``x (n,)``."""
+
+    @abstractmethod
     def choose(
         self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
     ) -> tuple[Answer, Found, Violated]:
@@ -125,6 +130,22 @@ class Working(ABC):
     @abstractmethod
     def candidate(self, answer: Answer) -> Answer | None:
         """A decision that may be proven as it is while the bounds have not met, where one is known."""
+
+    def rested(self, ledger: Ledger, answer: Answer, found: Found, number: int) -> tuple[Answer, Found]:
+        """The answer with nothing left of what costs, where that closes the gap and violates nothing: of a cost whose
+        optimum is 0 solvers leave dust, and no relative gap is closed at dust."""
+        x, other = answer.solution.x, at_rest(self.program, answer.solution.x)
+        if answer.epsilon or not ledger.open(x) or not self.program.cost(other) < self.program.cost(x):
+            return answer, found
+        ledger.improve(self.bounded(ledger, answer, other))
+        if not fits(ledger, other):
+            return answer, found
+        looked = separate(self.program, other, ledger.tools, ALLOWED, number)
+        if any(above(*one)[1].size for one in looked):
+            return answer, found
+        cost = self.program.cost(other)
+        solution = replace(answer.solution, x=other, value=cost, gap=cost - answer.solution.lower_bound)
+        return replace(answer, solution=solution, value=cost), looked
 
     def thin(self) -> bool:
         """Nothing is feasible: the margin, not the program, may be at fault, as of a thin set or where there is no
@@ -170,6 +191,25 @@ class Working(ABC):
         self.floor = self.margin = floor
         self.allowed += 1
         return True
+
+
+def at_rest(program: SemiInfiniteProgram, x: Array) -> Array:
+    """The decision ``x (n,)`` with everything that costs at 0: all of it where images of it do, and else the entries
+    with a weight or a square, not those that only answer deviations."""
+    base = program.finite
+    if base.S is not None:
+        return np.zeros_like(x)
+    costs = base.weights > 0.0
+    if base.P is not None:
+        costs = costs | (base.P.diagonal() > 0.0)
+    rested: Array = np.where(costs, 0.0, x)
+    return rested if program.settle is None else program.settle(rested)
+
+
+def fits(ledger: Ledger, x: Array) -> bool:
+    """Whether a decision closes the gap and keeps everything that is no family."""
+    base = ledger.program.finite
+    return not ledger.open(x) and base.missed(x) <= EQUALITY and base.residual(x) <= ALLOWED
 
 
 def size_of(program: SemiInfiniteProgram, answer: Answer) -> float:

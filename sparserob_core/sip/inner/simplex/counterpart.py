@@ -262,7 +262,7 @@ class Counterpart:
                 if parts:
                     self._linear.limit(where, limits - margin)
         until = time.monotonic() + seconds
-        for _ in range(TOUCHED):
+        for rounds in reversed(range(TOUCHED)):
             solved, said, columns, rows = self._linear.solve(until - time.monotonic())
             self.answered[self._linear.by] += 1
             if not solved:
@@ -271,8 +271,8 @@ class Counterpart:
             if self._tangents is None:
                 break
             missed, decided, roots = self._tangents.below(columns)
-            if missed <= max(accuracy, FLAT * self.program.added(decided)):
-                break
+            if missed <= max(accuracy, FLAT * self.program.added(decided)) or not rounds:
+                break  # the last ones are not sharpened: their multipliers are those of the rows that were solved with
             self._tangents.sharpen(decided, roots)
         n, mu = self.program.n, rows[self._fixed]
         x = columns[:n] - columns[n : 2 * n]

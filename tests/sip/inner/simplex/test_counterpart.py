@@ -214,6 +214,22 @@ def test_costs_that_are_not_linear_are_met_by_their_tangents_and_proven(seed: in
     assert cost - 1e-8 <= base.objective(found.x) <= cost + 0.1
 
 
+def test_squares_that_are_to_be_0_are_answered_though_no_tangent_is_sharp_enough() -> None:
+    """No share of a cost that tends to 0 is ever met, so that the rounds end by their number."""
+    none = np.zeros((0, N))
+    base = FiniteProgram(
+        np.zeros(N), np.zeros(N), -np.ones(N), np.ones(N), none, np.zeros(0), none, np.zeros(0), csc_array(np.eye(N))
+    )
+    block = replace(rows(np.random.default_rng(0), "several"), h=np.full(3, 9.0))
+    counterpart = Counterpart(base, BOX)
+    counterpart.add(block)
+    answer = counterpart.solve()
+    assert answer.solved
+    assert base.objective(answer.x) <= 1e-10
+    proven, _ = robust_bound(base, [block], answer.y, answer.deviations, answer.mu, True, answer.at)
+    assert -1e-9 <= proven <= 0.0
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_ceiling_keeps_the_weighted_sum_of_absolute_values(seed: int) -> None:
     rng = np.random.default_rng(seed)
