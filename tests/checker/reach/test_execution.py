@@ -90,6 +90,25 @@ def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(execution: Ex
     assert 0.5 < max(ratios) <= 1.0
 
 
+@pytest.mark.parametrize("rate", [-6.0, 6.0])
+def test_a_chord_is_missed_by_no_more_wherever_it_begins_among_the_parts(rate: float) -> None:
+    """The weight falls, or grows, by a tenth from one part to the next, so that the bound of a neighbour is seen."""
+    from flint import arb, ctx
+
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[rate]], [[1.0]]), horizon=3.0, initial_state=[0.0], control=sr.Box([-1.0], [1.0])
+    )
+    with ctx.workprec(128):
+        one = Execution(problem, np.array([0.5]), np.array([0.0, 3.0]), [stacked([[arb(0.25)]])])
+        part, length = 3.0 / one.kernel.count, 3.0 / one.kernel.count / 64
+        for number in range(1, one.kernel.count - 1):
+            for begin in (number * part + 1e-9, (number + 1) * part - length - 1e-9):
+                heights = [(np.exp(rate * (begin + s * length)) - 1.0) / rate / 8.0 for s in (0.0, 0.5, 1.0)]
+                missed = abs(heights[1] - (heights[0] + heights[2]) / 2)
+                bound = one.bent(np.array([1.0]), begin, begin + length)
+                assert missed * (1.0 - 1e-6) - 1e-15 * max(heights) <= bound <= missed * np.exp(3.0 * 6.0 * part)
+
+
 def test_an_integral_allows_for_where_its_end_is_among_the_parts(execution: Execution) -> None:
     low, high = execution.integrals(C, np.array([0.41]))
     heights = np.array([abs(_height(0.41, j)) for j in range(2)])

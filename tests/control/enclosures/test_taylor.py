@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -54,6 +56,63 @@ def test_a_model_encloses_its_function(text: str, degree: int, seed: int) -> Non
     assert (np.abs(truth - model.evaluate(delta)) <= model.remainder + slack).all()
     low, high = model.bounds()
     assert low - slack <= truth.min() and truth.max() <= high + slack
+
+
+def height(model: TaylorModel, delta: list[Fraction]) -> Fraction:
+    """The polynomial of a model at a point, without rounding."""
+    total = Fraction(0)
+    for exponents, coefficient in zip(model.space.exponents.tolist(), model.coefficients.tolist(), strict=True):
+        term = Fraction(coefficient)
+        for one, power in zip(delta, exponents, strict=True):
+            term *= one**power
+        total += term
+    return total
+
+
+@pytest.mark.parametrize("radius", [2.0**-30, 2.0**-12])
+@pytest.mark.parametrize("text", EXPRESSIONS)
+def test_on_a_small_cell_the_remainder_holds_what_is_rounded(text: str, radius: float) -> None:
+    """In balls of 300 bits, against the polynomial in rational numbers: nothing is allowed for but the remainder, of
+    which rounding is the larger part on the smaller cell."""
+    flint = pytest.importorskip("flint")
+    space, expression = TaylorSpace(2, 5), parse_expression(text, ("p1", "p2"))
+    rng = np.random.default_rng(len(text))
+    for _ in range(4):
+        centre, radii = rng.uniform(1.0, 2.0, 2), np.array([radius, 0.75 * radius])
+        model = expression(dict(zip(("p1", "p2"), space.variables(centre, radii), strict=True)))
+        for signs in ([1, 1], [1, -1], [-1, 0]):
+            delta = [Fraction(sign) for sign in signs]
+            place = [
+                Fraction(c) + Fraction(r) * d for c, r, d in zip(centre.tolist(), radii.tolist(), delta, strict=True)
+            ]
+            with flint.ctx.workprec(300):
+                at = [np.array([flint.arb(flint.fmpq(q.numerator, q.denominator))], dtype=object) for q in place]
+                truth = expression({"p1": at[0], "p2": at[1]})[0]
+                said = height(model, delta)
+                off = abs(truth - flint.arb(flint.fmpq(said.numerator, said.denominator)))
+                assert off <= flint.arb(float(model.remainder))
+
+
+@pytest.mark.parametrize("left", ["constant", "line", "plane", "dense"])
+@pytest.mark.parametrize("right", ["constant", "line", "plane", "dense"])
+def test_of_a_product_the_remainder_holds_what_is_rounded(left: str, right: str) -> None:
+    """Of two that are nothing but constants the product is that of two numbers, which is what it says."""
+    space, rng = TaylorSpace(2, 6), np.random.default_rng(0)
+    filled = {"constant": 1, "line": 2, "plane": 3, "dense": 10}
+    places = np.arange(space.size)
+    for _ in range(10):
+        a, b = (
+            TaylorModel(space, np.where(places < filled[kind], rng.normal(size=space.size), 0.0), 0.0)
+            for kind in (left, right)
+        )
+        product = a * b
+        if left == right == "constant":
+            assert product.coefficients[0] == a.coefficients[0] * b.coefficients[0]
+            continue
+        for corner in ([1, 1], [1, -1], [-1, 1]):
+            delta = [Fraction(sign) for sign in corner]
+            off = abs(height(product, delta) - height(a, delta) * height(b, delta))
+            assert off <= Fraction(product.remainder)
 
 
 def test_the_remainder_shrinks_with_the_degree_and_with_the_cell() -> None:

@@ -3,6 +3,7 @@ forms of the worst case, close to them on short cells, and where series are cut 
 
 from __future__ import annotations
 
+from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
@@ -17,6 +18,7 @@ from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.tube import VaryingTube
+from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -107,6 +109,22 @@ def test_what_a_series_leaves_out_is_in_the_error(name: str, monkeypatch: pytest
                 assert (truth <= above(poly, shares) + 1e-14).all()
                 off = max(off, float((truth - above(poly, shares) + poly.error).max()))
     assert off > 1e-8, "nothing was left out"
+
+
+def test_a_product_holds_that_of_every_two_matrices_within_both_and_no_more() -> None:
+    rng = np.random.default_rng(4)
+    (a, da), (b, db) = ((rng.uniform(0.5, 1.0, size), rng.uniform(0.0, 0.3, size)) for size in ((2, 3, 4), (4, 5)))
+    for signs in (np.ones(4), np.array([1.0, -1.0, 1.0, -1.0])):
+        found = varying_tube._product(Enclosed(a, da), Enclosed(signs[:, None] * b, db))
+        far = (a + da) @ (b + db) if signs.min() > 0.0 else (a + signs * da) @ (signs[:, None] * b + db)
+        assert ((far - found.mid) <= found.rad).all()
+        if signs.min() > 0.0:
+            assert (found.rad <= (1.0 + 1e-9) * (far - found.mid)).all()
+    rounded = varying_tube._product(Enclosed(a, 0.0 * a), Enclosed(b, 0.0 * b))
+    for place in np.ndindex(rounded.mid.shape):
+        pairs = zip(a[place[:-1]].tolist(), b[:, place[-1]].tolist(), strict=True)
+        exact = sum((Fraction(x) * Fraction(y) for x, y in pairs), Fraction(0))
+        assert abs(exact - Fraction(float(rounded.mid[place]))) <= Fraction(float(rounded.rad[place]))
 
 
 def test_entries_that_are_ever_other_than_0_are_links() -> None:
