@@ -2,7 +2,7 @@
 share no code with the package (tests/support/policies.py); and `check` of every run.
 
 There are 61, of which the second stage takes a share (tests/support/draws.py); ``SPARSEROB_FIRST_POLICY`` is the number
-of the first. 39, 57 and 58 ended in a traceback once, 60 in a bound that its multipliers did not prove, the `check` of
+of the first. Beside them are 24 with all features together (``SPARSEROB_FIRST_RICH_POLICY``). 39, 57 and 58 ended in a traceback once, 60 in a bound that its multipliers did not prove, the `check` of
 5, 7, 10, 43, 45 and 55 in no answer, and that of 960 refused an honest bound: units far from 1.
 """
 
@@ -16,10 +16,12 @@ import pytest
 
 import sparserob_core as sr
 from tests.support.draws import taken
+from tests.support.instances import TOGETHER
 from tests.support.policies import answered, truth_answered
 
 QUICK = 1
 COUNT, FIRST = taken(61), int(os.environ.get("SPARSEROB_FIRST_POLICY", "0"))
+RICH = int(os.environ.get("SPARSEROB_FIRST_RICH_POLICY", str(4 * TOGETHER)))
 FAULTS = (5, 7, 10, 39, 43, 45, 55, 57, 58, 60, 960)  # taken whatever the share is
 
 
@@ -27,7 +29,7 @@ FAULTS = (5, 7, 10, 39, 43, 45, 55, 57, 58, 60, 960)  # taken whatever the share
     "number",
     [
         pytest.param(n, marks=pytest.mark.slow if n >= FIRST + QUICK else ())
-        for n in dict.fromkeys((*range(FIRST, FIRST + COUNT), *FAULTS))
+        for n in dict.fromkeys((*range(FIRST, FIRST + COUNT), *FAULTS, *range(RICH, RICH + taken(24))))
     ],
 )
 def test_what_is_said_of_a_random_policy_in_any_units_is_true(number: int, tmp_path: Path) -> None:

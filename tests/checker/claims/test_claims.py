@@ -10,7 +10,7 @@ import pytest
 from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.claims import activity, claims, constraints
+from sparserob_core.checker.claims import activity, claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -190,6 +190,13 @@ def test_a_final_state_is_met_to_rounding():
         )
         with pytest.raises(Unchecked, match="may reach x1"):
             constraints.equalities(case_of(terminal=[Equality([0.5])], **begun, **E))
+
+
+def test_what_fixed_states_miss_is_told_with_the_rounding_of_the_largest(monkeypatch):
+    case = case_of(terminal=[Equality([0.5])])
+    said = {"constraint": replay.EQUALS, "time": 2.0, "violation": 3.0}
+    monkeypatch.setattr(replay, "missed", lambda case: [(arb(3), 2.0), (arb(-1), 64.0), (arb(2), 0.5)])
+    assert replay.exceeded(case, said) == ([3.0, -1.0, 2.0], 64.0 * replay.TOLERANCE)
 
 
 def tree(*nodes, constraints=()):

@@ -15,8 +15,9 @@ from scipy.integrate import quad
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.response import measurable
+from sparserob_core.control.response.response import Response, merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, uniform, worst_case
@@ -172,6 +173,27 @@ def test_bounds_of_the_support_of_a_flat_set_hold_it_and_are_close(name, short):
             assert functionals.offsets(np.array([time]), direction[None], np.zeros((1, 0)))[0] == (low + high) / 2
         elif speed > 3.0:
             assert high - low > 1e-9 * abs(truth)
+
+
+@pytest.mark.parametrize("name", FLAT)
+@pytest.mark.parametrize("short", [0.5, 4.0])
+def test_bounds_over_turns_hold_what_both_systems_add_and_are_close(name, short):
+    """Of the first one all of its turn is integrated for rows that are others at every time."""
+    rng = np.random.default_rng(1)
+    first, second, direction = (*(random_system(rng, speed=6.0) for _ in range(2)), rng.normal(size=2))
+    turn, grid = 0.9, merge_grids(uniform(4, HORIZON).breakpoints, np.array([0.0, HORIZON]), switches=[0.9])
+    response = Response(SwitchedSystem([(turn, first), (HORIZON, second)]), grid, np.zeros(2))
+    support, A = measurable.MeasurableSupport(response, BOUNDS[name]), second.matrices(np.zeros((1, 0)))[0][0]
+    for time in (0.4, HORIZON):
+        with patch.object(measurable, "SHORT", short):
+            ((low, high),) = support.enclosed(np.array([time]), direction[None])
+        early, late = min(time, turn), max(time - turn, 0.0)
+        truth = across_kinks(first, BOUNDS[name], direction @ expm(A * late), early)
+        truth += across_kinks(second, BOUNDS[name], direction, late) if late else 0.0
+        assert low <= truth + 1e-13 * abs(truth)
+        assert truth <= high + 1e-13 * abs(truth)
+        if short < 1.0:
+            assert high - low <= 1e-10 * abs(truth)
 
 
 def test_bounds_across_a_root_are_those_of_the_modulus_of_a_sine():
