@@ -2,8 +2,9 @@
 share no code with the package (tests/support/policies.py); and `check` of every run.
 
 There are 61, of which the second stage takes a share (tests/support/draws.py); ``SPARSEROB_FIRST_POLICY`` is the number
-of the first. Beside them are 24 with all features together (``SPARSEROB_FIRST_RICH_POLICY``). 39, 57 and 58 ended in a traceback once, 60 in a bound that its multipliers did not prove, the `check` of
-5, 7, 10, 43, 45 and 55 in no answer, and that of 960 refused an honest bound: units far from 1.
+of the first. 39, 57 and 58 ended in a traceback once, 60 in a bound that its multipliers did not prove, the `check` of
+5, 7, 10, 43, 45 and 55 in no answer, and that of 960 refused an honest bound: units far from 1. Beside them are 24 with
+all features together, from ``SPARSEROB_FIRST_RICH_POLICY`` on.
 """
 
 from __future__ import annotations
