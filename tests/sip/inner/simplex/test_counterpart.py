@@ -14,6 +14,7 @@ from scipy.sparse import csc_array, csr_array
 from sparserob_core.control.sets.sets import NormBall
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.inner.simplex import counterpart as simplex
 from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
 
 N, Q = 4, 3
@@ -212,6 +213,17 @@ def test_costs_that_are_not_linear_are_met_by_their_tangents_and_proven(seed: in
     coarse.add(blocks[0])
     found = coarse.solve(accuracy=0.1)
     assert cost - 1e-8 <= base.objective(found.x) <= cost + 0.1
+
+
+@pytest.mark.parametrize("name", SPREADS)
+def test_a_basis_from_which_there_is_no_end_is_forgotten(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    base, blocks = program(rng), [rows(rng, "several")]
+    steps = solved(Counterpart(base, SPREADS[name]), blocks)
+    monkeypatch.setattr(simplex, "STALLED", 0)
+    begun_anew = solved(Counterpart(base, SPREADS[name]), blocks)
+    assert begun_anew.solved
+    assert base.objective(begun_anew.x) == pytest.approx(base.objective(steps.x), abs=1e-9)
 
 
 def test_squares_that_are_to_be_0_are_answered_though_no_tangent_is_sharp_enough() -> None:
