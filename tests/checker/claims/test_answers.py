@@ -145,6 +145,9 @@ def test_the_costs_of_a_policy_are_by_hand():
     assert float(answers_of(case_of(cost="nominal")).cost().mid()) == pytest.approx(0.5)
     assert float(answers_of(case_of(cost="peak")).cost().mid()) == pytest.approx(0.3 + 0.325)
     assert float(answers_of(case_of(cost="peak", weights=[2.0])).cost().mid()) == pytest.approx(2 * 0.625)
+    peaks = case_of(cost="peak")
+    ends = replace(peaks.problem, cost=sr.Cost(final={"Q": [[2.0]]}))  # at 0.6, nominally
+    assert float(answers_of(replace(peaks, problem=ends)).cost().mid()) == pytest.approx(0.625 + 2 * 0.36)
     assert float(answers_of(case_of(cost="worst", certificate={"cost": 0.625 + 1e-10})).cost().mid()) == pytest.approx(
         0.625
     )

@@ -14,8 +14,10 @@ from flint import ctx
 import sparserob_core as sr
 from sparserob_core.checker.claims import causal as causal_bounds
 from sparserob_core.checker.claims import claims, multipliers, replay
+from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import number
 from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.sets.sets import Box, NormBall
 from tests.checker.claims.test_windows import case_of, causal
 
@@ -49,6 +51,20 @@ def moved(case: Any, **change: Any) -> Any:
 
 REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "fewer functions": (lambda: moved(case_of(), disturbance=FEWER).changes, Unchecked, "fewer functions than pieces"),
+    "outputs of what is pushed at any time": (
+        lambda: (
+            answers_of(
+                case_of(
+                    policy=AffinePolicy(),
+                    disturbance_class="measurable",
+                    measurements=sr.Measurements([[1.0]]),
+                    certificate={"gains": np.zeros((2, 2, 1, 1)).tolist()},
+                )
+            ).loop
+        ),
+        Unchecked,
+        "outputs beside disturbances that are constant on pieces only",
+    ),
     "no flow in time": (lambda: case_of().varying, Unchecked, "does not change with time"),
     "a decision of another shape": (lambda: case_of(decision=((0.5,),)).theta, Broken, r"shape \(1, 1\), expected \(1"),
     "numbers for one": (lambda: number({"time": [1.0, 2.0]}, "time"), Broken, "time: expected a number"),

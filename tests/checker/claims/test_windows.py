@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 from types import SimpleNamespace
 from typing import Any
 
@@ -69,6 +70,23 @@ def case_of(wall=None, decision=((0.5, -0.5),), certificate=None, policy=None, *
         **(certificate or {}),
     }
     return Case(problem, grid, grid, said, policy=policy)
+
+
+def test_measurable_disturbances_in_time_stray_from_their_middle_by_half_their_widths():
+    """A side that is a point strays by nothing; of 0.1 and 0.3 neither the middle nor the half is a number."""
+    plant = sr.VaryingSystem.of([["-t"]], [[1]], 2.0, [[1, "t"]])
+    bound = Box([-0.1, 0.05], [0.3, 0.05])
+    case = case_of(system=plant, disturbance=bound, disturbance_class="measurable")
+    held, strayed = case.held, case.strayed
+    assert isinstance(held, Box)
+    np.testing.assert_array_equal(held.lower, held.upper)
+    np.testing.assert_allclose(held.lower, [0.1, 0.05], rtol=1e-15)
+    assert strayed.shares[1] == 0.0
+    assert strayed.off[1] < 1e-300
+    assert 0.0 < strayed.off[0] < 1e-15
+    for end in (bound.upper[0], bound.lower[0]):
+        far = abs(Fraction(float(end)) - Fraction(float(held.lower[0])))
+        assert abs(far - Fraction(float(strayed.shares[0]))) <= Fraction(float(strayed.off[0]))
 
 
 @pytest.fixture(autouse=True)

@@ -111,6 +111,18 @@ def test_a_system_that_is_too_fast_is_not_followed() -> None:
         Motion.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), 1.0, Clock())
 
 
+def test_what_is_left_of_an_expansion_is_in_what_inputs_add() -> None:
+    """In own units: the largest entry of every column, times what is left of the row."""
+    known = adjoint()
+    sizes = (np.abs(np.array(F)) / known.motion.units[:, None]).max(axis=0)
+    assert (sizes <= known.pushes).all() and (known.pushes <= sizes * (1 + 1e-9)).all()
+    wide = replace(known)
+    wide.__dict__["left"] = known.left + 1.0
+    grown = wide.driven.rad - known.driven.rad
+    assert (np.abs(grown[:, 0] - known.pushes) <= 1e-9 * known.pushes).all()
+    assert not grown[:, 1:].any()
+
+
 def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
     """Rows and integrals that are moved by as much as they may be off, to the corners that matter."""
     plain, off = worst("constant"), 1e-3

@@ -17,7 +17,9 @@ import sparserob_core.checker.reach.varying.flow as varying
 from sparserob_core.checker.arithmetic.jets import kepler_root, kepler_series
 from sparserob_core.checker.arithmetic.timed import Timed
 from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.control.problem.system import VaryingSystem
 from tests.support.integration import mathieu
 
@@ -79,6 +81,44 @@ def test_what_a_series_leaves_out_widens_every_entry_in_its_units() -> None:
         expected = [1.0, *[2.0 * u] * (len(table[0]) - 1)]
         for ball, size in zip(found.entries(), expected, strict=True):
             assert size <= float(ball.rad()) <= size * 1.001
+
+
+def test_what_is_left_of_an_expansion_is_in_every_entry_of_what_an_interval_makes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With rests that are told, one for each entry; what is beyond an order joins them."""
+    with ctx.workprec(BITS):
+        flow = VaryingFlow(FADING, 3.0)
+        stop = 0.5 * flow.segments[0].stop
+        terms, rest = flow._series(flow.segments[0], 0.0, stop)
+        sizes = [1.0 + i for i in range(rest.ncols())]
+        told = stacked([[arb(0, size) for size in sizes]])
+        monkeypatch.setattr(VaryingFlow, "_series", lambda *_: (terms, told))
+        Phi, both = flow._within(flow.segments[0], 0.0, stop)
+        wide = [float(x.rad()) for x in [*Phi.entries(), *both.entries()]]
+        assert all(size <= found <= size * 1.001 for size, found in zip(sizes, wide, strict=True))
+        kept, left = flow.within(0.0, stop, 1)
+        assert len(kept) == 2
+        beyond = [sum(abs(float(term[0, i].mid())) for term in terms[2:]) for i in range(rest.ncols())]
+        for size, more, found in zip(sizes, beyond, left.entries(), strict=True):
+            assert (size + more) * (1 - 1e-9) <= float(found.rad()) <= (size + more) * 1.001
+
+
+def test_a_chord_of_a_loop_is_missed_by_its_powers_and_twice_what_is_left_of_them() -> None:
+    """``2 s^2`` and ``3 s^3`` of a nominal state of 1, a rest of 0.5, and half of all of it for a deviation of 4."""
+    told = SimpleNamespace(
+        _flow=SimpleNamespace(within=lambda *_: ([stacked([[arb(x), arb(0)]]) for x in (1, 5, 2, 3)], told_rest)),
+        state=lambda *_: stacked([[arb(1), arb(0.5)]]),
+        drives=[stacked([[arb(7), arb(7)]])],
+        radii=np.array([4.0]),
+    )
+    told_rest = stacked([[arb(0, 0.5), arb(0)]])
+    with ctx.workprec(BITS):
+        bound = VaryingLoop.bent(told, 0, 0.0, 1.0, np.array([[1.0]]))
+    share = np.linspace(0.0, 1.0, 10001)
+    chords = [float((share - share**n).max()) for n in (2, 3)]
+    expected = (2 * chords[0] + 3 * chords[1] + 2 * 0.5) * (1.0 + 0.5 * 4.0)
+    assert expected * (1 - 1e-7) <= bound[0] <= expected * (1 + 1e-6)
 
 
 def test_nothing_is_said_beyond_what_was_expanded() -> None:
