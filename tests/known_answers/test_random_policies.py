@@ -17,12 +17,11 @@ import pytest
 
 import sparserob_core as sr
 from tests.support.draws import taken
-from tests.support.instances import TOGETHER
-from tests.support.policies import answered, truth_answered
+from tests.support.policies import ROUND, answered, truth_answered
 
 QUICK = 1
 COUNT, FIRST = taken(61), int(os.environ.get("SPARSEROB_FIRST_POLICY", "0"))
-RICH = int(os.environ.get("SPARSEROB_FIRST_RICH_POLICY", str(4 * TOGETHER)))
+RICH = int(os.environ.get("SPARSEROB_FIRST_RICH_POLICY", str(ROUND)))
 FAULTS = (5, 7, 10, 39, 43, 45, 55, 57, 58, 60, 960)  # taken whatever the share is
 
 

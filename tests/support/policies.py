@@ -20,6 +20,7 @@ from scipy.sparse import coo_array, csc_matrix, csr_array
 
 from tests.support.instances import (
     TOGETHER,
+    Curved,
     Flat,
     Instance,
     Sampled,
@@ -35,6 +36,7 @@ from tests.support.instances import (
     sample,
 )
 
+ROUND = 5 * TOGETHER  # numbers of policies among whose sets of deviations there are ellipsoids
 LARGER = 2.0  # times the disturbance that open loops are tested with
 PER_PIECE = 8
 AT_ONCE = 80  # rows that are imposed where they are violated
@@ -122,6 +124,7 @@ def together(number: int) -> Answered:
     if has[2]:
         timed = in_time(rng, problem)  # an initial control other than 0 is no step from 0
         problem = timed if problem.step is None else replace(timed, late=0, before=None)
+    problem = rounder(number, problem)
     units, cost = drawn_units(rng, problem), str(rng.choice(["nominal", "peak"]))
     if has[3]:
         problem = replace(problem, charge=charge(rng, d, m))
@@ -137,6 +140,22 @@ def together(number: int) -> Answered:
     elif has[5] and equal and problem.dictionary == "piecewise_constant":
         lag = int(rng.integers(1, 4))
     return Answered(problem, units, cost, lag, outputs, scale)
+
+
+def rounder(number: int, problem: Instance) -> Instance:
+    """From `ROUND` on with ellipsoids for the boxes of the disturbance and the initial states, each or not."""
+    rng = np.random.default_rng([number, 41])  # the numbers of what was drawn before stay as they are
+
+    def turned(shape: Shape, size: int) -> Shape:
+        axes = shape.support(np.eye(size))[:, None] * np.linalg.qr(rng.normal(size=(size, size)))[0]
+        return Curved(size, 2.0, axes=axes)
+
+    has, (d, q) = (rng.random(2) < 0.4) & (number >= ROUND), problem.E.shape
+    if has[0] and q > 1 and problem.disturbance is not None:
+        problem = replace(problem, disturbance=turned(problem.disturbance, q))
+    if has[1] and d > 1 and problem.initial_set is not None:
+        problem = replace(problem, initial_set=turned(problem.initial_set, d))
+    return problem
 
 
 @dataclass(frozen=True)
@@ -319,6 +338,13 @@ class _Policy:
         noisy = np.tile(seen.noise, K)
         self.radii = np.concatenate([np.repeat(problem.disturbance.support(np.eye(q)), K), begun, noisy])
         self.still = np.zeros(self.radii.size)
+        self.blocks = [(np.array([z]), np.eye(1) * self.radii[z]) for z in np.flatnonzero(self.radii)]
+        places = [*(np.arange(piece, q * K, K) for piece in range(K)), q * K + np.arange(d)]
+        for block, shape in zip(places, [*[problem.disturbance] * K, problem.initial_set], strict=True):
+            if isinstance(shape, Curved):
+                assert shape.axes is not None
+                self.blocks = [one for one in self.blocks if one[0][0] not in block]
+                self.blocks.append((block, shape.radius * shape.axes))
         self.v = self.program.variables(m * K)
         for i, side in zip(self.v, problem.sides.T, strict=True):
             self.program.bounds[i] = (-side[1], side[0])
@@ -358,20 +384,26 @@ class _Policy:
 
     def impose(self, row: _Row) -> None:
         where = np.flatnonzero(row.on_v)
-        tops, widths = list[int](), list[float]()
-        for z in np.flatnonzero(self.radii):
-            answer = row.on_v @ self.answers[z]
-            used = np.flatnonzero(answer)
-            if used.size or row.own[z]:
-                (top,) = self.program.variables(1, low=0.0)
-                for sign in (1.0, -1.0):
-                    places = np.append(self.gains[used], top)
-                    self.program.row(places, np.append(sign * answer[used], -1.0), float(-sign * row.own[z]))
-                tops.append(int(top))
-                widths.append(float(self.radii[z]))
+        tops = list[int]()
+        for block, axes in self.blocks:
+            answers = axes.T @ np.stack([row.on_v @ self.answers[z] for z in block])
+            own = axes.T @ row.own[block]
+            if not (answers.any() or own.any()):
+                continue
+            (top,) = self.program.variables(1, low=0.0)
+            tops.append(int(top))
+            sizes = [int(top)] if len(block) == 1 else self.program.variables(len(block)).tolist()
+            for answer, alone, size in zip(answers, own, sizes, strict=True):
+                used = np.flatnonzero(answer)
+                for sign in (1.0, -1.0):  # above both, or equal to the one
+                    other = -1.0 if len(block) == 1 else -sign
+                    places = np.append(self.gains[used], size)
+                    self.program.row(places, np.append(sign * answer[used], other), float(-sign * alone))
+            if len(block) > 1:
+                self.program.norms.append((np.array(sizes), int(top)))
         more = [] if row.top is None else [row.top]
         at = np.concatenate([self.v[where], np.array([*tops, *more], dtype=int)])
-        self.program.row(at, np.concatenate([row.on_v[where], widths, [-1.0] * len(more)]), row.limit)
+        self.program.row(at, np.concatenate([row.on_v[where], np.ones(len(tops)), [-1.0] * len(more)]), row.limit)
 
     def charged(self, cost: str) -> list[_Row]:
         """Prices and squares of the nominal control, or of the largest that deviations make of it."""
@@ -408,7 +440,9 @@ class _Policy:
             v, gains = x[self.v], x[self.gains]
             U = np.stack([answer @ gains for answer in self.answers])  # (deviations, m K)
             on_v, own = np.stack([row.on_v for row in sought]), np.stack([row.own for row in sought])
-            over = on_v @ v + np.abs(own + on_v @ U.T) @ self.radii - np.array([row.limit for row in sought])
+            over = on_v @ v - np.array([row.limit for row in sought])
+            for block, axes in self.blocks:
+                over += np.linalg.norm((own + on_v @ U.T)[:, block] @ axes, axis=1)
             worst = np.argsort(-over)[:AT_ONCE]
             worst = worst[over[worst] > MET]
             if not worst.size:

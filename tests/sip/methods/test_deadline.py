@@ -345,7 +345,7 @@ def test_the_search_over_tuples_keeps_its_best_tuple_at_the_limit(tmp_path):
     assert time.monotonic() - started < 20.0
     result = outcome.result
     assert result.status in KNOWN
-    assert result.message.endswith("the limit of 2 s is reached")
+    assert "the limit of 2 s is reached" in result.message  # of what is refuted it is told that more would help
     assert result.decision is not None
     assert np.isfinite(result.lower_bound)
     assert result.trace is not None
