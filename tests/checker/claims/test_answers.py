@@ -78,6 +78,21 @@ def precision():
         yield
 
 
+def test_a_peak_is_charged_to_its_own_channel_and_piece():
+    plant = LinearSystem(np.zeros((1, 1)), np.ones((1, 2)), E=np.ones((1, 1)))
+    said = {"decision": [[0.3, -0.2], [0.1, 0.0]]}
+    two = case_of(
+        Box([-1.0, -1.0], [1.0, 1.0]), gains=np.zeros((2, 2, 2, 1)), cost="peak", certificate=said, system=plant
+    )
+    for channel, piece in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        for sign in (1.0, -1.0):
+            row = bounds._of_control(two, "peak", sign * np.eye(2)[channel], float(piece), None)
+            assert row.charged == (piece, channel)
+    for other in ([1.0, 1.0], [0.5, 0.0]):
+        with pytest.raises(Broken, match="not that of a peak"):
+            bounds._of_control(two, "peak", np.array(other), 0.0, None)
+
+
 def test_a_control_is_as_large_as_its_answers_make_it():
     assert "2 pieces" in claims._control(case_of(0.325 / (1 + NOTHING)))
     for size in (0.325 / (1 + TOO_MUCH), 0.31):
