@@ -128,9 +128,9 @@ def told_apart(one: float, two: float) -> tuple[str, str]:
 class ConstraintFamily:
     """``rows(xi) x <= rhs(xi)`` for every index ``xi`` in a compact box.
 
-    ``rows`` maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``. A violation of at most `TOLERANCE` counts as none, in
-    the numbers of the rows as they are stated: rows of 1e-10 are to be divided by that. The rest is optional, and used
-    when offered:
+    ``rows`` maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``. A violation of at most `TOLERANCE` counts as none,
+    in the numbers of the rows as they are stated: rows of 1e-10 are to be divided by that. The rest is optional, and
+    used when offered:
 
     ``chosen(indices (k, d), rows (k,))``  one row of each index, ``(G (k, n), h (k,))``, where all would take longer;
     ``worst(x)``      exact separation (a `Separation`);
