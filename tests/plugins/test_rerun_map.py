@@ -255,6 +255,19 @@ def test_in_a_narrow_panel_of_the_climb_what_is_proven_far_below_is_said_below_i
     assert np.unique(np.diff([y for y, *_ in below])).tolist() == [0.0, climb.LINE]  # three lines, none on another
 
 
+def test_beside_the_climb_there_are_two_numbers_at_least_that_lie_on_no_other() -> None:
+    from sparserob_rerun.drawing.canvas import Axes
+    from sparserob_rerun.search import climb
+
+    for low in np.linspace(-1.0, 1.0, 101):
+        for span in (0.0013, 0.0226, 0.225, 0.41, 7.7):
+            axes = Axes(0.0, 0.0, 500.0, climb.HEIGHT, (0.0, 1.0), (low, low + span))
+            drawing = climb.Drawing()
+            climb._frame(drawing, axes, SimpleNamespace(epsilon=0.1), low)  # type: ignore[arg-type]
+            heights = sorted(at[1] for at, *_ in drawing.labels if at[0] < 0.0)
+            assert len(heights) >= 2 and min(np.diff(heights)) >= climb.LINE - 1e-9
+
+
 def test_a_panel_of_the_climb_has_all_of_a_climb_and_no_number_on_that_of_its_neighbour(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -93,17 +93,29 @@ def _frame(drawing: Drawing, axes: Axes, stage: Stage, best: float) -> None:
     """The box of a panel, with the weight and the best value above it and few ticks: it may be narrow."""
     left, top, right, bottom = axes.left, axes.top, axes.left + axes.width, axes.top + axes.height
     drawing.line("frame", np.array([[left, top], [left, bottom], [right, bottom]]), ink.GREY, 1.0)
-    for value in ticks(*axes.y, 4):
+    numbered = _numbered(axes, 4)
+    for value in numbered if len(numbered) > 1 else _numbered(axes, 2 * 4):  # one number is no scale
         y = float(axes.at(axes.x[0], value)[0, 1])
         drawing.line("frame", np.array([[left - 5, y], [left, y]]), ink.GREY, 1.0)
-        if y < bottom - ROOM:  # the last number of the panel on the left is below it
-            drawing.text(left - 48.0, y, f"{value:.7g}", ink.GREY)
+        drawing.text(left - 48.0, y, f"{value:.7g}", ink.GREY)
     for value, x in ((axes.x[0], left + 8.0), (axes.x[1], right - 8.0)):
         drawing.text(x, bottom + 26.0, f"{value:.0f}", ink.GREY)
     middle = (left + right) / 2
     if np.isfinite(stage.epsilon) and stage.epsilon > 0.0:
         drawing.text(middle, top - 36.0 - LINE, f"epsilon {stage.epsilon:.3g}")
     drawing.text(middle, top - 36.0, f"best {best:.6g}", ink.ORANGE)
+
+
+def _numbered(axes: Axes, most: int) -> list[float]:
+    """Round numbers upwards that are written beside the axis: from the highest on those with a line of words between
+    them, above the last number of the panel on the left."""
+    found, below = list[float](), -np.inf
+    for value in ticks(*axes.y, most)[::-1]:
+        y = float(axes.at(axes.x[0], value)[0, 1])
+        if below + LINE <= y < axes.top + axes.height - ROOM:
+            found.append(float(value))
+            below = y
+    return found
 
 
 def _corners(values: Floats) -> np.ndarray:
