@@ -119,6 +119,10 @@ class Rounds:
 
         # Exchange: impose them, drop what has been idle; tighten what is violated though imposed.
         exchanged = not last and (working.exchange(answer, violated, number) or imposed or working.tighten(found))
+        # Rest: what costs is put to 0 where that meets the lower bound and violates nothing.
+        if not exchanged:
+            answer, found = working.rested(ledger, answer, found, number)
+            x = answer.solution.x
         # Sharpen: nothing is violated but the bounds have not met, so solve what is imposed more closely.
         if exchanged or (not last and ledger.open(x) and working.sharpen(ledger, answer)):
             return None

@@ -198,7 +198,6 @@ class PlainRows(Working):
     ) -> tuple[Answer, Found, Violated]:
         """One of which fewer entries count, where solvers leave dust or any optimum will do: the answer without its
         dust, or a vertex of the relaxed program where no regulariser chooses another optimum."""
-        answer, found = self.rested(ledger, answer, found, number)
         answer, found, violated = self._sparser(ledger, answer, found, number)
         if not self.exact:
             self._plain(ledger)

@@ -367,7 +367,6 @@ class RobustRows(Working):
     ) -> tuple[Answer, Found, Violated]:
         """The one that is best by the second objective of the program, `SemiInfiniteProgram.among`, among those that
         cost at most the lower bound and half of the tolerance more, once this one has been proven."""
-        answer, found = self.rested(ledger, answer, found, number)
         second, x = self.program.among, answer.solution.x
         violated = any(above(*one)[1].size for one in found)
         if second is None or second[0].n > MANY or violated or ledger.open(x):

@@ -135,15 +135,16 @@ class Working(ABC):
         """The answer with nothing left of what costs, where that closes the gap and violates nothing: of a cost whose
         optimum is 0 solvers leave dust, and no relative gap is closed at dust."""
         x, other = answer.solution.x, at_rest(self.program, answer.solution.x)
-        if answer.epsilon or not ledger.open(x) or not self.program.cost(other) < self.program.cost(x):
-            return answer, found
+        cost = self.program.cost(other)
+        if answer.epsilon or not ledger.open(x) or not ledger.lower <= cost < self.program.cost(x):
+            return answer, found  # what costs less than the lower bound is proven not to be feasible
         ledger.improve(self.bounded(ledger, answer, other))
         if not fits(ledger, other):
             return answer, found
-        looked = separate(self.program, other, ledger.tools, ALLOWED, number)
+        every = separate(self.program, other, ledger.tools, ALLOWED, number)
+        looked = [one for one in every if not one[0].defines]
         if any(above(*one)[1].size for one in looked):
             return answer, found
-        cost = self.program.cost(other)
         solution = replace(answer.solution, x=other, value=cost, gap=cost - answer.solution.lower_bound)
         return replace(answer, solution=solution, value=cost), looked
 
