@@ -78,7 +78,7 @@ def prove(
             _examine(Place(tubes(box), parameters, box, clock, beside), sides, todo, left, found)
             todo, left.halves = left.halves, []
         if left.turned:
-            stack += [(box, half, left.turned) for half in reversed(sides.halves())]
+            stack += [(box, half, left.turned) for half in reversed(sides.halves(left.slopes))]
         if left.wide:
             stack += [(half, sides, left.wide) for half in reversed(_split(box, left.influence))]
     return Proven(found.bound, found.share, cells, items)
@@ -119,9 +119,10 @@ class _Found:
 @dataclass(eq=False)
 class _Left:
     """What a box leaves open: cells to be halved in time, those for smaller cells of directions, those for smaller
-    boxes."""
+    boxes; the ``influence`` of every parameter on these, and the ``slopes`` of every coordinate of directions."""
 
     influence: Array
+    slopes: Array = field(default_factory=lambda: np.zeros(1))
     halves: list[Interval] = field(default_factory=list)
     turned: list[Interval] = field(default_factory=list)
     wide: list[Interval] = field(default_factory=list)
@@ -142,6 +143,7 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
             continue
         if _turn(place, sides, interval, failed, max(tops)):
             left.turned.append(interval)
+            left.slopes = left.slopes + sides.slopes(tops)
         elif place.box[0] and any(_to_blame(poly, top, interval) for _, poly, top in over):
             left.wide.append(interval)
             left.influence += sum(_influence(place.tube, poly) for _, poly in failed)

@@ -112,10 +112,20 @@ class Sides:
         """Whether it is a cell of more than one direction; on a line a curved set has two directions and no more."""
         return self.low is not None and self.high is not None and bool((self.high > self.low).any())
 
-    def halves(self) -> list[Sides]:
-        """Both halves of the cell of directions, across its widest coordinate."""
+    def slopes(self, tops: Sequence[float]) -> Array:
+        """By how much bounds ``tops`` of the rows differ from end to end of every coordinate of the directions, in the
+        mean, ``(b,)``: what the cell loses, for in the middle the limit is the true one."""
+        assert self.low is not None and self.high is not None
+        free, found = np.flatnonzero(self.high > self.low), np.zeros(self.low.size)
+        corners = np.asarray(tops, dtype=float).reshape((2,) * free.size)
+        for place, axis in enumerate(free):
+            found[axis] = abs(float((corners.take(1, axis=place) - corners.take(0, axis=place)).mean()))
+        return found
+
+    def halves(self, slopes: Array) -> list[Sides]:
+        """Both halves of the cell of directions, across the coordinate of the largest of the ``slopes (b,)``."""
         assert self.curved is not None and self.low is not None and self.high is not None
-        axis = int((self.high - self.low).argmax())
+        axis = int(np.where(self.high > self.low, slopes, -np.inf).argmax())
         middle = (self.low[axis] + self.high[axis]) / 2
         if not self.low[axis] < middle < self.high[axis]:
             raise Unchecked("a cell of directions cannot be halved any more")

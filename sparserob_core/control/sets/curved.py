@@ -422,7 +422,7 @@ def _pivoted(matrix: Array) -> Array:
             break
         columns.append(rest[pivot] / np.sqrt(rest[pivot, pivot]))
         rest = rest - np.outer(columns[-1], columns[-1])
-    return np.array(columns).reshape(-1, matrix.shape[0])
+    return np.array(columns).reshape(len(columns), matrix.shape[0])
 
 
 @shaped

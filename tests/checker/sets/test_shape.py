@@ -189,7 +189,11 @@ def test_rows_at_the_corners_of_a_cell_of_directions_stand_for_all_of_it(name):
             assert true - 1e-14 <= centre.limit <= true + 1e-15
             middle = float((low + high) / 2 @ curved.normals @ np.asarray(known(source).centre))
             assert centre.unit == pytest.approx(true - middle)
-            halves = cell.halves()
+            # of bounds that are linear in the direction the slopes are the coefficients times the widths
+            steep = rng.normal(size=d)
+            slopes = cell.slopes([float(row.z @ steep) for row in cell.rows])
+            np.testing.assert_allclose(slopes, np.abs(steep) * (high - low), rtol=1e-9, atol=1e-14)
+            halves = cell.halves(high - low)
             axis = int((high - low).argmax())
             assert halves[0].high[axis] == halves[1].low[axis] == (low[axis] + high[axis]) / 2
             assert (halves[0].low == low).all() and (halves[1].high == high).all()
@@ -202,7 +206,7 @@ def test_rows_at_the_corners_of_a_cell_of_directions_stand_for_all_of_it(name):
         assert true - 1e-14 * (1 + abs(true)) <= point.centre.limit <= true + 1e-15
         assert true - 1e-14 * (1 + abs(true)) <= point.rows[0].limit <= true
         with pytest.raises(Unchecked):
-            Sides.cell(curved, high, np.where(np.arange(d) == 1, np.nextafter(high, np.inf), high)).halves()
+            Sides.cell(curved, high, np.where(np.arange(d) == 1, np.nextafter(high, np.inf), high)).halves(np.ones(d))
 
 
 def test_an_excess_of_a_billionth_of_the_unit_counts_as_none_and_no_more():

@@ -139,6 +139,7 @@ def test_the_curvature_of_a_length_is_below_it_and_near_the_true_one_where_the_s
                 flat = B - np.outer(B @ a, a) / size**2
                 np.testing.assert_allclose(H, flat @ flat.T / size, rtol=0.02, atol=1e-14)
     assert (norm_curvature(np.zeros(2), np.eye(2)) == 0.0).all()
+    assert norm_curvature(np.ones(1), np.zeros((0, 1))).shape == (0, 0)
     # by hand: U = 4 + 1/2, and 1 across
     H = norm_curvature(np.array([4.0, 0.0]), np.array([[0.5, 0.0], [0.0, 1.0]]))
     assert np.diag([0.0, 2.0 / (4.5 + np.sqrt(4.5**2 + 1.0))]) == pytest.approx(H)
