@@ -92,7 +92,7 @@ class Whole:
     def forward(self, r: Array) -> tuple[State, Array]:
         """A right-hand side among the pivots, and what it makes of the parts."""
         block, u = self.block, self._solved(r)
-        parts = np.bincount(block.columns, self.single * u[block.of], self.parts)
+        parts: Array = np.bincount(block.columns, self.single * u[block.of], self.parts).astype(float)
         parts += np.bincount(block.mixed, self.rows @ u, self.parts)
         return (r,), parts
 

@@ -57,7 +57,10 @@ class Interior:
 
     def __post_init__(self) -> None:
         self._layout = Layout(self.program, self.spread)
-        self._begun, self._stale = False, True
+        self._begun, self._stale, none = False, True, np.zeros(0)
+        self._z, self._f, self._s, self._y, self._mu = none, none, none, none, 0.0
+        self._plus, self._minus, self._alpha, self._beta = none, none, none, none
+        self._went = 0.0  # share of the last direction that multipliers went
         self._margin, self._tightened = 0.0, 0.0  # of the last solve, and by how much more rows are tightened now
         self._elsewhere: tuple[float, Iterate] | None = None  # where the last solve with another margin ended
 
@@ -173,7 +176,7 @@ class Interior:
         free = self._h[first:] - self._g @ self._z - L.scale * worst[L.of]
         many = np.bincount(L.part, minlength=L.parts) + 2.0  # a slack is as large as that of each absolute value
         violation = max(self._tightened, -float(free[had:].min(initial=0.0)))
-        before = np.bincount(L.of[:had], L.scale[:had] * self._y[first:], L.parts)
+        before: Array = np.bincount(L.of[:had], L.scale[:had] * self._y[first:], L.parts).astype(float)
         if had:
             aim = SLACK * violation * float(self._y[first:].max()) / float(many.max())
             self._mu = max(self._mu, aim)
@@ -214,7 +217,7 @@ class Interior:
         """The gap, what the residuals of the dual take from a bound, and the largest of the primal."""
         L, first = self._layout, self._limits.size
         tau = np.bincount(L.part, L.radius * (self._plus + self._minus) / 2, L.parts)
-        eta = np.bincount(L.of, L.scale * self._y[first:], L.parts)
+        eta: Array = np.bincount(L.of, L.scale * self._y[first:], L.parts).astype(float)
         self._rz = self._c + self._G.T @ self._y
         self._rf = L.C.T @ (self._alpha - self._beta)
         self._rt = L.radius * eta[L.part] - self._alpha - self._beta
@@ -348,7 +351,7 @@ class Interior:
         x[L.joint], x[L.answering] = self._z[: self._n], self._f
         y = self._y[self._limits.size :]
         y = np.where(y > NOTHING * y.max(), y, 0.0)
-        eta = np.bincount(L.of, L.scale * y, L.parts)
+        eta: Array = np.bincount(L.of, L.scale * y, L.parts).astype(float)
         weight, aim, _ = self._balanced(eta)
         y = y + ((weight - eta) / np.maximum(np.bincount(L.of, L.scale, L.parts), TINY))[L.of]
         leaning = np.divide(aim, weight[L.part], out=np.zeros(aim.size), where=weight[L.part] > 0.0)
