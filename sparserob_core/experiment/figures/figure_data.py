@@ -189,20 +189,25 @@ class FigureData:
     def output_label(self, output: int) -> str:
         """The axis label of an output: that of the state which is measured as it is, or else the letter."""
         assert self.outputs is not None
-        row = self.outputs.C[output]
-        alone = np.flatnonzero(row)
-        if alone.size == 1 and row[alone[0]] == 1.0:
-            return self.state_label(int(alone[0]))
-        return label((), (), "y", output, len(self.outputs.C))
+        alone = self._measured_state(output)
+        return label((), (), "y", output, len(self.outputs.C)) if alone is None else self.state_label(alone)
 
     def gain_label(self, channel: int, component: int) -> str:
-        """The label of a gain: of which control on which state, and its unit where both are known."""
-        if self.outputs is not None:
+        """The label of a gain: of which control on which state or output, and its unit where both are known."""
+        measured_as = component if self.outputs is None else self._measured_state(component)
+        if measured_as is None:
             return f"gain on $y_{{{component + 1}}}$"
         u, x = self.names.control_units, self.names.state_units
-        unit = f" [{plain(u[channel])} per {plain(x[component])}]" if u and x and u[channel] and x[component] else ""
-        plainly = label(self.names.states, (), "x", component, self.state.shape[0])
-        return f"gain on {plainly}{unit}"
+        known = u and x and u[channel] and x[measured_as]
+        unit = f" [{plain(u[channel])} per {plain(x[measured_as])}]" if known else ""
+        return f"gain on {label(self.names.states, (), 'x', measured_as, self.state.shape[0])}{unit}"
+
+    def _measured_state(self, output: int) -> int | None:
+        """The state that is an output as it is; ``None`` where there is none."""
+        assert self.outputs is not None
+        row = self.outputs.C[output]
+        alone = np.flatnonzero(row)
+        return int(alone[0]) if alone.size == 1 and row[alone[0]] == 1.0 else None
 
     def time_label(self) -> str:
         """The label of the time axis."""

@@ -31,6 +31,10 @@ EXCLUDED: dict[str, Any] = {"facecolor": MIST, "edgecolor": "#C4C4C4", "hatch": 
 WIDTH = 6.2
 """Width of every figure in inches: a text column at full size."""
 
+LETTERS, BESIDE = 104, 8
+"""Letters that have room beside each other in a legend, and as how many of them a mark with its spaces is as wide: with
+more, or with narrower marks, the first and the last entry are cut off."""
+
 KINDS: dict[str, dict[str, Any]] = {
     ".png": {"dpi": 200, "metadata": {"Software": None}},
     ".pdf": {"metadata": {"CreationDate": None, "Creator": None, "Producer": None}},
@@ -88,11 +92,14 @@ def panels(rows: int, height: float, *, extra: float = 0.0) -> tuple[Figure, lis
 def draw_legend(figure: Figure, axes: list[Axes]) -> None:
     """One legend below all panels."""
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    letters = len("".join(entries))
+    alone = letters <= 64 and letters + BESIDE * len(entries) <= LETTERS
+    few = 4 if max(map(len, entries), default=0) + BESIDE <= LETTERS / 4 else 3
     figure.legend(
         entries.values(),
         entries.keys(),
         loc="outside lower center",
-        ncols=len(entries) if len("".join(entries)) <= 64 else 3,
+        ncols=len(entries) if alone else few,
         columnspacing=1.6,
         handlelength=1.4,
         handletextpad=0.6,

@@ -170,3 +170,6 @@ def test_readings_are_outputs_in_the_worst_case_and_their_noise(tmp_path: Path) 
     assert np.allclose(outputs.lower[:, at] - outputs.read_lower, [[0.01], [0.03]])
     figure = result.plot("outputs")
     assert [ax.get_ylabel() for ax in figure.axes] == ["$x_{1}(t)$", "$y_{2}(t)$"]
+    names = sr.Names(states=("q", "v"), controls=("F",), state_units=("m", "m/s"), control_units=("N",))
+    labels = [replace(drawn, names=names).gain_label(0, output) for output in (0, 1)]
+    assert labels == ["gain on q [N per m]", "gain on $y_{2}$"]  # what is a state as it is has its name and its unit

@@ -19,7 +19,7 @@ from sparserob_core.experiment.figures import drawing
 from sparserob_core.experiment.figures.active import active_of, stored_active
 from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
-from sparserob_core.experiment.figures.style import _letters_told, held
+from sparserob_core.experiment.figures.style import _letters_told, draw_legend, held, panels, style
 from sparserob_core.sip.events import RoundFinished
 from tests.support.drafts import whole
 
@@ -287,3 +287,25 @@ def test_letters_that_no_font_has_are_told_once_and_other_warnings_are_kept(tmp_
     assert [record.getMessage() for record in caplog.records] == ["figures: no font here has \uf8ff: boxes stand there"]
     with pytest.warns(UserWarning, match="something else"), _letters_told():
         warnings.warn("something else", UserWarning, stacklevel=1)
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        ("adversary", "iid", "vertices", "slow", "neighbours", "forbidden", "terminal set", "nominal"),
+        ("worst case, with feedback", "nominal", "readings, with noise"),
+        ("worst case, with feedback", "terminal set", "nominal", "forbidden", "initial states"),
+    ],
+)
+def test_no_entry_of_a_legend_is_cut_off(entries: tuple[str, ...]) -> None:
+    with style():
+        figure, axes = panels(1, 1.0)
+        for entry in entries:
+            axes[0].plot([0.0, 1.0], label=entry)
+        draw_legend(figure, axes)
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        FigureCanvasAgg(figure).draw()
+    (legend,) = figure.legends
+    drawn, page = legend.get_window_extent(), figure.bbox
+    assert page.x0 <= drawn.x0 and drawn.x1 <= page.x1
