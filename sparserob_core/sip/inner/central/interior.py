@@ -36,6 +36,7 @@ AROUND, ROOM = 5.0, 1.0  # slacks that it begins with: times the largest violati
 SLACK = 0.1  # share of a violation that new rows have as slack in the middle
 SPENT = 0.1  # share of the accuracy that residuals may take
 MET = 1e-10  # residual of rows that is none
+ROUNDED = 1e-14  # share of its reach below which a variable is 0: what costs nothing has no gap, and rows do not move
 NOTHING = 1e-11  # share of the largest multiplier below which one is 0
 ENDLESS = 1e9  # multipliers of rows that nothing meets
 TINY = 1e-300
@@ -348,7 +349,10 @@ class Interior:
     def _answer(self, solved: bool, said: str) -> RobustAnswer:
         L = self._layout
         x = np.zeros(self.program.n)
-        x[L.joint], x[L.answering] = self._z[: self._n], self._f
+        for places, values, reach in zip(
+            (L.joint, L.answering), (self._z[: self._n], self._f), self._reach, strict=True
+        ):
+            x[places] = np.where(np.abs(values) > ROUNDED * reach[: values.size], values, 0.0)
         y = self._y[self._limits.size :]
         y = np.where(y > NOTHING * y.max(), y, 0.0)
         eta: Array = np.bincount(L.of, L.scale * y, L.parts).astype(float)

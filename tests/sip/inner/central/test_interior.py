@@ -176,6 +176,17 @@ def test_a_new_row_leaves_residuals_of_the_size_of_its_violation() -> None:
     assert central._residuals()[2] < 10 * 1e-3
 
 
+def test_what_costs_nothing_costs_exactly_nothing() -> None:
+    """A gap is relative to the cost, and that of 1e-160 to a bound of 0 stayed open."""
+    rng, central = np.random.default_rng(7), Interior(program(), spread())
+    for block in [answering(k, k) for k in range(EACH)] + [rows(rng, 30.0) for _ in range(4)]:
+        central.add(block)
+    found = central.solve(0.0, 1e-9)
+    for _ in range(12):
+        found = central.solve(0.0, 1e-30)
+    assert program().objective(found.x) == 0.0
+
+
 def test_rows_that_are_there_already_are_known_by_a_short_name() -> None:
     rng = np.random.default_rng(3)
     central = Interior(program(), spread())
