@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import linprog
 
@@ -172,3 +173,48 @@ def transfer(problem: sr.OptimalControlProblem, pieces: int) -> tuple[np.ndarray
         X = X + h / 6 * (k1 + 2 * k2 + 2 * k3 + A[2] @ (X + h * k3) + D)
         Phi, G = X[:, :4], X[:, 4:]
     return G, Phi @ np.asarray(problem.initial_state)
+
+
+@pytest.mark.slow
+def test_a_mission_through_a_pericentre_at_an_eccentricity_of_nine_tenths(tmp_path: Path) -> None:
+    orbit = {"semi_major_axis": 7.0e7, "eccentricity": 0.9, "true_anomaly": 1.25 * np.pi, "mu": 3.986e14}
+    centre, box = np.array([-5000.0, 300.0, 0.0, 0.0]), np.array([0.5, 0.5, 1e-4, 1e-4])
+    lower, upper = np.array([-400.0, -200.0, -0.2, -0.2]), np.array([-100.0, 200.0, 0.2, 0.2])
+    pieces, most, horizon = 60, 0.02, 14562.0
+    given = {
+        "orbit": orbit,
+        "horizon": horizon,
+        "initial_state": {"centre": centre.tolist(), "box": box.tolist()},
+        "control": {"box": most},
+        "path": [{"name": "wall", "box": {"lower": [None] * 4, "upper": [-50, None, None, None]}}],
+        "terminal": [{"box": {"lower": lower.tolist(), "upper": upper.tolist()}}],
+    }
+    config = {
+        "problem": {"name": "rendezvous", **given},
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": pieces}},
+        "observers": [],
+    }
+    result = sr.run(config, out=tmp_path / "run", figures=False).result
+    assert result.status == "certified"
+    assert sr.check(tmp_path / "run").status == "verified"
+
+    problem = Rendezvous(**given).build()
+
+    def rate(time: float, flat: np.ndarray) -> np.ndarray:
+        both = laws(problem, time) @ flat.reshape(4, 6)
+        both[2:, 4:] += np.eye(2)
+        return both.ravel()
+
+    Phi, G, length, walls = np.eye(4), np.zeros((4, 2 * pieces)), horizon / pieces, list[tuple[np.ndarray, float]]()
+    for piece in range(pieces):
+        begun = np.hstack([np.eye(4), np.zeros((4, 2))]).ravel()
+        over = (piece * length, (piece + 1) * length)
+        flow = solve_ivp(rate, over, begun, method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1].reshape(4, 6)
+        Phi, G = flow[:, :4] @ Phi, flow[:, :4] @ G
+        G[:, 2 * piece : 2 * piece + 2] = flow[:, 4:]
+        walls.append((G[0].copy(), -50.0 - Phi[0] @ centre - np.abs(Phi[0]) @ box))
+    moved, unknown = Phi @ centre, np.abs(Phi) @ box
+    rows = np.vstack([G, -G, *(row for row, _ in walls)])
+    left = np.concatenate([upper - moved - unknown, moved - lower - unknown, [rest for _, rest in walls]])
+    found = linprog(np.full(4 * pieces, length), np.hstack([rows, -rows]), left, bounds=(0, most), method="highs")
+    assert found.fun * (1.0 - 1e-6) <= result.cost <= 1.001 * found.fun  # with the wall at the nodes alone
