@@ -55,9 +55,11 @@ def _marks(model: Transcription, found: Sequence[tuple[str, float, int]]) -> Act
     times, which = np.unique(np.array([time for _, time, _ in found], dtype=float), return_inverse=True)
     states = np.zeros((times.size, model.problem.system.states), dtype=bool)
     constraints = {one.name: one for one in model.constraints}
+    rows = {(family, row) for family, _, row in found if family in constraints}  # far fewer than constraints
+    bounded = {one: constraints[one[0]].bounded(one[1])[: states.shape[1]] for one in rows}
     for place, (family, _, row) in zip(which.tolist(), found, strict=True):
-        if family in constraints:
-            states[place] |= constraints[family].bounded(row)[: states.shape[1]]
+        if (family, row) in bounded:
+            states[place] |= bounded[family, row]
     return Active(times, states)
 
 
