@@ -96,7 +96,7 @@ class Answers:
         one = isinstance(system, LinearSystem) and not system.delay
         if case.answering and case.measurable and not one:
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
-        if case.answering and not case.alike:
+        if case.answering and (case.several or case.lasting is not None):
             raise Unchecked("the checker knows feedback under disturbances of one class, on one dictionary")
         held = (changes or []) if case.measurable and not case.several else (case.changes or [])
         measured = case.problem.measurements if case.answering else None

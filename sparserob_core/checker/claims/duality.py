@@ -20,7 +20,7 @@ from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.cost.price import Price, Tangent
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
-from sparserob_core.checker.reach.lasting import Lasting
+from sparserob_core.checker.reach.lasting import Lasting, summed
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
@@ -131,9 +131,8 @@ class Duality:
             constant = constant + known(self.problem.initial_set).support(lags[0.0][:d])
         if disturbed and self.changes is not None and self.problem.disturbance is not None:
             mw = parts["E"][0].ncols()
-            for weights in self._gathered(
-                _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw)
-            ):
+            pushes = _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw)
+            for weights in summed(self.lasting, pushes):
                 if any(not w.is_zero() for w in weights):
                     constant = constant + known(self.problem.disturbance).support(weights)
         return Row(constant, slope)
@@ -163,12 +162,9 @@ class Duality:
         if disturbed and problem.initial_set is not None:
             constant = constant + known(problem.initial_set).support(free)
         if disturbed and self.held is not None:
-            for one in self._gathered(pushes):
+            for one in summed(self.lasting, pushes):
                 constant = constant + known(self.held).support(one)
         return Row(constant, slope)
-
-    def _gathered(self, pushes: list[list[arb]]) -> list[list[arb]]:
-        return pushes if self.lasting is None else self.lasting.summed(pushes)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:
         """What every block of the disturbance gives to ``c'x(t)`` of a known system, ``(mw,)`` each; the blocks begin

@@ -78,21 +78,22 @@ class Lasting:
             mid[begun, ..., columns, :], rad[begun, ..., columns, :] = here, off * OUTWARD
         return mid, rad
 
-    def summed(self, weights: Sequence[Sequence[arb]]) -> list[list[arb]]:
-        """`gathered` of weights ``(mw,)`` on every piece, exactly."""
-        from flint import arb
-
-        found = [list(one) for one in weights]
-        for columns, firsts in self.parts:
-            first = 0
-            for piece in range(len(found)):
-                first = piece if piece in firsts else first
-                for j in range(columns.start, columns.stop) if piece != first else ():
-                    found[first][j], found[piece][j] = found[first][j] + found[piece][j], arb(0)
-        return found
-
     def may_jump(self, time: float) -> np.ndarray:
         """Which components ``(mw,)`` may have another value from a time on."""
         piece = bisect_right(self.changes, time) - 1
         begins = self.changes[piece] == time
         return np.concatenate([np.full(one.stop - one.start, begins and piece in firsts) for one, firsts in self.parts])
+
+
+def summed(lasting: Lasting | None, weights: Sequence[Sequence[arb]]) -> list[list[arb]]:
+    """`Lasting.gathered` of weights ``(mw,)`` on every piece, exactly; as they are where no component lasts longer."""
+    from flint import arb
+
+    found = [list(one) for one in weights]
+    for columns, firsts in () if lasting is None else lasting.parts:
+        first = 0
+        for piece in range(len(found)):
+            first = piece if piece in firsts else first
+            for j in range(columns.start, columns.stop) if piece != first else ():
+                found[first][j], found[piece][j] = found[first][j] + found[piece][j], arb(0)
+    return found

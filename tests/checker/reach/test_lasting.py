@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from flint import arb
 
-from sparserob_core.checker.reach.lasting import Lasting
+from sparserob_core.checker.reach.lasting import Lasting, summed
 
 CHANGES = [0.0, 0.4, 1.0, 1.7, 2.0]
 LASTING = Lasting(CHANGES, ((slice(0, 1), np.array([0, 2])), (slice(1, 3), np.array([0, 1, 4]))))
@@ -39,10 +39,11 @@ def test_sums_hold_the_exact_ones_and_lie_with_the_first_piece(begun):
 
 def test_balls_are_summed_too():
     weights = [[arb(k + 10 * j) for j in range(3)] for k in range(5)]
-    found = LASTING.summed(weights)
+    found = summed(LASTING, weights)
     assert [float(one[0]) for one in found] == [1.0, 0.0, 9.0, 0.0, 0.0]
     assert [float(one[1]) for one in found] == [10.0, 36.0, 0.0, 0.0, 14.0]
     assert float(weights[1][0]) == 1.0  # what is given stays
+    assert summed(None, weights) == weights
 
 
 def test_a_component_may_jump_where_a_piece_of_its_own_begins():
