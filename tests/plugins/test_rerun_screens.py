@@ -407,6 +407,15 @@ def test_a_low_plot_has_two_ticks_at_least() -> None:
         assert sum(text != "" for _, text, _ in drawing.labels) >= 2
 
 
+def test_of_three_numbers_for_which_there_is_no_room_the_one_between_is_left_out() -> None:
+    from sparserob_rerun.drawing.canvas import _apart
+
+    low, high = (
+        _apart(Axes(0.0, 0.0, 100.0, height, (0.0, 1.0), (-2.7, 2.7)), 34.0, False) for height in (60.0, 110.0)
+    )
+    assert low.tolist() == [-2.0, 2.0] and high.tolist() == [-2.0, 0.0, 2.0]
+
+
 def test_decades_are_whole_and_a_search_that_gains_nothing_more_has_numbers_that_can_be_told_apart() -> None:
     from sparserob_rerun.drawing.canvas import _apart, ticks
     from sparserob_rerun.search.climb import _limits
