@@ -6,7 +6,7 @@ problem with one, and whatever is proven of one disturbance is proven of a list.
 `Product`, each part of it of a class of its own; what each class does is that of the set that is 0 along the columns of
 the other, and both add up (`apart`). One that acts in a window of time alone
 enters a system that takes turns, whose ``E`` is 0 outside of the window. Those that are constant on pieces of their own
-are one on the pieces of all, of which some parts stay what they are from one to the next (`finest`).
+are one on the pieces of all, of which some parts stay what they are from one to the next.
 """
 
 from __future__ import annotations
@@ -128,17 +128,6 @@ def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np
         return np.full(bound.dimension, classes == kind)
     assert isinstance(bound, Product)
     return np.repeat([one == kind for one in classes], [part.dimension for part in bound.parts])
-
-
-def finest(breakpoints: Breakpoints, dictionary: Array) -> tuple[Breakpoints, Array]:
-    """The breakpoints of every part, those of the ``dictionary (K + 1,)`` for one without its own, and all of them as
-    those of one: none that is another one but for rounding."""
-    every = tuple(dictionary if times is None else times for times in breakpoints)
-    joint: Array = np.unique(np.concatenate(every))
-    apart = np.concatenate([[True], np.diff(joint) > SHORTEST * joint[-1]])
-    joint = joint[apart]
-    joint[-1] = dictionary[-1]
-    return every, joint
 
 
 def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: float) -> Array | None:

@@ -94,8 +94,7 @@ class DisturbanceModel:
         if self.by_piece:
             return weights
         if self.starts is not None:
-            blocks = weights if self.starts.size == self.grid.pieces else np.add.reduceat(weights, self.starts, axis=-2)
-            return self._gathered(blocks)
+            return self._gathered(np.add.reduceat(weights, self.starts, axis=-2))
         assert self.functions is not None
         coefficients = np.einsum("...li,jl->...ij", weights, self.functions)
         if self.scale is None:
@@ -196,9 +195,12 @@ def disturbance_model(
             np.searchsorted(merged.breakpoints, _middles(grid), side="right") - 1, 0, merged.breakpoints.size - 2
         )
         starts = np.flatnonzero(np.diff(which, prepend=-1))
+        plain = DisturbanceModel("piecewise_constant", bound, bound, grid, starts=starts)
+        if breakpoints is None:
+            return plain
+        assert isinstance(bound, Product)
         lasting = _lasting(bound, breakpoints, _middles(grid)[starts])
-        held = product(bound.parts) if isinstance(bound, Product) else bound
-        return DisturbanceModel("piecewise_constant", held, bound, grid, starts=starts, lasting=lasting)
+        return replace(plain, set=product(bound.parts), lasting=lasting)
     flat = bound.halfspaces()
     if flat is None:
         raise InputError(
@@ -212,10 +214,10 @@ def disturbance_model(
     return DisturbanceModel("piecewise_constant", coupled, bound, grid, functions=dictionary.at(grid.disturbance_piece))
 
 
-def _lasting(bound: ConvexSet, breakpoints: Breakpoints | None, middles: Array) -> tuple[tuple[slice, np.ndarray], ...]:
+def _lasting(bound: Product, breakpoints: Breakpoints, middles: Array) -> tuple[tuple[slice, np.ndarray], ...]:
     """`DisturbanceModel.lasting`, of blocks of which these are times that lie within them."""
     found, column = list[tuple[slice, np.ndarray]](), 0
-    for part, times in zip(bound.parts, breakpoints, strict=True) if isinstance(bound, Product) and breakpoints else ():
+    for part, times in zip(bound.parts, breakpoints, strict=True):
         columns = slice(column, column + part.dimension)
         column = columns.stop
         assert times is not None

@@ -12,7 +12,6 @@ from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.disturbances import finest
 from sparserob_core.control.problem.problem import (
     Accumulated,
     MixedConstraint,
@@ -27,7 +26,7 @@ from sparserob_core.control.response.disturbance import DisturbanceModel, distur
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
-from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
+from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times, merge_grids
 from sparserob_core.control.transcription.accumulated import accumulated
 from sparserob_core.control.transcription.own_units import (
     own_units,
@@ -133,7 +132,9 @@ def _on_one_grid(problem: OptimalControlProblem, disturbance: Dictionary) -> tup
             "dictionaries.disturbance: fewer functions than pieces are not proven beside disturbances that have"
             " breakpoints of their own"
         )
-    own, joint = finest(problem.disturbance_breakpoints, disturbance.merged().breakpoints)
+    plain = disturbance.merged().breakpoints
+    own = tuple(plain if times is None else times for times in problem.disturbance_breakpoints)
+    joint = distinct_times(np.concatenate(own), problem.horizon)
     return replace(problem, disturbance_breakpoints=own), Dictionary.indicators(joint)
 
 

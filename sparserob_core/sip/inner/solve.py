@@ -396,8 +396,8 @@ def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[tuple[str, Fin
         found = polish(program, guess.x, guess.y, guess.mu)
         if found is not None:
             yield DUAL_NEWTON, found
-    curvature = program.curvature if program.separable and program.h.size >= CROWDED and program.n >= WIDE else None
-    if DUAL_NEWTON in quick and curvature is not None and curvature.min(initial=np.inf) > 0.0:
+    large = program.separable and program.h.size >= CROWDED and program.n >= WIDE
+    if DUAL_NEWTON in quick and large and program.curvature is not None and program.curvature.min() > 0.0:
         yield DUAL_NEWTON, from_nothing(program, 0.1 * case.tolerance, POINTS)[0]
 
 

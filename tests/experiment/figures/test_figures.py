@@ -22,6 +22,7 @@ from sparserob_core.experiment.figures.run_figures import draw_control, draw_con
 from sparserob_core.experiment.figures.style import _letters_told, draw_legend, held, panels, style
 from sparserob_core.sip.events import RoundFinished
 from tests.support.drafts import whole
+from tests.support.problems import double_integrator
 
 
 @pytest.fixture(scope="module")
@@ -89,20 +90,9 @@ def test_an_active_constraint_is_marked_under_the_states_that_it_bounds(data: Fi
     ],
 )
 def test_a_constraint_says_which_states_it_bounds(bounds: dict[str, Any], about: set[int]) -> None:
-    config = {
-        "problem": {
-            "name": "linear",
-            "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
-            "horizon": 2.0,
-            "initial_state": [1, 0],
-            "control": {"box": 1.0},
-            "path": [bounds],
-            "terminal": [{"box": [0.5, 0.5]}],
-        },
-        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
-        "method": {"name": "exchange"},
-    }
-    experiment = assemble(load_config(config))
+    control = {"name": "piecewise_constant", "pieces": 4}
+    problem = {**double_integrator(0.05), "path": [bounds]}
+    experiment = assemble(load_config({"problem": problem, "dictionaries": {"control": control}}))
     assert isinstance(experiment, ControlExperiment)
     cuts = [sr.Cut("path", np.array([0.5, 0.0]), row, 1.0) for row in (0, 9)]
     cuts.append(sr.Cut("terminal", np.array([2.0]), 1, 0.0))
