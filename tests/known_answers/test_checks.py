@@ -73,6 +73,7 @@ def test_the_uncertain_rate_costs_what_is_known(tmp_path: Path) -> None:
     assert summary["lower_bound"] >= known - 1e-9
 
 
+@pytest.mark.slow
 def test_the_oscillator_with_an_interior_worst_parameter_costs_what_is_known(tmp_path: Path) -> None:
     problem = {
         "name": "linear",

@@ -276,6 +276,7 @@ def test_groups_are_those_of_an_independent_cone_program(tmp_path):
     assert certified(run(TWO_GROUPS, pieces, tmp_path / "run")) == pytest.approx(solution.obj_val, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_groups_stand_beside_disturbances_walls_and_quadratic_terms(tmp_path):
     problem = {
         **PLANE,

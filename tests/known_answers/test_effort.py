@@ -78,6 +78,7 @@ def test_the_largest_effort_is_that_of_the_worst_vertex(seed: int) -> None:
     assert found.values[0] == pytest.approx(found.lower, rel=1e-14)
 
 
+@pytest.mark.slow
 def test_the_largest_effort_is_that_of_a_mixed_integer_program() -> None:
     """``|u| <= t`` reversed by a binary variable for each entry, solved by HiGHS."""
     rng = np.random.default_rng(5)
@@ -167,6 +168,7 @@ def test_the_least_worst_effort_of_a_scalar_problem_is_that_of_all_signals_at_on
     assert check(outcome.directory).status == "verified"
 
 
+@pytest.mark.slow
 def test_worst_lies_between_nominal_and_peak_and_no_disturbance_costs_more(tmp_path: Path) -> None:
     costs = {}
     for cost in ("nominal", "worst", "peak"):
@@ -182,7 +184,7 @@ def test_worst_lies_between_nominal_and_peak_and_no_disturbance_costs_more(tmp_p
     assert costs["worst"] <= costs["peak"] * (1.0 + 1e-9)
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changed",
     [
@@ -209,7 +211,7 @@ def test_draws_and_the_adversary_never_cost_more_than_the_largest_effort(tmp_pat
     assert effort_at(outcome, draws).max() <= outcome.result.cost
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("pressed", [False, True])
 def test_a_search_that_is_ended_leaves_an_honest_gap(
     pressed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

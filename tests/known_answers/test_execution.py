@@ -70,6 +70,7 @@ def independent() -> float:
     return float(linprog(prices, A_ub=G, b_ub=h, bounds=(0, 1), method="highs").fun)
 
 
+@pytest.mark.slow
 def test_the_cost_is_that_of_an_independent_linear_program(finished: Path) -> None:
     assert json.loads((finished / "result.json").read_text())["cost"] == pytest.approx(independent(), rel=2e-6)
 
@@ -90,6 +91,7 @@ def test_a_push_that_may_fall_short_is_stronger(tmp_path: Path) -> None:
     assert verified(tmp_path / "run", STRAIGHT, pieces(4))["cost"] == pytest.approx(0.9 / 0.95, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_worst_errors_reach_the_walls_and_no_others_pass_them(finished: Path) -> None:
     control = np.load(finished / "solution.npz")["control"]
     fine, rng = 200, np.random.default_rng(5)

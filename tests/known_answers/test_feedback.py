@@ -231,6 +231,7 @@ def test_without_a_disturbance_feedback_changes_nothing(tmp_path: Path) -> None:
     assert answering.result.cost == pytest.approx(fixed.result.cost, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_drift_is_answered_too(tmp_path: Path) -> None:
     system = {**SPRING["system"], "c": [0, 0.3]}
     proven(run({**springs(0.1, 0.5), "system": system}, 10, tmp_path / "run", "peak"))
@@ -255,6 +256,7 @@ def test_other_units_change_nothing(tmp_path: Path) -> None:
     assert second.result.lower_bound == pytest.approx(4 * first.result.lower_bound, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_loop_that_measures_meets_the_worst_case_that_was_predicted(tmp_path: Path) -> None:
     outcome = run({**MASSES, "disturbance": {"box": [0.08, 0.08]}}, 12, tmp_path / "run", "peak")
     found = sr.simulate(outcome.directory, law="adversary")
@@ -273,6 +275,7 @@ def test_the_stored_gains_answer_only_what_was_seen(tmp_path: Path) -> None:
     assert gains.any()
 
 
+@pytest.mark.slow
 def test_a_peak_is_zero_where_the_control_is_off_whatever_happens(tmp_path: Path) -> None:
     outcome = run(springs(0.2, 0.3), 20, tmp_path / "run", "peak")
     assert outcome.control is not None
@@ -395,6 +398,7 @@ def test_a_record_is_solved_without_files() -> None:
     assert result.cost == pytest.approx(1.195, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_no_causal_policy_costs_less_than_a_tree_of_signals_proves(tmp_path: Path) -> None:
     """An independent tree of about fifty signals proves 0.55099 where the affine policy costs 0.58605."""
     outcome = run(springs(0.2, 0.5), 10, tmp_path / "run")
@@ -448,6 +452,7 @@ def test_where_no_causal_policy_exists_the_run_says_so_and_the_check_derives_it(
     assert found.status == "verified"
 
 
+@pytest.mark.slow
 def test_no_bound_against_causal_policies_is_sought_with_no_signals(tmp_path: Path) -> None:
     outcome = run(springs(0.2, 0.5), 10, tmp_path / "run", policy={"causal_signals": 0})
     assert outcome.summary["causal_lower_bound"] is None and outcome.summary["causal_infeasible"] is False
@@ -455,6 +460,7 @@ def test_no_bound_against_causal_policies_is_sought_with_no_signals(tmp_path: Pa
     proven(outcome)
 
 
+@pytest.mark.slow
 def test_a_forged_bound_against_causal_policies_is_refused(tmp_path: Path) -> None:
     outcome = run(springs(0.2, 0.5), 8, tmp_path / "run")
     certificate = json.loads((outcome.directory / "certificate.json").read_text())
@@ -483,6 +489,7 @@ def test_a_forged_bound_against_causal_policies_is_refused(tmp_path: Path) -> No
         assert verdict(signals=wrong) == "fails"
 
 
+@pytest.mark.slow
 def test_a_result_that_says_another_causal_bound_than_the_certificate_is_noticed(tmp_path: Path) -> None:
     outcome = run(springs(0.2, 0.5), 10, tmp_path / "run")
     file = outcome.directory / "result.json"

@@ -79,6 +79,7 @@ def test_a_path_that_moves_costs_what_a_linear_program_says(cost: str, tmp_path:
     bracketed(outcome.result.cost, programs)
 
 
+@pytest.mark.slow
 def test_a_curved_path_that_moves_keeps_every_guarantee(tmp_path: Path) -> None:
     moving = {"ellipsoid": {"centre": [0, 0], "shape": [[1.2, 0], [0, 2.0]]}, **MOVING}
     del moving["box"]
@@ -299,7 +300,7 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Callable[[dict[str, Any]
     return directory
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORGERIES)
 def test_what_is_forged_beside_the_state_is_found(
     name: str, honest: Callable[[dict[str, Any]], Path], tmp_path: Path

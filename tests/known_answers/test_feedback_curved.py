@@ -48,7 +48,7 @@ def test_an_elliptic_final_set_costs_what_its_tangents_say(cost: str, tmp_path: 
     assert outcome.result.cost == pytest.approx(found, rel=5e-3)
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
 def test_a_round_set_of_controls_costs_what_its_tangents_say(cost: str, tmp_path: Path) -> None:
     outcome = run(THRUSTERS, tmp_path / "run", cost, pieces=6)
@@ -88,7 +88,7 @@ SETS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if " an" in name else name for name in SETS]
 )
@@ -155,12 +155,13 @@ def curved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return outcome.directory
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forged_curved_set_is_found(name: str, tmp_path: Path, curved: Path) -> None:
     assert forged(curved, tmp_path / "copy", FORGERIES[name]) == "refuted"
 
 
+@pytest.mark.slow
 def test_a_control_that_leaves_its_round_set_is_found(tmp_path: Path) -> None:
     outcome = run(THRUSTERS, tmp_path / "run", pieces=6)
     proven(outcome)

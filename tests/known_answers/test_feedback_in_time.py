@@ -160,7 +160,7 @@ def test_a_controller_keeps_an_integrated_plant_in_its_sets(finished: Path) -> N
     assert highest <= 1.2 and max(ends) <= 0.4 + 1e-7
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [

@@ -86,6 +86,7 @@ def test_linear_programs_of_their_own_say_the_same_on_both_sides_of_the_boundary
         assert least(beyond(spring, np.array(direction), 1e-4)) == np.inf
 
 
+@pytest.mark.slow
 def test_costs_are_those_of_linear_programs_of_their_own(spring: sr.InitialStates) -> None:
     assert len(spring.costs) >= 4
     for point, cost, lower in zip(spring.points[:4], spring.costs, spring.lower_bounds, strict=False):
@@ -105,6 +106,7 @@ def test_whoever_measures_starts_from_more_states_than_one_who_plans(spring: sr.
     assert any(plan.where(vertex) == "outside" for vertex in spring.inner)
 
 
+@pytest.mark.slow
 def test_without_a_disturbance_feedback_changes_nothing() -> None:
     still = {key: value for key, value in SPRING.items() if key != "disturbance"}
     answered, planned = (sr.initial_states(config(still, policy), directions=8, values=0) for policy in (None, OFF))

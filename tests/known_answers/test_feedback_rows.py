@@ -116,6 +116,7 @@ def test_sets_of_initial_states_keep_every_guarantee(name: str, disturbed: bool,
     proven(run(problem, tmp_path / "run", "peak"))
 
 
+@pytest.mark.slow
 def test_the_control_answers_the_initial_state_from_the_first_piece_on(tmp_path: Path) -> None:
     """What is seen at time 0 is forgotten at once here, so that only the first piece can answer it; no plan takes such
     initial states."""
@@ -157,6 +158,7 @@ def test_the_bound_against_every_causal_policy_is_the_same_beside_all_policies_t
     assert min(bounds) > 0.4477
 
 
+@pytest.mark.slow
 def test_larger_initial_states_than_any_policy_can_take_are_infeasible_with_their_reason(tmp_path: Path) -> None:
     problem = {**SPRING, "initial_state": {"centre": [-1, 1], "box": [0.6, 0.6]}}
     outcome = run(problem, tmp_path / "run")
@@ -207,7 +209,7 @@ def test_final_states_are_fixed_from_every_initial_state(cost: str, fixed: list[
     bracketed(outcome.result.cost, programs)
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STATES)
 def test_final_states_are_fixed_from_sets_of_every_kind(name: str, tmp_path: Path) -> None:
     start = {"centre": [-1, 1], **STATES[name]}
@@ -236,6 +238,7 @@ SIDE_BY_SIDE: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 def test_what_no_disturbance_reaches_is_fixed_beside_what_it_reaches(tmp_path: Path) -> None:
     """Two integrators side by side: the disturbance acts on the first alone, the second can be fixed."""
     problem = {**SIDE_BY_SIDE, "initial_state": {"centre": [1, 1], "box": [0.1, 0.1]}}
@@ -263,6 +266,7 @@ def test_a_fixed_state_that_only_a_known_disturbance_reaches_is_met(pushed: dict
     proven(run({**SIDE_BY_SIDE, "system": system, "disturbance": pushed}, tmp_path / "run"))
 
 
+@pytest.mark.slow
 def test_a_fixed_state_that_the_last_disturbance_reaches_has_the_margin_zero() -> None:
     system = {**SPRING["system"], "E": [[0], [1]]}
     problem = {**SPRING, "system": system, "disturbance": {"box": 0.1}, "path": [], "terminal": [{"equals": [0, 0]}]}
@@ -338,12 +342,13 @@ def test_a_forged_final_state_is_found(name: str, tmp_path: Path, fixed: Path) -
     assert forged(fixed, tmp_path / "copy", FIXED[name]) == "refuted"
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forged_initial_state_is_found(name: str, tmp_path: Path, begun: Path) -> None:
     assert forged(begun, tmp_path / "copy", FORGERIES[name]) == "refuted"
 
 
+@pytest.mark.slow
 def test_a_simplex_of_disturbances_has_one_middle_in_all_units(tmp_path: Path) -> None:
     """That of its bounding box is outside; solver and checker count deviations from the same point."""
     problem = {

@@ -178,6 +178,7 @@ def test_a_late_control_of_systems_that_take_turns_keeps_every_wall_in_a_loop_th
     assert nearest < 0.1  # the walls are near enough for a wrong control to be seen
 
 
+@pytest.mark.slow
 def test_between_two_times_the_bounds_of_a_late_control_hold_what_is_reached(late: sr.Outcome) -> None:
     model, x = late.experiment.transcription, late.result.decision
     loop, H = model.feedback.loop, np.array([[1.0, 0.0], [-1.0, 0.0], [0.3, 1.0]])

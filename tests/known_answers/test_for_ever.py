@@ -241,6 +241,7 @@ def test_a_controller_goes_on_after_the_horizon_and_knows_where_a_period_may_beg
     assert not controller.ever_uncovered
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_solved_anew_steps_to_the_next_period_too(tmp_path) -> None:
     config = _config(
         5,

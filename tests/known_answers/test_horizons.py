@@ -88,7 +88,7 @@ def test_the_spring_can_be_at_rest_at_some_horizons_only(tmp_path: Path) -> None
     assert "10 pieces at every horizon" in found.remarks[0]
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "exact"),
     [
@@ -109,6 +109,7 @@ def test_the_shortest_way_at_full_speed_is_found(change: dict[str, Any], exact: 
     assert_between(margin({**RATE, **change}, tolerance=1e-4), exact, 2e-3)
 
 
+@pytest.mark.slow
 def test_the_shortest_horizon_at_an_uncertain_rate() -> None:
     """x' = -a x - 1 from 2 to 0.5: slowest at a = 0.5, where x(T) = 4 e^(-T / 2) - 2."""
     system = {"A": [["-a"]], "B": [[1]], "parameters": {"a": [0.5, 1.0]}}
@@ -181,6 +182,7 @@ def test_horizons_before_a_window_begins_do_not_know_of_it() -> None:
     assert {point.status for point in found.curve if point.factor >= 0.5} == {"infeasible"}
 
 
+@pytest.mark.slow
 def test_what_is_never_feasible_is_covered_up_to_the_end() -> None:
     found = margin({**RATE, "horizon": 1.4})
     assert found.status == "infeasible" and found.lower == 1.4 and math.isnan(found.upper)

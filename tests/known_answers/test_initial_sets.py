@@ -86,6 +86,7 @@ def test_sets_of_every_kind_are_certified_and_verified_under_uncertainty(
     assert verified(tmp_path / "run", problem, dictionary, pieces(16))["cost"] > single.cost + 1e-4
 
 
+@pytest.mark.slow
 def test_a_set_without_a_centre_beside_it_is_where_it_says() -> None:
     one = solved({**SPRING, "initial_state": BOX}).result
     for other in (
@@ -269,7 +270,7 @@ def _deviation(value: Any) -> Callable[[Forgery], None]:
     return lambda files: files.certificate["witness"].update(deviation=value)
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("run", "change"),
     [

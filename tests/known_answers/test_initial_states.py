@@ -70,6 +70,7 @@ def test_the_piecewise_constant_set_approaches_the_integral_from_within(cart: sr
     np.testing.assert_allclose(cart.bounds, integral, atol=3e-3)
 
 
+@pytest.mark.slow
 def test_the_area_between_the_polygons_is_small_and_the_polygons_enclose(cart: sr.InitialStates) -> None:
     assert 0.0 <= cart.gap < 0.02
     assert (cart.inner @ cart.directions.T <= cart.bounds + 1e-8).all()
@@ -131,6 +132,7 @@ def test_combined_controls_of_the_vertices_drive_any_point_of_the_inner_polygon_
         assert abs(velocity) <= SIDE[1] + 1e-7
 
 
+@pytest.mark.slow
 def test_uncertain_rates_give_the_rectangle_of_the_worst_rate() -> None:
     config = {
         **CART,
@@ -170,6 +172,7 @@ def test_a_coordinate_that_nothing_moves_and_an_equality_pins_makes_a_segment() 
     assert np.abs(found.costs - np.maximum(np.abs(found.points[:, 0] + 0.25) - 0.5, 0.0)).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_path_set_at_time_0_bounds_the_set() -> None:
     found = sr.initial_states(CART, {"problem.path": [{"box": [2.0, 1.5]}]}, directions=12, values=0)
     np.testing.assert_allclose(found.outer.max(axis=0), [2.0, 1.5], atol=1e-6)

@@ -81,6 +81,7 @@ def test_a_law_that_is_changed_afterwards_is_found(change: tampering.Change, fin
     assert sr.check(tampering.forged(finished, tmp_path / "copy", change, consistent=True)).status == "refuted"
 
 
+@pytest.mark.slow
 def test_a_bound_on_the_path_holds_on_both_sides_of_a_turn(tmp_path: Path) -> None:
     # up at a rate of 2 until 0.97 and down afterwards: the state is highest at the turn, between two breakpoints
     turning = [{"until": SWITCH, "A": [["0*t"]], "B": [[1]], "c": [2]},
@@ -93,6 +94,7 @@ def test_a_bound_on_the_path_holds_on_both_sides_of_a_turn(tmp_path: Path) -> No
         assert sr.check(tampering.forged(tmp_path / "run", tmp_path / str(k), change, True)).status == "refuted"
 
 
+@pytest.mark.slow
 def test_a_push_in_a_window_counts_there_alone(tmp_path: Path) -> None:
     # (1 + t) x gains at most 0.1 * int (1 + t) over [0.53, 1.27]; 2.5 of what is left has to go, which costs 1
     start, stop = 0.53, 1.27
@@ -149,6 +151,7 @@ def test_laws_that_stay_the_same_cost_what_pieces_of_a_system_do(more: str, tmp_
     assert costs[1] == pytest.approx(costs[0], rel=2e-6)
 
 
+@pytest.mark.slow
 def test_a_measurable_push_is_a_control_at_one_of_which_anything_may_be_delivered(tmp_path: Path) -> None:
     # (1 + t) x gains at most 0.1 * 4 by any w, 0.6 of it by the initial set and the end: 2.5 of it has to go
     problem = {
@@ -183,6 +186,7 @@ def returning(**more: Any) -> dict[str, Any]:
     return {"problem": problem, "dictionaries": dictionaries, "policy": policy, "observers": []}
 
 
+@pytest.mark.slow
 def test_a_plan_over_a_period_of_the_plant_holds_for_ever(tmp_path: Path) -> None:
     found = sr.run(returning(), out=tmp_path / "run", quiet=True, figures=False)
     assert found.status == "certified"
@@ -268,6 +272,7 @@ def test_attention_to_a_plant_that_stays_the_same_costs_the_same_as_a_function_o
     assert costs[1] == pytest.approx(costs[0], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_laws_that_take_turns_are_written_and_read_again(tmp_path: Path) -> None:
     law, window = ([["t"]], [[1]], [[1]], ["cos(t)"]), sr.Disturbance(sr.Box([-0.1], [0.1]), start=0.3, stop=0.6)
     problem = sr.OptimalControlProblem(

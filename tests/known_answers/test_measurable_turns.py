@@ -78,7 +78,7 @@ def on_a_fine_grid(
     return float(found.fun)
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 0.15])
 def test_turns_cost_what_a_fine_grid_says_and_every_claim_holds(delay: float, tmp_path: Path) -> None:
     found = ran(tmp_path / "run", 10, system={**TURNS, "delay": delay})
@@ -99,7 +99,7 @@ def test_a_window_costs_what_a_fine_grid_says_and_every_claim_holds(tmp_path: Pa
     assert sr.check(tmp_path / "run").status == "verified"
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("dictionary", [8, HAAR], ids=["pieces", "haar"])
 def test_one_system_told_in_pieces_is_that_system(dictionary: Any, tmp_path: Path) -> None:
     one = ran(tmp_path / "one", dictionary, system=FIRST)
@@ -285,7 +285,7 @@ def _decision(step: float) -> tampering.Change:
     return change
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -306,6 +306,7 @@ def test_what_is_changed_afterwards_is_refuted(change: tampering.Change, finishe
     assert sr.check(forged).status == "refuted"
 
 
+@pytest.mark.slow
 def test_worst_cases_over_turns_are_bounded_from_both_sides_and_checked(finished: Path, tmp_path: Path) -> None:
     found = sr.bound(finished, out=tmp_path / "bound")
     assert {abs(row.proven - row.reached) < 1e-8 for row in found.rows} == {True}
@@ -345,6 +346,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_two_classes_cost_less_than_one_that_does_all(two: Path, tmp_path: Path) -> None:
     cost = json.loads((two / "result.json").read_text())["cost"]
     all_of_it = ran(tmp_path / "more", 10, system={**FIRST, "delay": 0.15})
@@ -361,6 +363,7 @@ def test_two_classes_over_turns_cost_what_a_fine_grid_says(tmp_path: Path, monke
     assert sr.check(tmp_path / "run").status == "verified"
 
 
+@pytest.mark.slow
 def test_two_classes_are_bounded_simulated_and_have_a_margin(two: Path, tmp_path: Path) -> None:
     found = sr.bound(two, out=tmp_path / "bound")
     assert {abs(row.proven - row.reached) < 1e-8 for row in found.rows} == {True}
@@ -375,7 +378,7 @@ def _class(number: int, kind: str) -> tampering.Change:
     return lambda files: files.problem["disturbance"][number].update({"class": kind})
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -392,6 +395,7 @@ def test_what_is_changed_of_two_classes_is_refuted(change: tampering.Change, two
     assert sr.check(tampering.forged(two, tmp_path / "copy", change, consistent=True)).status == "refuted"
 
 
+@pytest.mark.slow
 def test_a_bound_whose_held_disturbance_jumps_within_a_piece_is_refuted(two: Path, tmp_path: Path) -> None:
     sr.bound(two, out=tmp_path / "bound")
     place = next((tmp_path / "bound").glob("bound.json"))

@@ -120,6 +120,7 @@ def test_other_dictionaries_systems_and_delays_are_certified_and_checked(entry, 
     assert check(outcome.directory).status == "verified", check(outcome.directory).claims
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "curved",
     [
@@ -307,7 +308,7 @@ def drop(files: Forgery) -> None:
         files.proof("path[1]")[name] = files.proof("path[1]")[name][1:]
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("run_of", "claim", "change"),
     [

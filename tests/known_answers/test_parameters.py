@@ -28,6 +28,7 @@ def dictionary(pieces):
     return sr.Dictionary(np.linspace(0.0, 2 * np.pi, pieces + 1), np.eye(pieces))
 
 
+@pytest.mark.slow
 def test_the_oscillator_with_a_worst_parameter_inside_its_interval_is_proven():
     program = sr.transcribe(oscillator(), control=dictionary(100))
     result = sr.solve(program, method="exchange", solver="piqp", tolerance=1e-7)

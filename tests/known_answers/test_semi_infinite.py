@@ -119,6 +119,7 @@ def test_one_sided_approximation_of_an_exponential_of_any_rate(decay, solver):
     assert_solved(one_sided(5, lambda t: np.exp(-decay * t)), solver, float(weights @ np.exp(-decay * nodes)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_watson_8_with_two_index_dimensions(solver):
     def rows(y):
@@ -223,6 +224,7 @@ def test_the_projection_onto_a_disc_given_by_its_tangents(solver):
     np.testing.assert_allclose(result.decision, point / math.hypot(*point), atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_linear_cost_over_a_ball_given_by_its_tangents_in_spherical_coordinates(solver):
     def tangents(a):

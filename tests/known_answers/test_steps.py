@@ -110,7 +110,7 @@ def test_the_cost_is_that_of_an_independent_linear_program(step, before, tmp_pat
     assert check(outcome.directory).status == "verified", check(outcome.directory).claims
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [{"norm": {"p": 2, "radius": 0.3}}, {"box": [0.2, 0.3]}])
 @pytest.mark.parametrize(
     "control",

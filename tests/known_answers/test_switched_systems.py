@@ -329,7 +329,7 @@ SETS = [
 ]
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", SETS)
 def test_pieces_share_a_set_of_parameters_of_any_kind(parameters: dict[str, Any], tmp_path: Path) -> None:
     plain = {"A": [["-0.5 + p1"]], "B": [["1 + p2"]]}
@@ -362,6 +362,7 @@ def test_parameters_of_pieces_are_the_same_where_their_numbers_are(parameters: s
         sr.SwitchedSystem([(1.0, piece(again[0])), (2.0, piece(parameters.in_units(1.001 * units)))])
 
 
+@pytest.mark.slow
 def test_the_other_methods_and_studies_know_switched_systems(tmp_path: Path) -> None:
     problem = {**SWITCHED, "disturbance": {"box": 0.02}}
     config = {"problem": problem, "dictionaries": {"control": pieces(10)}, "observers": []}
@@ -396,6 +397,7 @@ def test_minimum_attention_takes_drift_and_pieces_and_refuses_a_delay(tmp_path: 
         sr.run({"problem": late, "dictionaries": {"control": pieces(4)}, "observers": []}, figures=False)
 
 
+@pytest.mark.slow
 def test_a_quadratic_cost_follows_every_piece(tmp_path: Path) -> None:
     # the same system told in pieces costs the same; with other pieces, what a fine sum says
     cost = {"l1": 0.5, "state": {"Q": [[0.2, 0], [0, 0.1]], "reference": [0.1, 0]}, "final": {"Q": [[1, 0], [0, 1]]}}

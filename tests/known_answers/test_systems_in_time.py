@@ -56,6 +56,7 @@ def test_an_uncertain_drift_costs_its_worst_side(tmp_path: Path) -> None:
     assert verified(tmp_path / "run", config, pieces(8))["cost"] == pytest.approx(2.35, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_drift_is_a_shift_of_the_state(tmp_path: Path) -> None:
     # with z = x + A^-1 c: z' = A z + B u + w
     A, c = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([0.3, -0.2])
@@ -91,6 +92,7 @@ def test_a_delayed_problem_is_one_that_begins_later(tmp_path: Path) -> None:
         assert not solution["control"][:, 18:].any()  # what is commanded after T - 0.5 does nothing
 
 
+@pytest.mark.slow
 def test_a_delay_that_is_no_multiple_of_a_piece_and_a_haar_dictionary_agree_with_indicators(tmp_path: Path) -> None:
     problem = {**DELAY, "system": {**DELAY["system"], "delay": 0.13, "c": [0, 0.1]}, "initial_control": 0.5}
     problem = {**problem, "disturbance": {"box": 0.02}}

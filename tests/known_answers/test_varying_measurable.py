@@ -146,7 +146,7 @@ def test_the_worst_signal_attains_what_is_claimed_and_reaches_the_wall(finished:
     assert max(highest) == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [

@@ -181,6 +181,7 @@ def test_a_fading_plant_stays_below_a_bound_between_the_breakpoints(tmp_path: Pa
     assert found == pytest.approx(dense((0.93, 1.91), 0.9), rel=2e-6)
 
 
+@pytest.mark.slow
 def test_a_curved_set_of_two_fading_plants_is_the_radius_of_one(tmp_path: Path) -> None:
     # the second state is 0 and stays so
     config = {
@@ -207,7 +208,7 @@ def uncertain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-@pytest.mark.first(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -261,6 +262,7 @@ def area(ends: np.ndarray, until: float) -> np.ndarray:
     return np.asarray(y**2 / 2 * (np.log1p(until) - np.log(y)) + y**2 / 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "policy", [None, pytest.param({"name": "affine"}, marks=pytest.mark.slow)], ids=["open loop", "affine"]
 )
@@ -299,6 +301,7 @@ LATE: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 def test_a_fading_plant_that_hears_late_costs_what_a_program_in_closed_form_says(tmp_path: Path) -> None:
     # (1 + t) x is the integral of (1 + t) (u(t - 0.3) + w), and u = -0.5 before 0
     breaks, late = np.linspace(0.0, 2.0, 11), 0.3

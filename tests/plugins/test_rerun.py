@@ -124,6 +124,7 @@ def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(
     assert proven.max() <= searched.result.lower_bound + 1e-12 * searched.result.cost_scale
 
 
+@pytest.mark.slow
 def test_the_walk_has_the_values_of_the_trace_and_steps_to_what_was_accepted(searched: sr.Outcome) -> None:
     trace = searched.result.trace
     assert trace is not None

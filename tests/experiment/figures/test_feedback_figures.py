@@ -48,6 +48,7 @@ def test_the_tube_of_few_pieces_is_drawn_between_their_ends_too(data: FigureData
     assert data.alone_upper is not None and (data.alone_upper >= data.tube_upper - 1e-9).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_no_draw_is_larger_than_the_most_that_any_disturbance_causes(data: FigureData) -> None:
     assert data.effort is not None and data.control_least is not None and data.control_most is not None
     most = np.maximum(np.abs(data.control_least), np.abs(data.control_most))

@@ -417,6 +417,7 @@ def test_an_answer_at_a_time_limit_is_a_row_and_is_run_again(tmp_path: Path, mon
     assert [row["run"] for row in again.table] == [row["run"] for row in first.table]
 
 
+@pytest.mark.slow
 def test_tables_do_not_depend_on_the_executor(counting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "fail3").touch()
     axes = {"method.number": "1:4:4", "seed": [0, 1]}
