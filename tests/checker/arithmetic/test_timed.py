@@ -59,8 +59,8 @@ def test_the_anomaly_solves_the_equation_of_kepler():
 
 def test_what_has_no_series_is_refused_by_name():
     t = Timed.time(arb(0.0), 4)
-    for function in (lambda: t.log(), lambda: 1.0 / t, lambda: t / 0.0, lambda: (1.0 / t).exp(), lambda: t**-1):
-        with pytest.raises(Unchecked, match="not finite|no expansion"):
+    for function in (t.log, lambda: 1.0 / t, lambda: t / 0.0, lambda: t**-1):
+        with pytest.raises(Unchecked, match=r"not finite|no expansion"):
             function().coefficients(4)
     with pytest.raises(Unchecked, match="holds a str, expected a number"):
         t + "1"
