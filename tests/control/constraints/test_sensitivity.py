@@ -13,12 +13,9 @@ from hypothesis import strategies as st
 from sparserob_core.control.constraints.control import ControlConstraint, Places
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.response import Response, merge_grids
-from sparserob_core.control.response.sensitivity_system import Derivatives, tangent
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope, cylinder
 from sparserob_core.control.transcription.transcribe import transcribe
-from sparserob_core.sip.convex_set import Box, ConvexSet
+from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.program import ConstraintFamily
 from sparserob_core.sip.relaxed.index_gradient import STEP, index_gradient
 from tests.support.plants import indicators, random_system, uniform, walsh
@@ -306,77 +303,6 @@ def test_an_index_by_itself_has_the_same_slopes_as_among_others():
             assert np.allclose(
                 family.gradient(x, indices[i : i + 1], rows[i : i + 1])[0], together[i], rtol=1e-9, atol=1e-10
             )
-
-
-class Egg(ConvexSet):
-    """A convex set that only its violation is known of in closed form: ``x^2 + y^4 <= 1``."""
-
-    @property
-    def dimension(self):
-        return 2
-
-    def support(self, directions):
-        return (np.asarray(directions) * self.support_point(directions)).sum(axis=-1)
-
-    def support_point(self, directions):
-        y = np.linspace(-1, 1, 20001)
-        curve = np.stack([np.sqrt(1 - y**4), y], axis=1)
-        directions = np.asarray(directions)
-        curve = np.vstack([curve, curve * [-1, 1]])
-        return curve[(directions @ curve.T).argmax(axis=-1)]
-
-    def violation(self, points):
-        points = np.asarray(points)
-        return points[..., 0] ** 2 + points[..., 1] ** 4 - 1
-
-
-@pytest.mark.parametrize("convex", [*sorted(SETS), "egg", "long diamond"])
-def test_the_map_of_a_box_onto_a_set_has_the_slopes_that_it_has(convex):
-    rng = np.random.default_rng(12)
-    index = ParameterIndex({**SETS, "egg": Egg(), "long diamond": NormBall(p=1.0, radius=1.0, dimension=12)}[convex])
-    box = index.box
-    points = rng.uniform(box.lower, box.upper, size=(40, index.count))
-    weights = rng.normal(size=points.shape)
-    claimed = index.pulled_back(points, weights)
-    inside = index.set.contains(points, 0.0)
-    assert np.array_equal(claimed[inside], weights[inside])
-    close = 0
-    for axis in range(index.count):
-        move = 1e-6 * np.eye(index.count)[axis]
-        slope = ((index.clamp(points + move) - index.clamp(points - move)) * weights).sum(axis=1) / 2e-6
-        close += (np.abs(claimed[:, axis] - slope) <= 1e-6 * (1 + np.abs(slope))).sum()
-    assert close >= 0.97 * points.size
-    assert np.array_equal(index.pulled_back(index.set.interior_point()[None], weights[:1]), weights[:1])
-
-
-@pytest.mark.parametrize("enclosable", [True, False])
-def test_the_derivatives_of_the_matrices_are_exact_where_they_can_be_enclosed(enclosable):
-    def A(p):
-        p = p if enclosable else [float(entry) for entry in p]
-        return np.array([[p[0] ** 3, np.sin(p[1])], [p[0] * p[1], 2.0 + 0 * p[0]]])
-
-    system = LinearSystem(A, [[1.0], [2.0]], parameters=Box([-1.0, 0.0], [1.0, 2.0]))
-    for p in ([-1.0, 0.0], [1.0, 2.0], [0.3, 0.7], [0.0, 0.0]):
-        values, B, E = Derivatives(system)(np.array(p))
-        truth = [[[3 * p[0] ** 2, 0.0], [p[1], 0.0]], [[0.0, np.cos(p[1])], [p[0], 0.0]]]
-        assert np.allclose(values[0], A(np.array(p)))
-        assert np.allclose(values[1:], truth, rtol=0, atol=1e-15 if enclosable else 1e-9)
-        assert not np.any(B[1:])
-        assert not np.any(E[1:])
-
-
-def test_the_derivative_beside_a_singularity_stays_inside_the_parameters():
-    system = LinearSystem(lambda p: np.array([[p[0] ** 1.5]]), [[1.0]], parameters=Box([0.0], [1.0]))
-    assert abs(Derivatives(system)(np.array([0.0]))[0][1, 0, 0]) <= 1e-2
-    assert abs(Derivatives(system)(np.array([1.0]))[0][1, 0, 0] - 1.5) <= 1e-9
-
-
-def test_the_tangent_of_a_known_system_is_the_system_itself():
-    rng = np.random.default_rng(13)
-    response = Response(
-        random_system(rng), merge_grids(GRIDS["uniform"].breakpoints, GRIDS["uniform"].breakpoints), np.zeros(2)
-    )
-    assert tangent(response) is response
 
 
 def circle_family(**more):
