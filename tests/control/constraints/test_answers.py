@@ -27,7 +27,7 @@ ONES = np.ones(2)
 UNITS = Units(8.0, ONES, np.array([2.0, 4.0]), ONES[:1], ONES[:0], 0.5)
 
 
-def model(cost: str = "nominal", answering: bool = True, **more: Any) -> Any:
+def model(cost: str = "nominal", answering: bool = True, blocks: int = 2, **more: Any) -> Any:
     """A plant with two controls, which answers a disturbance on two pieces and a set of initial states, or nothing."""
     said = {
         "system": LinearSystem([[0.0, 1.0], [-2.0, -0.3]], [[0.0, 0.2], [1.0, 0.0]], [[0.3], [1.0]]),
@@ -39,7 +39,7 @@ def model(cost: str = "nominal", answering: bool = True, **more: Any) -> Any:
         "initial_set": Box([-0.05, -0.02], [0.05, 0.02]),
         "terminal": [Box([-0.5, -0.5], [0.5, 0.5])],
     }
-    grids = uniform(PIECES, HORIZON), uniform(2, HORIZON)
+    grids = uniform(PIECES, HORIZON), uniform(blocks, HORIZON)
     return prepare(
         sr.OptimalControlProblem(**(said | more)), *grids, policy=sr.AffinePolicy(cost=cost) if answering else None
     )
