@@ -81,7 +81,9 @@ def written(made: Kind, which: str, far: float = 1.0, **more: Any) -> tuple[Any,
 
     def judged(rows: Any, form: object = 1) -> list[str]:
         said = {"format": form, "rows": rows}
-        return [one.verdict for one in check_suprema(made.case(said, path=[wall(limits)], **more))]
+        found = check_suprema(made.case(said, path=[wall(limits)], **more))
+        judged.texts = [one.text for one in found]  # type: ignore[attr-defined]
+        return [one.verdict for one in found]
 
     return rows, judged
 
@@ -136,25 +138,49 @@ def test_measurable_disturbances_do_what_those_that_change_often_do_and_a_little
 
 
 OUTSIDE = np.array([0.02, 0.2])
-WRONG: dict[str, Callable[[dict[str, Any]], object]] = {
-    "sense": lambda row: row.update(sense="inf" if row["sense"] == "sup" else "sup"),
-    "empty": lambda row: row.update(lower=row["upper"] + 1.0),
-    "wall": lambda row: row.update(wall=row["wall"] + 1e-6),
-    "margin": lambda row: row.update(margin=row["margin"] + 1e-6),
-    "margin without a bound": lambda row: row.update({"upper" if row["sense"] == "sup" else "lower": None}),
-    "no wall": lambda row: row.update(wall=None),
-    "early": lambda row: row.update(time=0.2),
-    "late": lambda row: row.update(time=1.9),
-    "a parameter": lambda row: row.update(parameter=[0.0]),
-    "a deviation outside": lambda row: row.update(deviation=OUTSIDE.tolist()),
-    "a deviation of three": lambda row: row.update(deviation=[0.0] * 3),
-    "changes that end early": lambda row: row.update(changes=[*CHANGES, HORIZON - 0.1]),
-    "changes that begin late": lambda row: row.update(changes=[0.1, *CHANGES[1:], HORIZON]),
-    "changes that stand still": lambda row: row.update(changes=[0.0, 1.5, 1.5, HORIZON]),
-    "changes of its own": lambda row: row.update(changes=[0.0, 0.7, 1.5, HORIZON]),
-    "a disturbance outside": lambda row: row.update(disturbance=(1.001 * np.array(row["disturbance"])).tolist()),
-    "another shape": lambda row: row.update(disturbance=row["disturbance"][:1]),
-    "no disturbance": lambda row: row.update(disturbance=None),
+WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "sense": (lambda row: row.update(sense="inf" if row["sense"] == "sup" else "sup"), "its direction is that of"),
+    "empty": (lambda row: row.update(lower=row["upper"] + 1.0), "is empty"),
+    "wall": (lambda row: row.update(wall=row["wall"] + 1e-6), "a wall at"),
+    "margin": (lambda row: row.update(margin=row["margin"] + 1e-6), "a margin of"),
+    "margin without a bound": (
+        lambda row: row.update({"upper" if row["sense"] == "sup" else "lower": None}),
+        "a margin is written without a bound",
+    ),
+    "no wall": (lambda row: row.update(wall=None), "wall: expected numbers"),
+    "early": (lambda row: row.update(time=0.2), "t = 0.2 is not within"),
+    "late": (lambda row: row.update(time=1.9), "t = 1.9 is not within"),
+    "a parameter": (lambda row: row.update(parameter=[0.0]), "parameter: 1 numbers where 0 are expected"),
+    "a deviation outside": (
+        lambda row: row.update(deviation=OUTSIDE.tolist()),
+        "the deviation of the initial state is not shown",
+    ),
+    "a deviation of three": (lambda row: row.update(deviation=[0.0] * 3), "deviation: 3 numbers where 2"),
+    "changes that end early": (
+        lambda row: row.update(changes=[*CHANGES, HORIZON - 0.1]),
+        "changes: expected times from 0 to 2",
+    ),
+    "changes that begin late": (
+        lambda row: row.update(changes=[0.1, *CHANGES[1:], HORIZON]),
+        "changes: expected times from 0 to 2",
+    ),
+    "changes that stand still": (
+        lambda row: row.update(changes=[0.0, 1.5, 1.5, HORIZON]),
+        "changes: expected increasing times",
+    ),
+    "changes of its own": (lambda row: row.update(changes=[0.0, 0.7, 1.5, HORIZON]), "disturbance: expected shape"),
+    "a disturbance outside": (
+        lambda row: row.update(disturbance=(1.001 * np.array(row["disturbance"])).tolist()),
+        "is not shown to be in its set",
+    ),
+    "another shape": (lambda row: row.update(disturbance=row["disturbance"][:1]), "disturbance: expected shape"),
+    "a jump within a piece": (
+        lambda row: row.update(
+            changes=[0.0, 0.3, *row["changes"][1:]], disturbance=[[0.0, *one] for one in row["disturbance"]]
+        ),
+        "the disturbance jumps within a piece",
+    ),
+    "no disturbance": (lambda row: row.update(disturbance=None), "disturbance: expected numbers"),
 }
 
 
@@ -162,8 +188,20 @@ WRONG: dict[str, Callable[[dict[str, Any]], object]] = {
 def test_a_row_that_is_not_the_problems_fails_alone(wrong: str) -> None:
     rows, judged = written(kind("known"), "fixed")
     changed = copy.deepcopy(rows)
-    WRONG[wrong](changed[1])
+    change, sentence = WRONG[wrong]
+    change(changed[1])
     assert judged(changed) == ["holds", "holds", "fails", *["holds"] * (len(rows) - 2)]
+    assert sentence in judged.texts[2]
+
+
+def test_what_is_half_written_is_left_open() -> None:
+    rows, judged = written(kind("known"), "fixed")
+    for side, sentence in (("reached", "no value is written that is reached"), ("proven", "no bound is written on")):
+        first = copy.deepcopy(rows[0])
+        first["lower" if (first["sense"] == "sup") == (side == "reached") else "upper"] = None
+        first["margin"] = None if side == "proven" else first["margin"]
+        assert judged([first, *rows[1:]])[1] == "not checked"
+        assert sentence in judged.texts[1]
 
 
 def test_every_row_of_the_problem_is_written_once() -> None:
