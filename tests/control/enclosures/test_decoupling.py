@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from sparserob_core.control.enclosures.comparison import ComparisonSystem, block_norms, block_sizes, comparison_matrix
-from sparserob_core.control.enclosures.decoupling import MANY, decoupled, decoupled_transitions
+from sparserob_core.control.enclosures.decoupling import MANY, _clusters, decoupled, decoupled_transitions
 
 MATRICES = {
     "a number": [[-3.0]],
@@ -150,3 +150,11 @@ def test_a_long_chain_of_masses_comes_apart_in_whatever_units_its_states_are(see
     chain = np.block([[np.zeros((count, count)), np.eye(count)], [-stiffness, -0.1 * stiffness - 0.05 * np.eye(count)]])
     units = 2.0 ** np.random.default_rng(seed).integers(-30, 30, 2 * count)
     assert decoupled(chain * units / units[:, None]).groups.size == count
+
+
+def test_eigenvalues_that_are_near_each_other_are_one_cluster_in_chains():
+    values = np.array([1.0, 5.0, 1.3, -2.0 + 0.1j, -2.0 - 0.1j, 1.6, 5.25])
+    found = [np.flatnonzero(one).tolist() for one in _clusters(values, 0.3000001)]
+    assert found == [[0, 2, 5], [1, 6], [3, 4]]
+    assert [one.tolist() for one in _clusters(np.array([1.0, 2.0, 3.0]), 0.5)] == np.eye(3, dtype=bool).tolist()
+    assert len(_clusters(np.array([1.0, 2.0, 3.0]), 1.0)) == 1

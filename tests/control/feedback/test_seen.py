@@ -6,15 +6,17 @@ from __future__ import annotations
 import dataclasses
 from functools import cache
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.control.feedback.observer import Observer
 from sparserob_core.control.feedback.tree import Sampled
 from sparserob_core.control.feedback.zonoid import Zonoid
-from sparserob_core.control.sets.sets import Box
+from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.closed_loops import LOOPS
 
@@ -144,3 +146,38 @@ def test_a_set_of_what_a_disturbance_does_has_chords_to_its_boundary():
     for axis, far in zip(axes, high, strict=True):
         along = c @ axis
         assert far == pytest.approx((reach[along > 1e-6] / along[along > 1e-6]).min(), rel=1e-3)
+
+
+def test_the_coordinates_of_what_a_disturbance_does_have_second_moments_alike():
+    """Of corners that reach differently far along the channels."""
+    A, E = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.3, 0.0], [1.0, -0.5]])
+    corners = np.array([[0.4, -0.1], [-0.2, 0.3], [0.1, 0.05]])
+    bound = Polytope(*half_planes(corners))
+    found, lengths = Zonoid.of(A, E, 0.7, bound), (np.arange(100) + 0.5) * 0.7 / 100
+    steps = np.array([expm(A * s) for s in lengths]) @ (E * np.abs(corners - bound.middle()).max(axis=0))
+    moments = np.einsum("sij,skj->ik", steps, steps) * 0.7 / len(steps)
+    assert found.into @ moments @ found.into.T == pytest.approx(np.eye(2), abs=1e-3)
+    assert found.outward @ found.into == pytest.approx(np.eye(2), abs=1e-9)
+
+
+def half_planes(corners):
+    """Of a triangle with corners in any order."""
+    middle, rows, limits = corners.mean(axis=0), [], []
+    for i in range(3):
+        a, b = corners[i], corners[(i + 1) % 3]
+        normal = np.array([b[1] - a[1], a[0] - b[0]])
+        normal = normal * np.sign(normal @ (a - middle))
+        rows.append(normal)
+        limits.append(normal @ a)
+    return np.array(rows), np.array(limits)
+
+
+def test_a_coordinate_along_which_nearly_nothing_happens_is_not_answered():
+    pieces = made("measurable")[1].measurable
+    outward = np.array([[1.0, 0.0, 1e-9, 0.3], [0.0, 0.0, 0.0, 0.4]])
+    stub = SimpleNamespace(outward=outward, dimension=4)
+    few = dataclasses.replace(pieces, zonoids=(stub, *pieces.zonoids[1:]))
+    assert few.seen(0).tolist() == [True, False, False, True]
+    at, states = few.at(1)
+    assert (at.start, at.stop) == (4, 4 + pieces.zonoids[1].dimension)
+    assert (states == pieces.states[:, None] * pieces.zonoids[1].outward).all()

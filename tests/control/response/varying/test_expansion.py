@@ -11,7 +11,7 @@ import pytest
 import sparserob_core.control.response.varying.expansion as varying
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.response import Response, merge_grids
-from sparserob_core.control.response.varying.expansion import Expansion, Flow
+from sparserob_core.control.response.varying.expansion import Expansion, Flow, balanced
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from tests.support.integration import mathieu
@@ -119,3 +119,21 @@ def test_rows_at_any_time_are_those_of_the_states() -> None:
     fine = Response(FADING, grid.refined(np.union1d(grid.breakpoints, times)), np.array([2.0]))
     states = fine.states(u[:, grid.control_piece], np.zeros((1, 0)))[0, :, 0]
     np.testing.assert_allclose(states[np.searchsorted(fine.grid.breakpoints, times)], exact, rtol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_units_are_those_in_which_rows_and_columns_are_of_like_size(seed: int) -> None:
+    """Whatever units a matrix is written in; the same up to a common factor where one state is written in others."""
+    rng = np.random.default_rng(seed)
+    plain = rng.uniform(0.5, 2.0, size=(4, 4)) * rng.choice([-1.0, 1.0], size=(4, 4))
+    written = np.exp2(rng.integers(-12, 12, size=4))
+    A = plain * written[:, None] / written
+    units = balanced(A, 1.0)
+    assert (np.log2(units) % 1.0 == 0.0).all()
+    moved = np.abs(A) * units / units[:, None]
+    np.fill_diagonal(moved, 0.0)
+    assert (moved.max(axis=1) <= 4.0 * moved.max(axis=0)).all() and (moved.max(axis=0) <= 4.0 * moved.max(axis=1)).all()
+    assert np.abs(np.log2(units / written) - np.log2(units / written).mean()).max() <= 2.0
+    # a state that reaches others, and that no other one reaches, is no state of infinite or no size
+    one_way = np.triu(A)
+    assert np.isfinite(balanced(one_way, 1.0)).all() and (balanced(np.zeros((2, 2)), 1.0) == 1.0).all()
