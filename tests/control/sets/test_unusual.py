@@ -1,0 +1,86 @@
+"""Guards control/sets: what a linear program or a hull does not answer is said, never guessed."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Polytope
+from sparserob_core.errors import InputError
+
+SQUARE = np.vstack([np.eye(2), -np.eye(2)]), np.ones(4)
+
+
+def test_a_polytope_about_which_a_program_says_nothing_is_refused(monkeypatch):
+    monkeypatch.setattr(scipy.optimize, "linprog", lambda *a, **k: SimpleNamespace(status=4, message="numbers failed"))
+    with pytest.raises(InputError, match=r"could not decide whether it is empty \(numbers failed\)"):
+        Polytope(*SQUARE)
+
+
+def test_where_a_program_fails_a_support_is_infinite_and_never_too_small(monkeypatch):
+    made = Polytope(*SQUARE)
+    assert made._maximise(np.array([3.0, -4.0])) == (pytest.approx(7.0), pytest.approx([1.0, -1.0]))
+    assert made._maximise(np.zeros(2))[0] == 0.0
+    monkeypatch.setattr(scipy.optimize, "linprog", lambda *a, **k: SimpleNamespace(status=1, message=""))
+    value, point = made._maximise(np.array([3.0, -4.0]))
+    assert value == np.inf and made.contains(point)
+
+
+def test_flat_polytopes_have_no_vertices_and_keep_their_support():
+    segment = Polytope([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], [1.0, 0.5, 0.25, -0.25])
+    assert segment.vertices is None
+    c = np.array([[1.0, 2.0], [-3.0, 1.0]])
+    assert segment.support(c) == pytest.approx([1.0 + 0.5, 1.5 + 0.25])
+    assert segment.amid() == pytest.approx(segment.interior_point())
+    assert Polytope(*SQUARE).amid() == pytest.approx([0.0, 0.0])
+    assert sorted(map(tuple, np.round(Polytope(*SQUARE).vertices, 9).tolist())) == [(-1, -1), (-1, 1), (1, -1), (1, 1)]
+
+
+@pytest.mark.parametrize(
+    "bound", [Polytope(*SQUARE), Polytope([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [1.0, 0.5, 0.5])]
+)
+def test_extreme_samples_lie_on_the_boundary(bound):
+    rng = np.random.default_rng(1)
+    points = bound.sample_extreme(30, rng)
+    assert points.shape == (30, 2) and bound.violation(points) == pytest.approx(np.zeros(30), abs=1e-9)
+    inside = bound.sample(200, rng)
+    assert bound.contains(inside, 1e-9).all()
+    low, high = bound.bounding_box().lower, bound.bounding_box().upper
+    assert (inside.min(axis=0) < low + 0.2 * (high - low)).all() and (
+        inside.max(axis=0) > high - 0.4 * (high - low)
+    ).all()
+
+
+@pytest.mark.parametrize(
+    ("build", "sentence"),
+    [
+        (lambda: Ellipsoid([0.0], "wide"), "shape must be a square matrix of numbers"),
+        (lambda: Ellipsoid([0.0, 0.0], [[1.0, 0.0]]), r"square matrix of finite numbers, got shape \(1, 2\)"),
+        (lambda: Ellipsoid([0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]]), "symmetric positive definite"),
+        (lambda: Ellipsoid([0.0, 0.0], [[1.0, 0.1], [0.2, 1.0]]), "symmetric positive definite"),
+        (lambda: NormBall(0.5, 1.0, dimension=2), "a number of at least 1"),
+        (lambda: NormBall(2.0, -1.0, dimension=2), "a finite number, at least 0"),
+        (lambda: NormBall(2.0, np.inf, dimension=2), "a finite number, at least 0"),
+        (lambda: NormBall(2.0, 1.0), "a centre, or a dimension"),
+        (lambda: NormBall(2.0, 1.0, dimension=0), "at least 1"),
+        (lambda: NormBall(2.0, 1.0, centre=[np.inf]), "finite numbers"),
+        (lambda: Polytope("H", [1.0]), "H must be a matrix of numbers"),
+        (lambda: Polytope([[np.inf]], [1.0]), "matrix of finite numbers"),
+        (lambda: Polytope([[1.0]], [-np.inf]), "h must not be -inf"),
+        (lambda: Polytope([[1.0], [0.0]], [1.0, -1.0]), "empty, row 1 of H is zero"),
+        (lambda: Polytope([[1.0], [-1.0]], [1.0, -2.0]), "empty, no point satisfies"),
+        (lambda: Equality("x"), "a list of numbers, null where free"),
+        (lambda: Equality([np.inf]), "a list of finite numbers"),
+        (lambda: Equality([]), "a list of finite numbers"),
+    ],
+)
+def test_numbers_that_describe_no_set_are_refused_by_what_was_expected(build, sentence):
+    with pytest.raises(InputError, match=sentence):
+        build()
+
+
+def test_what_is_fixed_has_the_dimension_of_the_state():
+    assert Equality([0.5, None, 1.0]).dimension == 3 and Box([-1.0], [1.0]).dimension == 1
