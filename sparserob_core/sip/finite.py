@@ -168,8 +168,8 @@ class FiniteProgram:
 
     @shaped
     def objective(self, x: Float[Array, " n"]) -> float:
-        """The cost at ``x``."""
-        quadratic = 0.0 if self.P is None else 0.5 * float(x @ self._bent(x))
+        """The cost at ``x``; of squares that cancel rounding may leave less than 0, and they are never less."""
+        quadratic = 0.0 if self.P is None else max(0.0, 0.5 * float(x @ self._bent(x)))
         return float(self.weights @ self._lengths(x) + self.q @ x) + quadratic + self.constant
 
     @shaped

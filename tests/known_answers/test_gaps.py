@@ -4,6 +4,7 @@ and what need not act costs exactly nothing."""
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,35 @@ def test_squares_that_need_not_be_anything_cost_exactly_nothing(policy, cost, tm
     }
     result = sr.run(stated, out=tmp_path / "run", quiet=True, figures=False).result
     assert (result.status, result.lower_bound, result.upper_bound, result.gap) == ("certified", 0.0, 0.0, 0.0)
+    assert [claim.verdict for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"] == []
+
+
+@pytest.mark.parametrize(("spare", "status"), [(0.0, "verified"), (1e-6, "certified"), (1e-9, None)])
+def test_squares_that_cancel_are_certified_where_what_is_left_is_no_rounding(spare, status, tmp_path):
+    """Along ``u_1 = 7/3 u_2`` the cost ``R`` is 0 but for rounding, and the control has to go there: -7e-19 was written
+    of what costs 8e-19 and certified, and `check` refused costs that are off by the rounding of their products."""
+    R = [[0.09 + spare, -0.21], [-0.21, 0.49]]
+    stated = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[0.0, 0.0], [0.0, 0.0]], "B": [[1.0, 0.0], [0.0, 1.0]]},
+            "horizon": 1.0,
+            "initial_state": [0.7, 0.3],
+            "control": {"box": [5.0, 5.0]},
+            "terminal": [{"box": [1e-3, 1e-3]}],
+            "cost": {"l1": 0.0, "control": {"R": R}},
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+    }
+    result = sr.run(stated, out=tmp_path / "run", quiet=True, figures=False).result
+    u, exact = result.decision.reshape(2, 4).tolist(), [[Fraction(entry) for entry in row] for row in R]
+    cost = sum(
+        exact[i][j] * Fraction(u[i][k]) * Fraction(u[j][k]) / 4 for i in range(2) for j in range(2) for k in range(4)
+    )
+    assert 0.0 <= result.lower_bound <= result.cost <= cost + Fraction(1e-15)
+    assert result.status in ((status,) if status else ("certified", "verified"))
+    if result.status == "certified":
+        assert cost - Fraction(result.lower_bound) <= Fraction(1e-6) * cost
     assert [claim.verdict for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"] == []
 
 

@@ -39,8 +39,8 @@ VARYING = 96  # more bits for a tree of products, in each level of which balls g
 FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
 SMALL_COST = 1e-6  # of what is added up to a cost: a gap is relative to at least so much
 # Of what is added up to a cost: so much must agree to `FIGURES` where terms cancel, that is, to 1e-14 of the terms,
-# some forty roundings. Ten times smaller, and honest costs of 0 are refused, whose terms were rounded; ten times
-# larger, and a cost may be written lower than it is by as much as a gap that counts as closed.
+# some forty roundings. Ten times smaller, and honest costs of 0 are refused, whose terms were rounded. Whether a gap is
+# closed is judged by the cost that is derived, where that is the larger one.
 CANCELLED = 1e-3
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
 ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
@@ -262,7 +262,7 @@ def _cost(case: Case) -> str:
     if case.counts:
         return _counted(case)
     derived = answers_of(case).cost()
-    _agrees("cost", number(case.certificate, "cost"), derived, CANCELLED * added_up(case))
+    _agrees("cost", number(case.certificate, "cost"), derived, CANCELLED * compared(case))
     return f"J = {float(derived.mid()):.12g}{_effort(case)}"
 
 
@@ -278,7 +278,12 @@ def _counted(case: Case) -> str:
     acted, total = activity.acted(case), activity.largest(case)
     _agrees("cost", number(case.certificate, "cost"), arb(acted * total), 0.0)
     derived = case.price.of(case.pieces)
-    _agrees("J", number(case.certificate, "J"), derived, CANCELLED * case.price.added(case.pieces))
+    _agrees(
+        "J",
+        number(case.certificate, "J"),
+        derived,
+        CANCELLED * max(case.price.added(case.pieces), case.price.terms(case.pieces)),
+    )
     if case.letters is not None and not np.isin(case.control.control(case.theta), case.letters).all():
         raise Broken(f"the control takes other values than {list(case.letters)}")
     unit = f" {case.problem.names.time}" if case.problem.names.time else ""
@@ -430,9 +435,11 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
     if any(claim.verdict == "not checked" for claim in needed):
         raise Unchecked(f"{status} rests on claims that were not checked")
     cost, lower = number(case.certificate, "cost"), number(case.certificate, "lower_bound")
-    gap = relative_gap(case, cost, lower)
     if status == "verified":
-        return f"every constraint is kept; the gap is {gap:.2e}"
+        return f"every constraint is kept; the gap is {relative_gap(case, cost, lower):.2e}"
+    if case.price.is_quadratic and not case.counts:
+        cost = max(cost, -below(-answers_of(case).cost()))
+    gap = relative_gap(case, cost, lower)
     written = case.certificate.get("gap_tolerance")
     if tolerance is None or written != tolerance:
         raise Broken(f"the gap is to be within {written!r}, the config says {tolerance!r}")
@@ -454,6 +461,12 @@ def added_up(case: Case) -> float:
         return abs(cost)
     other = None if case.charge == "nominal" else cost - case.price.squares(case.pieces)
     return case.price.added(case.pieces, other)
+
+
+def compared(case: Case) -> float:
+    """What the rounding of a cost is a share of: all products that are added up to it, which may be more than
+    `added_up` where they cancel within the matrix of one term."""
+    return max(added_up(case), 0.0 if case.counts else case.price.terms(case.pieces))
 
 
 def largest_cost(case: Case) -> float:

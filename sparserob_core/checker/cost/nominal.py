@@ -30,12 +30,13 @@ EVERY = 1000  # terms of a series, more than there are
 @final
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """The quadratic terms at a control, their derivatives on every piece, and the largest radius of them, relative to
-    the sizes that are added up."""
+    """The quadratic terms at a control, their derivatives on every piece, the largest radius of them, relative to the
+    sizes that are added up, and ``terms``: the absolute values of all products that are added up to the value."""
 
     value: arb
     slope: list[list[arb]]
     blurred: float
+    terms: float
 
 
 def walked(
@@ -57,11 +58,11 @@ def walked(
         walked.append((k, flow, weight, z))
         x = arb_mat((flow * z).tolist()[: d + 1])
     costate = modes[0].final * x
-    value = (x.transpose() * costate)[0, 0]
+    value, terms = (x.transpose() * costate)[0, 0], _terms(x, modes[0].final)
     slope: list[list[arb]] = [[arb(0)] * m for _ in pieces]
     for k, flow, weight, z in reversed(walked):
         own = weight * z
-        value = value + (z.transpose() * own)[0, 0]
+        value, terms = value + (z.transpose() * own)[0, 0], terms + _terms(z, weight)
         both = (own + flow.transpose() * arb_mat([*costate.tolist(), *([arb(0)] for _ in range(m))])).tolist()
         costate = arb_mat(both[: d + 1])
         if k >= 0:
@@ -72,12 +73,20 @@ def walked(
         for k, (start, stop) in enumerate(pairwise(ends)):
             push = matrix * pieces[k] * ball_of(stop - start)
             value = value + (pieces[k].transpose() * push)[0, 0]
+            terms += _terms(pieces[k], matrix) * float(stop - start)
             slope[k] = [g + 2 * entry for g, entry in zip(slope[k], push.entries(), strict=True)]
     sizes = [abs(float(value.mid())), *(abs(float(g.mid())) for entry in slope for g in entry)]
     radii = [float(value.rad()), *(float(g.rad()) for entry in slope for g in entry)]
     exact = max(radii) == 0.0
     blurred = 0.0 if exact else float("inf") if not np.isfinite(sum(radii)) else max(radii) / (max(sizes) or 1.0)
-    return Walk(value, slope, blurred)
+    return Walk(value, slope, blurred, terms)
+
+
+def _terms(z: arb_mat, M: arb_mat) -> float:
+    """``|z|' |M| |z|``."""
+    size = np.array([abs(float(entry.mid())) for entry in z.entries()])
+    weight = np.abs([float(entry.mid()) for entry in M.entries()]).reshape(size.size, size.size)
+    return float(size @ weight @ size)
 
 
 def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[Fraction, Fraction, int, int]]:

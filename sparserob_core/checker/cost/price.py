@@ -158,6 +158,11 @@ class Price:
         linear = found.value - constant - bent
         return float((norms + abs(linear) + abs(bent) + abs(constant)).mid())
 
+    def terms(self, pieces: Sequence[arb_mat]) -> float:
+        """The absolute values of all products that are added up to the quadratic terms of a control: what rounding is a
+        share of, also where they cancel within one matrix."""
+        return self._quadratic(pieces).terms if self.is_quadratic else 0.0
+
     @cached_property
     def largest(self) -> float:
         """What a gap is relative to: the largest cost of the absolute values, and the largest of the quadratic terms

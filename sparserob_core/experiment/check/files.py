@@ -224,11 +224,14 @@ def _cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """What is added up to the cost; earlier versions wrote the largest possible cost, or nothing."""
     if "cost_scale" not in summary:
         return None
-    from sparserob_core.checker.claims.claims import added_up, largest_cost
+    from sparserob_core.checker.claims.claims import CANCELLED, added_up, compared, largest_cost
+    from sparserob_core.checker.claims.claims import FIGURES as AGREED
 
-    said = summary["cost_scale"]
-    derived = 0.0 if case.certificate.get("decision") is None else added_up(case)
-    known = _same(said, derived, CLOSE) or _same(said, largest_cost(case), CLOSE)
+    said, decided = summary["cost_scale"], case.certificate.get("decision") is not None
+    derived = added_up(case) if decided else 0.0
+    rounded = AGREED * CANCELLED * compared(case) if decided else 0.0
+    near = isinstance(said, float) and abs(said - derived) <= rounded
+    known = near or _same(said, derived, CLOSE) or _same(said, largest_cost(case), CLOSE)
     return [] if known else [f"cost_scale is {said!r}, not {derived!r}"]
 
 
@@ -264,10 +267,10 @@ def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     anew."""
     if summary.get("epsilon") != 0.0 or case.certificate.get("status") == "infeasible":
         return None
-    from sparserob_core.checker.claims.claims import CANCELLED, added_up
+    from sparserob_core.checker.claims.claims import CANCELLED, compared
 
     value, cost = summary.get("value"), summary.get("cost")
-    slack = FIGURES * CANCELLED * added_up(case)
+    slack = FIGURES * CANCELLED * compared(case)
     near = isinstance(value, float) and isinstance(cost, float) and abs(value - cost) <= slack
     return [] if near or _same(value, cost) else [f"value is {value!r} without a regulariser, the cost {cost!r}"]
 

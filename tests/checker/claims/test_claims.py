@@ -104,6 +104,30 @@ def test_a_cost_whose_terms_cancel_agrees_to_the_rounding_of_its_terms():
                 claims._cost(case)
 
 
+def test_a_cost_that_cancels_within_one_matrix_agrees_to_the_rounding_of_its_products():
+    """``(u_1 - u_2)^2 + 2^-30 u_2^2`` of equal controls, integrated: what is left of products that add up to 1.25. To
+    1e-14 of these a cost may be written, but where it is written lower the gap is that of the cost there is."""
+    cost, R = 0.3125 * 2.0**-30, [[1.0, -1.0], [-1.0, 1.0 + 2.0**-30]]
+    plant = {
+        "control": Box([-1.0] * 2, [1.0] * 2),
+        "cost": sr.Cost(l1=0.0, control={"R": R}),
+        "decision": ((-0.5, -0.25), (-0.5, -0.25)),
+    }
+    for off, agrees in ((0.0, True), (1e-14, True), (-1e-14, True), (3e-14, False), (-3e-14, False)):
+        said = {"cost": cost + off, "lower_bound": cost + off, "gap_tolerance": 1e-6, "status": "certified"}
+        case = case_of(certificate=said, **plant)
+        if agrees:
+            assert claims._cost(case).startswith("J = 2.91038304")
+        else:
+            with pytest.raises(Broken, match="cost"):
+                claims._cost(case)
+        if off < 0.0:
+            with pytest.raises(Broken, match="certified, but the gap is"):
+                claims._status(case, "certified", 1e-6, [])
+        else:
+            assert "within 0.00e+00" in claims._status(case, "certified", 1e-6, [])
+
+
 def entry(y=1.0, **more):
     said = {"constraint": "terminal", "time": 2.0, "direction": [1.0], "parameter": [], "multiplier": y}
     return {**said, **more}
