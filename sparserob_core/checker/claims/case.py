@@ -104,7 +104,7 @@ class Case:
     @cached_property
     def windows(self) -> list[Window]:
         """The state constraints, under the names that the certificate uses."""
-        path = [entry for entry in self.problem.path if not isinstance(entry, ConvexSet | Return)]
+        path = [entry for entry in self.problem.windows if not isinstance(entry, Return)]
         d, own = self.problem.system.states, sum(not isinstance(entry, Accumulated) for entry in path)
         ends = [end for end in self.problem.terminal if not isinstance(end, Equality)]
         found = [

@@ -92,7 +92,7 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
         initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(size - d)]),
         initial_set=None if begun is None else _begun(begun, size),
         path=[
-            *(_freed(entry, size) for entry in problem.path),
+            *(_freed(entry, size) for entry in problem.windows),
             *(Accumulated(_summed(sums, size), time, time, name) for name, time, sums in windows),
         ],
         terminal=[
@@ -153,8 +153,7 @@ def _with(mode: LinearSystem, rates: list[tuple[Array, Array]]) -> LinearSystem:
     return LinearSystem(given["A"], given["B"], given["E"], mode.parameters, mode.names, given.get("c"))
 
 
-def _freed(entry: PathConstraint | MixedConstraint | ConvexSet, size: int) -> PathConstraint | MixedConstraint:
-    assert not isinstance(entry, ConvexSet)
+def _freed(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint | MixedConstraint:
     if isinstance(entry, MixedConstraint):
         H = np.asarray(entry.H)
         return replace(entry, H=np.pad(H, ((0, 0), (0, size - H.shape[1]))))

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.prices import weights_between
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.response import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import path_names, prepare
@@ -66,18 +63,21 @@ def remaining(
     control = _rest(model.control, begin, problem.horizon)
     disturbance = control if alone else _rest(model.disturbance.merged(), begin, problem.horizon)
     horizon = control.horizon
-    left = replace(
-        problem,
-        weights=weights_between(problem.weights, begin, horizon),
-        system=_system(problem, begin, horizon),
-        horizon=horizon,
+    windows = [
+        entry.remaining(begin, horizon, name=name)
+        for entry, name in zip(problem.windows, path_names(problem), strict=True)
+    ]
+    left = problem.remaining(
+        begin,
+        horizon,
         initial_state=state,
         initial_set=None,
         initial_control=before if problem.control_step is not None else None,
-        path=[*_windows(problem, begin, horizon), *_seam(problem, control, again)],
+        path=[*filter(None, windows), *_seam(problem, control, again)],
         repeat=False,  # the return is among the windows
+        **({"disturbance": None} if alone else {}),
     )
-    left = replace(left, disturbance=None) if alone else left
+    assert left is not None
     return prepare(left, control, disturbance, policy=None if alone else model.policy)
 
 
@@ -89,23 +89,6 @@ def _rest(dictionary: Dictionary, begin: float, horizon: float) -> Dictionary:
     return Dictionary(np.concatenate([[0.0], later]), np.eye(later.size))
 
 
-def _windows(problem: OptimalControlProblem, begin: float, horizon: float) -> list[PathConstraint | MixedConstraint]:
-    """The windows that are not over, with the names that they had."""
-    found: list[PathConstraint | MixedConstraint] = []
-    for entry, name in zip(problem.path, path_names(problem), strict=True):
-        assert isinstance(entry, PathConstraint | MixedConstraint)
-        stop = problem.horizon if entry.stop is None else entry.stop
-        if stop <= begin + SAME_TIME * problem.horizon:
-            continue
-        start, stop = min(max(0.0, entry.start - begin), horizon), min(stop - begin, horizon)
-        if isinstance(entry, MixedConstraint):
-            found.append(replace(entry, name=name, start=start, stop=stop))
-        else:
-            moved = None if entry.relative_to is None else _moved(np.asarray(entry.relative_to, dtype=float), begin)
-            found.append(replace(entry, name=name, relative_to=moved, start=start, stop=stop))
-    return found
-
-
 def _seam(problem: OptimalControlProblem, control: Dictionary, again: Array | None) -> list[MixedConstraint]:
     """The last control, from which the one that begins the next period is a step."""
     flat = None if problem.control_step is None else problem.control_step.halfspaces()
@@ -114,22 +97,3 @@ def _seam(problem: OptimalControlProblem, control: Dictionary, again: Array | No
     (H, h), begin = flat, float(control.breakpoints[-2])
     still = np.zeros((h.size, problem.system.states))
     return [MixedConstraint(still, -H, h - H @ again, begin, control.horizon, name="seam")]
-
-
-def _moved(rows: Array, begin: float) -> Array:
-    """Rows of a time and a point ``(q, 1 + d)``, from ``begin`` on."""
-    shifted = rows - np.eye(1, rows.shape[1])[0] * begin
-    later: Array = shifted[shifted[:, 0] > 0.0]
-    if shifted[0, 0] > 0.0:
-        return later
-    now = [np.interp(0.0, shifted[:, 0], column) for column in shifted[:, 1:].T]
-    return np.vstack([[0.0, *now], later])
-
-
-def _system(problem: OptimalControlProblem, begin: float, horizon: float) -> LinearSystem | SwitchedSystem:
-    system = problem.system
-    assert not isinstance(system, VaryingSystem)  # which was refused
-    if not isinstance(system, SwitchedSystem):
-        return system
-    left = [(until - begin, one) for until, one in system.pieces if until > begin + SAME_TIME * problem.horizon]
-    return SwitchedSystem([*left[:-1], (horizon, left[-1][1])]) if len(left) > 1 else left[-1][1]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
+from sparserob_core.control.term import Term, measured
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import dense, sealed
+from sparserob_core.shapes import dense
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
 
 SAME = (
@@ -19,19 +21,16 @@ SAME = (
 
 
 @dataclass(frozen=True, eq=False)
-class Measurements:
+class Measurements(Term):
     """``y_j = C x(tau_j) + v_j`` at every breakpoint ``tau_j`` of the control's dictionary, with ``C (p, d)`` and
     ``v_j`` in the bounded set ``noise``, ``None`` for none; the control knows ``y_j`` from ``tau_j + latency`` on, in
     the time unit of the problem."""
 
-    C: npt.ArrayLike
-    noise: ConvexSet | None = None
-    latency: float = 0.0
+    C: npt.ArrayLike = field(metadata=measured(lambda of: of.outputs[:, None] / of.states))
+    noise: ConvexSet | None = field(default=None, metadata=measured(lambda of: of.outputs))
+    latency: float = field(default=0.0, metadata=measured(lambda of: of.time))
 
     __repr__ = noun
-
-    def __post_init__(self) -> None:
-        sealed(self)
 
     @property
     def outputs(self) -> int:
@@ -77,12 +76,9 @@ class Measurements:
         units: Array = np.exp2(np.round(np.log2(sizes)))
         return units
 
-    def in_units(self, states: Array, time: float) -> Measurements:
-        """The same with every number in other units, of time and of the states; outputs in those that `units` says."""
-        outputs = self.units(states)
-        C = np.asarray(self.C) * states / outputs[:, None]
-        noise = None if self.noise is None else self.noise.in_units(outputs)
-        return Measurements(C, noise, self.latency / time)
+    def in_units(self, units: Any) -> Measurements:
+        """The same with every number in these `Units`, outputs in those that `units` says."""
+        return super().in_units(replace(units, outputs=self.units(units.states)))
 
     def latest(self, breakpoints: Array) -> Array:
         """When what each piece of the control knows last was measured, ``(K,)``; 0 of one that knows nothing."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal, TypeAlias, final
 
@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.control.problem.prices import by_time
+from sparserob_core.control.term import TERMS, UNITLESS, Term, measured
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import dense, sealed
+from sparserob_core.shapes import dense
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 EXACT = 16  # states up to which a matrix is shown to be positive semidefinite in fractions
@@ -22,24 +23,23 @@ ROUNDED = 1e-13  # of the diagonal, per row: a negative eigenvalue of at most th
 
 @final
 @dataclass(frozen=True, eq=False)
-class Quadratic:
+class Quadratic(Term):
     """``(v - reference)' Q (v - reference)``: ``Q (d, d)`` symmetric and positive semidefinite, ``reference (d,)``."""
 
-    Q: Array
-    reference: Array
+    Q: Array = field(metadata=measured(lambda of: of.cost / np.outer(of.states, of.states)))
+    reference: Array = field(metadata=measured(lambda of: of.states))
 
     __repr__ = noun
 
-    def __post_init__(self) -> None:
-        sealed(self)
 
-
-Term: TypeAlias = Quadratic | Mapping[str, npt.ArrayLike]
+Weighted: TypeAlias = Quadratic | Mapping[str, npt.ArrayLike]
+OF_STATES = measured(lambda of: replace(of, cost=of.cost / of.time))
+OF_CONTROLS = measured(lambda of: replace(of, states=of.controls, cost=of.cost / of.time))
 
 
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cost:
+class Cost(Term):
     """``J = l1 int sum_i weights_i |u_i| dt + int (x - r)' Q (x - r) dt + int u' R u dt + (x(T) - r)' Q (x(T) - r)``,
     ``x`` the nominal trajectory.
 
@@ -52,11 +52,11 @@ class Cost:
     The nominal trajectory is that of the `nominal_point` of every uncertainty set.
     """
 
-    l1: float = 1.0
-    group: Sequence[Sequence[int]] | Literal["all"] | None = None
-    state: Term | None = None
-    control: Term | None = None
-    final: Term | None = None
+    l1: float = field(default=1.0, metadata=UNITLESS)
+    group: Sequence[Sequence[int]] | Literal["all"] | None = field(default=None, metadata=UNITLESS)
+    state: Weighted | None = field(default=None, metadata=OF_STATES)
+    control: Weighted | None = field(default=None, metadata=OF_CONTROLS)
+    final: Weighted | None = field(default=None, metadata=TERMS)
 
     __repr__ = noun
 
@@ -101,16 +101,6 @@ class Cost:
         """Whether it is a weighted sum of absolute values."""
         return not self.is_quadratic and not self.blocks
 
-    def in_units(self, states: Array, controls: Array, time: float, cost: float) -> Cost:
-        """The same cost of states, controls, times and costs in these units."""
-        state, control, final = self.terms
-        return replace(
-            self,
-            state=_scaled(state, states, time / cost),
-            control=_scaled(control, controls, time / cost),
-            final=_scaled(final, states, 1.0 / cost),
-        )
-
     def words(self) -> str:
         """What is added up to the cost, in a few words; empty where that is the L1 norm alone."""
         if self.is_linear and self.l1 == 1.0:
@@ -133,10 +123,6 @@ def nominal_point(convex: ConvexSet) -> Array:
         return np.asarray(middle, dtype=float)
     vertices = getattr(convex, "vertices", None)
     return convex.interior_point() if vertices is None else np.asarray(vertices, dtype=float).mean(axis=0)
-
-
-def _scaled(term: Quadratic | None, units: Array, factor: float) -> Quadratic | None:
-    return None if term is None else Quadratic(factor * units[:, None] * term.Q * units, term.reference / units)
 
 
 def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ...], ...] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.control.term import timed
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, as_bound
 
@@ -88,7 +89,4 @@ def weights_between(weights: object, begin: float, horizon: float) -> Array:
     return kept[kept[:, 0] < horizon]
 
 
-def in_units(weights: object, factors: Array, time: float) -> Array:
-    """The weights times ``factors (m,)``, their times in a unit of ``time``."""
-    rows = np.asarray(weights, dtype=float)
-    return rows * factors if rows.ndim == 1 else rows * np.concatenate([[1.0 / time], factors])
+WEIGHTS = timed(lambda of: of.cost / (of.controls * of.time), weights_between)

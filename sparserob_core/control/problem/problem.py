@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, final, get_args
+from typing import TYPE_CHECKING, Any, Self, final, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from sparserob_core.control.problem.disturbances import (
     joined,
 )
 from sparserob_core.control.problem.names import UNNAMED, Names
-from sparserob_core.control.problem.prices import checked_weights, counted, integrals
+from sparserob_core.control.problem.prices import WEIGHTS, checked_weights, counted, integrals
 from sparserob_core.control.problem.system import (
     LinearSystem,
     SwitchedSystem,
@@ -33,6 +33,7 @@ from sparserob_core.control.problem.system import (
     require_period,
 )
 from sparserob_core.control.sets.sets import Equality, Polytope, Product
+from sparserob_core.control.term import CONTROLS, STATES, TERMS, TIME, UNITLESS, Term, measured, over, timed
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense, sealed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
@@ -48,28 +49,60 @@ RETURN = "return"  # what the constraint that a plan which repeats ends where it
 WITHIN = 1e-8
 
 
+SYSTEM = {
+    "in_units": lambda system, units: units.of_system(system),
+    "remaining": lambda system, begin, horizon: system.remaining(begin, horizon),
+}
+
+
+def _moved(rows: npt.ArrayLike, begin: float, horizon: float) -> Array:
+    """Rows of a time and a point ``(q, 1 + d)``, from ``begin`` on."""
+    given = np.asarray(rows, dtype=float)
+    shifted = given - np.eye(1, given.shape[1])[0] * begin
+    later: Array = shifted[shifted[:, 0] > 0.0]
+    if shifted[0, 0] > 0.0:
+        return later
+    now = [np.interp(0.0, shifted[:, 0], column) for column in shifted[:, 1:].T]
+    return np.vstack([[0.0, *now], later])
+
+
+def _pieces(times: Array, begin: float, horizon: float) -> Array:
+    """Breakpoints from ``begin`` on, with what is left of the piece that has begun."""
+    later = [time - begin for time in times.tolist() if not over(time, begin, horizon)]
+    return np.array([0.0, *later[:-1], horizon])
+
+
+class _Window(Term):
+    """What holds from a ``start`` to a ``stop``."""
+
+    start: float
+    stop: float | None
+
+    def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
+        if self.stop is not None and over(self.stop, begin, horizon):
+            return None
+        return super().remaining(begin, horizon, **given)
+
+
 @dataclass(frozen=True, eq=False)
-class PathConstraint:
+class PathConstraint(_Window):
     """The state stays in ``set`` for all times in ``[start, stop]``; ``stop`` is the horizon when ``None``.
 
     ``relative_to (q, 1 + d)``: rows of a time and a point, times increasing: then ``x(t) - r(t)`` stays in the set,
     where ``r`` runs from point to point along straight lines. The times cover the window.
     """
 
-    set: ConvexSet
-    start: float = 0.0
-    stop: float | None = None
-    name: str | None = None
-    relative_to: npt.ArrayLike | None = None
+    set: ConvexSet = field(metadata=STATES)
+    start: float = field(default=0.0, metadata=TIME)
+    stop: float | None = field(default=None, metadata=TIME)
+    name: str | None = field(default=None, metadata=UNITLESS)
+    relative_to: npt.ArrayLike | None = field(default=None, metadata=timed(lambda of: of.states, _moved))
 
     __repr__ = noun
 
-    def __post_init__(self) -> None:
-        sealed(self)
-
 
 @dataclass(frozen=True, eq=False)
-class MixedConstraint:
+class MixedConstraint(_Window):
     """``H x(t) + G u(t) <= h`` for all times in ``[start, stop]``; ``H (r, d)``, ``G (r, m)``, ``h (r,)``, a number for
     all rows alike; ``stop`` is the horizon when ``None``.
 
@@ -77,17 +110,14 @@ class MixedConstraint:
     of that piece: where the control jumps, with both of its values. ``u(t)`` is the commanded control, delay or not.
     """
 
-    H: npt.ArrayLike
-    G: npt.ArrayLike
-    h: npt.ArrayLike
-    start: float = 0.0
-    stop: float | None = None
-    name: str | None = None
+    H: npt.ArrayLike = field(metadata=measured(lambda of: 1.0 / of.states))
+    G: npt.ArrayLike = field(metadata=measured(lambda of: 1.0 / of.controls))
+    h: npt.ArrayLike = field(metadata=UNITLESS)
+    start: float = field(default=0.0, metadata=TIME)
+    stop: float | None = field(default=None, metadata=TIME)
+    name: str | None = field(default=None, metadata=UNITLESS)
 
     __repr__ = noun
-
-    def __post_init__(self) -> None:
-        sealed(self)
 
     @cached_property
     def set(self) -> Polytope:
@@ -96,7 +126,7 @@ class MixedConstraint:
 
 
 @dataclass(frozen=True, eq=False)
-class IntegralConstraint:
+class IntegralConstraint(_Window):
     """``lower <= int_start^stop (H x(t) + G u(t)) dt <= upper``, row by row: fuel of a channel, energy of a battery, a
     mean temperature. ``H (r, d)``, ``G (r, m)``, either of them absent: 0; ``lower``, ``upper (r,)``, a number for all
     rows alike, infinite or ``None`` where there is no bound; ``stop`` is the horizon when ``None``.
@@ -105,18 +135,21 @@ class IntegralConstraint:
     row, which nothing measures.
     """
 
-    H: npt.ArrayLike | None = None
-    G: npt.ArrayLike | None = None
-    lower: npt.ArrayLike | Sequence[float | None] | None = None
-    upper: npt.ArrayLike | Sequence[float | None] | None = None
-    start: float = 0.0
-    stop: float | None = None
-    name: str | None = None
+    H: npt.ArrayLike | None = field(default=None, metadata=measured(lambda of: 1.0 / (of.states * of.time)))
+    G: npt.ArrayLike | None = field(default=None, metadata=measured(lambda of: 1.0 / (of.controls * of.time)))
+    lower: npt.ArrayLike | Sequence[float | None] | None = field(default=None, metadata=UNITLESS)
+    upper: npt.ArrayLike | Sequence[float | None] | None = field(default=None, metadata=UNITLESS)
+    start: float = field(default=0.0, metadata=TIME)
+    stop: float | None = field(default=None, metadata=TIME)
+    name: str | None = field(default=None, metadata=UNITLESS)
 
     __repr__ = noun
 
-    def __post_init__(self) -> None:
-        sealed(self)
+    def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
+        left = super().remaining(begin, horizon, **given)
+        if left is not None and self.start < begin:
+            raise InputError("an integral that has begun is known as a state only: see `accumulated`", path="integral")
+        return left
 
 
 @final
@@ -139,7 +172,7 @@ class Repeating(Enum):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class OptimalControlProblem:
+class OptimalControlProblem(Term):
     """Minimise a `Cost`, ``sum_i weights_i int_0^T |u_i(t)| dt`` unless told otherwise, such that for every disturbance
     and every parameter
 
@@ -190,27 +223,27 @@ class OptimalControlProblem:
     outside a path set is legal: that problem is infeasible. Raises `InputError`.
     """
 
-    system: System
-    horizon: float
-    initial_state: npt.ArrayLike
-    control: ConvexSet
-    initial_set: ConvexSet | None = None
-    weights: npt.ArrayLike | None = None
-    disturbance: ConvexSet | None = None
-    disturbance_class: Classes = "piecewise_constant"
-    path: Sequence[PathConstraint | MixedConstraint | ConvexSet] = ()
-    terminal: Sequence[ConvexSet | Equality] = ()
-    integral: Sequence[IntegralConstraint] = ()
-    title: str = ""
-    initial_control: npt.ArrayLike | None = None
-    control_step: ConvexSet | None = None
-    names: Names = UNNAMED
-    cost: Cost = Cost()  # noqa: RUF009  immutable
-    disturbances: Sequence[Disturbance] = ()
-    measurements: Measurements | None = None
-    repeat: bool | Repeating = False
-    execution: npt.ArrayLike | None = None
-    disturbance_breakpoints: Breakpoints | None = None
+    system: System = field(metadata=SYSTEM)
+    horizon: float = field(metadata=TIME)
+    initial_state: npt.ArrayLike = field(metadata=STATES)
+    control: ConvexSet = field(metadata=CONTROLS)
+    initial_set: ConvexSet | None = field(default=None, metadata=STATES)
+    weights: npt.ArrayLike | None = field(default=None, metadata=WEIGHTS)
+    disturbance: ConvexSet | None = field(default=None, metadata=measured(lambda of: of.disturbances))
+    disturbance_class: Classes = field(default="piecewise_constant", metadata=UNITLESS)
+    path: Sequence[PathConstraint | MixedConstraint | ConvexSet] = field(default=(), metadata=TERMS)
+    terminal: Sequence[ConvexSet | Equality] = field(default=(), metadata=STATES)
+    integral: Sequence[IntegralConstraint] = field(default=(), metadata=TERMS)
+    title: str = field(default="", metadata=UNITLESS)
+    initial_control: npt.ArrayLike | None = field(default=None, metadata=CONTROLS)
+    control_step: ConvexSet | None = field(default=None, metadata=CONTROLS)
+    names: Names = field(default=UNNAMED, metadata=UNITLESS)
+    cost: Cost = field(default=Cost(), metadata=TERMS)
+    disturbances: Sequence[Disturbance] = field(default=(), metadata=UNITLESS)  # none after construction
+    measurements: Measurements | None = field(default=None, metadata=TERMS)
+    repeat: bool | Repeating = field(default=False, metadata=UNITLESS)
+    execution: npt.ArrayLike | None = field(default=None, metadata=UNITLESS)
+    disturbance_breakpoints: Breakpoints | None = field(default=None, metadata=measured(lambda of: of.time, _pieces))
 
     __repr__ = noun
 
@@ -264,6 +297,11 @@ class OptimalControlProblem:
     def measurable(self) -> ConvexSet | None:
         """The set of the measurable disturbances, 0 along the columns of others; ``None`` where there are none."""
         return apart(self.disturbance, self.disturbance_class, "measurable")
+
+    @property
+    def windows(self) -> list[PathConstraint | MixedConstraint]:
+        """The constraints on the path, of which none is a bare set any more."""
+        return [entry for entry in self.path if not isinstance(entry, ConvexSet)]
 
     @property
     def terminal_sets(self) -> list[ConvexSet]:

@@ -23,6 +23,7 @@ from sparserob_core.control.problem.expression import (
     parse_matrix,
 )
 from sparserob_core.control.sets.sets import Box
+from sparserob_core.control.term import over
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, dense, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -126,6 +127,10 @@ class LinearSystem:
     def with_parameters(self, parameters: ConvexSet) -> LinearSystem:
         """The same system with its parameters in another set."""
         return replace(self, parameters=parameters)
+
+    def remaining(self, begin: float, horizon: float) -> LinearSystem:
+        """Itself: it does not change with time."""
+        return self
 
     @shaped
     def accumulating(self, rows: Float[Array, "k d"], inputs: Float[Array, "k m"]) -> LinearSystem:
@@ -449,6 +454,11 @@ class SwitchedSystem:
         """As `LinearSystem.with_parameters`."""
         return SwitchedSystem([(until, one.with_parameters(parameters)) for until, one in self.pieces], self.delay)
 
+    def remaining(self, begin: float, horizon: float) -> LinearSystem | SwitchedSystem:
+        """Those that still take their turn from the time ``begin`` on, for as long as ``horizon``."""
+        left = [(until - begin, one) for until, one in self.pieces if not over(until, begin, horizon)]
+        return SwitchedSystem([*left[:-1], (horizon, left[-1][1])], self.delay) if len(left) > 1 else left[-1][1]
+
     @property
     def modes(self) -> tuple[LinearSystem, ...]:
         """The systems that take turns."""
@@ -596,6 +606,11 @@ class VaryingSystem:
     def lawful(self, laws: Sequence[tuple[float, LinearSystem]]) -> VaryingSystem:
         """The same with other ``laws``, each with the time from which it holds, the first from 0 on."""
         return VaryingSystem(laws[0][1], self.horizon, self.delay, tuple(laws[1:]))
+
+    def remaining(self, begin: float, horizon: float) -> VaryingSystem:
+        """None yet; raises `InputError`."""
+        expected = "a system that stays the same with time, or has pieces"
+        raise InputError(path="system", expected=expected, got="one in t")
 
     @property
     def states(self) -> int:

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.prices import in_units
-from sparserob_core.control.problem.problem import (
-    IntegralConstraint,
-    MixedConstraint,
-    OptimalControlProblem,
-    PathConstraint,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array
 
 OFFSET = 0.26535897932384626  # irrational: numbers that people choose are not at the edge between two powers of two
 
@@ -41,7 +35,8 @@ def ratios(theirs: Array, ours: Array, units: Array) -> Array:
 @dataclass(frozen=True, eq=False)
 class Units:
     """What one of each quantity is in the user's: ``time``, ``states (d,)``, ``controls (m,)``,
-    ``disturbances (mw,)``, ``parameters (nu,)``, ``cost``. Powers of two, so that nothing is rounded."""
+    ``disturbances (mw,)``, ``parameters (nu,)``, ``cost``, and ``outputs (p,)`` where they are measured. Powers of two,
+    so that nothing is rounded."""
 
     time: float
     states: Array
@@ -49,6 +44,7 @@ class Units:
     disturbances: Array
     parameters: Array
     cost: float
+    outputs: Array = field(default_factory=lambda: np.ones(0))
 
     def of_dictionary(self, dictionary: Dictionary) -> Dictionary:
         """The same functions of a time in these units."""
@@ -56,52 +52,7 @@ class Units:
 
     def of_problem(self, problem: OptimalControlProblem) -> OptimalControlProblem:
         """The same problem with every number in these units."""
-        return OptimalControlProblem(
-            system=self.of_system(problem.system),
-            horizon=problem.horizon / self.time,
-            initial_state=np.asarray(problem.initial_state) / self.states,
-            initial_set=None if problem.initial_set is None else problem.initial_set.in_units(self.states),
-            control=problem.control.in_units(self.controls),
-            weights=in_units(problem.weights, self.controls * self.time / self.cost, self.time),
-            disturbance=None if problem.disturbance is None else problem.disturbance.in_units(self.disturbances),
-            disturbance_class=problem.disturbance_class,
-            disturbance_breakpoints=(
-                None
-                if problem.disturbance_breakpoints is None
-                else tuple(None if times is None else times / self.time for times in problem.disturbance_breakpoints)
-            ),
-            path=[self._window(entry) for entry in problem.path if not isinstance(entry, ConvexSet)],
-            terminal=[end.in_units(self.states) for end in problem.terminal],
-            integral=[self._integral(entry) for entry in problem.integral],
-            title=problem.title,
-            cost=problem.cost.in_units(self.states, self.controls, self.time, self.cost),
-            initial_control=(
-                None if problem.initial_control is None else np.asarray(problem.initial_control) / self.controls
-            ),
-            control_step=None if problem.control_step is None else problem.control_step.in_units(self.controls),
-            names=problem.names,
-            measurements=(
-                None if problem.measurements is None else problem.measurements.in_units(self.states, self.time)
-            ),
-            repeat=problem.repeat,
-            execution=problem.execution,
-        )
-
-    def _window(self, entry: PathConstraint | MixedConstraint) -> PathConstraint | MixedConstraint:
-        start, stop = entry.start / self.time, None if entry.stop is None else entry.stop / self.time
-        if isinstance(entry, MixedConstraint):
-            H, G = np.asarray(entry.H) * self.states, np.asarray(entry.G) * self.controls
-            return replace(entry, H=H, G=G, start=start, stop=stop)
-        moved = entry.relative_to
-        moved = None if moved is None else np.asarray(moved) / np.concatenate([[self.time], self.states])
-        return replace(entry, set=entry.set.in_units(self.states), start=start, stop=stop, relative_to=moved)
-
-    def _integral(self, entry: IntegralConstraint) -> IntegralConstraint:
-        """What is integrated over these times, in the user's own unit."""
-        assert entry.H is not None and entry.G is not None  # those of a problem
-        H, G = (np.asarray(rows) * of * self.time for rows, of in ((entry.H, self.states), (entry.G, self.controls)))
-        stop = None if entry.stop is None else entry.stop / self.time
-        return replace(entry, H=H, G=G, start=entry.start / self.time, stop=stop)
+        return problem.in_units(self)
 
     def of_system(self, system: System) -> System:
         """``x' = A x + B u + E w + c`` with all of it in these units."""

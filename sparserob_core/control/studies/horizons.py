@@ -81,8 +81,7 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
     begin later are gone, as are the systems that would take their turn later. Raises `InputError` for a window that
     ends before the horizon of the problem."""
     windows = []
-    for i, entry in enumerate(problem.path):
-        assert not isinstance(entry, ConvexSet)
+    for i, entry in enumerate(problem.windows):
         if entry.stop is not None and entry.stop < problem.horizon:
             raise InputError(
                 path=f"path.{i}",

@@ -60,7 +60,7 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
         system=_system(problem.system, running, problem.horizon),
         initial_state=np.append(np.asarray(problem.initial_state), np.zeros(k)),
         initial_set=None if begun is None else product([begun, Box(np.zeros(k), np.zeros(k))]),
-        path=[_widened(entry, d + k) for entry in (*problem.path, *ends)],
+        path=[_widened(entry, d + k) for entry in (*problem.windows, *ends)],
         terminal=[_ended(end, d + k) for end in problem.terminal],
         integral=(),
         cost=_cost(problem.cost, k),
@@ -116,9 +116,8 @@ def _system(system: System, running: list[Running], horizon: float) -> System:
     return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay)
 
 
-def _widened(entry: PathConstraint | MixedConstraint | ConvexSet, size: int) -> PathConstraint | MixedConstraint:
+def _widened(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint | MixedConstraint:
     """A window that leaves the states beyond its own free, ``size`` in all."""
-    assert not isinstance(entry, ConvexSet)  # a problem has made constraints of its sets
     if isinstance(entry, MixedConstraint):
         H = np.asarray(entry.H)
         return replace(entry, H=np.hstack([H, np.zeros((len(H), size - H.shape[1]))]))

@@ -21,7 +21,7 @@ from sparserob_core.control.feedback.observer import Observer, between, innovati
 from sparserob_core.control.feedback.zonoid import has_corners
 from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.measurable import MISSED
@@ -231,7 +231,7 @@ def _equal(H: Array, h: Array) -> tuple[Array, Array]:
 def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, cost: str) -> None:
     """Raise `InputError` for what a policy is not built for, in one sentence."""
     disturbed = problem.disturbance is not None
-    paths = [entry for entry in problem.path if isinstance(entry, PathConstraint | MixedConstraint)]
+    paths = problem.windows
     sets = [entry.set for entry in paths] + problem.terminal_sets
     steps = [] if problem.control_step is None else [problem.control_step]
     curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]

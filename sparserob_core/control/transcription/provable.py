@@ -10,7 +10,6 @@ from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.errors import NotEnclosable
-from sparserob_core.sip.convex_set import ConvexSet
 
 SECONDS = 30.0  # that the search takes for a problem that cannot be proven, unless a limit is given: for a witness
 TINY = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
@@ -24,7 +23,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     Nothing is solved: this takes milliseconds.
     """
     if problem.measurable is not None:
-        paths = [entry if isinstance(entry, ConvexSet) else entry.set for entry in problem.path]
+        paths = [entry.set for entry in problem.windows]
         curved = [one for one in (*paths, *problem.terminal_sets) if one.halfspaces() is None]
         if problem.system.parameter_count or curved:
             over = "uncertain parameters" if problem.system.parameter_count else "sets with curved sides"

@@ -38,7 +38,7 @@ from sparserob_core.control.transcription.program import OpenLoop, held_nominall
 from sparserob_core.control.transcription.record import Acting, Posed, Transcription
 from sparserob_core.control.transcription.steps import refuse_without_steps
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import OwnUnits, SemiInfiniteProgram
 
 
@@ -312,17 +312,15 @@ def _state_constraints(
 
 def windows_of(problem: OptimalControlProblem) -> list[tuple[str, PathConstraint | MixedConstraint]]:
     """The path and terminal constraints with the names of their families; a terminal one has the window of one time."""
-    end, path = problem.horizon, [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
-    ends = problem.terminal_sets
+    end, ends = problem.horizon, problem.terminal_sets
     finals = [(_name("terminal", i, len(ends)), PathConstraint(one, end, end)) for i, one in enumerate(ends)]
-    return [*zip(path_names(problem), path, strict=True), *finals]
+    return [*zip(path_names(problem), problem.windows, strict=True), *finals]
 
 
 def path_names(problem: OptimalControlProblem) -> list[str]:
     """What the families of the path constraints are called: by their own name, or by their place."""
-    path = [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
-    own = sum(not isinstance(entry, Return | Accumulated) for entry in path)
-    return [entry.name or _name("path", i, own) for i, entry in enumerate(path)]
+    own = sum(not isinstance(entry, Return | Accumulated) for entry in problem.windows)
+    return [entry.name or _name("path", i, own) for i, entry in enumerate(problem.windows)]
 
 
 def _name(kind: str, position: int, count: int) -> str:

@@ -12,7 +12,6 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_horizon, stretched
 from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.record import Transcription
@@ -121,7 +120,7 @@ class HorizonSearch:
     def _cover(self, scan: list[float]) -> str:
         """Cover horizons from 0 on by cells on each of which nothing is feasible, until one is feasible; where that did
         not succeed, why."""
-        starts = [entry.start for entry in self.problem.path if not isinstance(entry, ConvexSet)]
+        starts = [entry.start for entry in self.problem.windows]
         starts.append(self._cells.changes)
         # windows that begin after 0 part cells: their rows are there beyond only
         points = sorted({0.0, *scan, *(start for start in starts if 0.0 < start < self.problem.horizon)})

@@ -184,7 +184,7 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
 
 
 def _control(problem: OptimalControlProblem) -> Scaling:
-    paths = _entries(problem)
+    paths = problem.windows
     named = [i for i, entry in enumerate(paths) if entry.name == "control"]
     if named:  # where the rate is the control, the bounds of the control itself are constraints of the augmented state
         return replace(_path(problem, "control", named), label=CONTROL)
@@ -228,7 +228,7 @@ def _execution(problem: OptimalControlProblem) -> Scaling:
 
 
 def _path(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
-    paths = _entries(problem)
+    paths = problem.windows
     resized = {i: _resized(of, paths[i]) for i in positions}
     return Scaling(
         of,
@@ -282,7 +282,7 @@ def _integral(problem: OptimalControlProblem, number: int) -> Scaling:
 
 
 def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int]) -> Scaling:
-    paths = _entries(problem)
+    paths = problem.windows
     latest = min(problem.horizon if paths[i].stop is None else float(paths[i].stop or 0.0) for i in positions)
     if any(isinstance(paths[i], MixedConstraint) for i in positions):
         latest *= 1.0 - SHORT  # a control lasts
@@ -306,10 +306,6 @@ def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int])
         relative=False,
         highest=latest,
     )
-
-
-def _entries(problem: OptimalControlProblem) -> list[PathConstraint | MixedConstraint]:
-    return [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
 
 
 def _resizing(of: str, bound: ConvexSet) -> Callable[[float], ConvexSet]:

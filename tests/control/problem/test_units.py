@@ -1,4 +1,5 @@
-"""Guards control/problem/units.py and `in_units` of sets and systems: other units, the same thing in other numbers."""
+"""Guards control/term.py, control/problem/units.py and `in_units` of sets and systems: other units, the same thing in
+other numbers."""
 
 from __future__ import annotations
 
@@ -11,10 +12,13 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.expression import parse_matrix
+from sparserob_core.control.problem.problem import Accumulated, Return
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.sets.sets import Box, Cylinder, Ellipsoid, NormBall, Polytope
+from sparserob_core.control.term import UNITLESS, Term
 
 SETS = [
     Box(np.array([-1.0, 0.5]), np.array([2.0, 0.75])),
@@ -88,8 +92,27 @@ def test_an_uncertain_system_in_other_units_is_the_same_in_values_and_taylor_mod
     assert other.describe(points[0] / p) == plain.describe(points[0])
 
 
+TERMS = {
+    sr.OptimalControlProblem, sr.PathConstraint, sr.MixedConstraint, sr.IntegralConstraint, Accumulated, Return,
+    sr.Cost, Quadratic, sr.Measurements,
+}  # fmt: skip
+
+
+def kinds(term: type) -> set[type]:
+    """Every term that there is."""
+    own = {term} if is_dataclass(term) else set()
+    return own.union(*(kinds(one) for one in term.__subclasses__()))
+
+
+def test_every_field_of_every_term_says_its_unit_and_what_is_left_of_it() -> None:
+    assert kinds(Term) == TERMS
+    told = [(one, field) for one in TERMS for field in fields(one)]
+    assert not [(one, field.name) for one, field in told if not {"in_units", "remaining"} <= set(field.metadata)]
+    assert {field.name for _, field in told if field.metadata == UNITLESS} == {one.split(".")[-1] for one in NUMBERS}
+
+
 # What has no unit, by its field: shares, choices, and what a row of the user's is bounded by in the user's own unit.
-UNITLESS = {
+NUMBERS = {
     "disturbance_class", "title", "names", "repeat", "execution", "path.name", "path.h", "integral.lower",
     "integral.upper", "integral.name", "cost.group", "cost.l1", "disturbances",
 }  # fmt: skip
@@ -119,6 +142,7 @@ def problems() -> list[sr.OptimalControlProblem]:
         sr.OptimalControlProblem(
             **system, path=path, terminal=[sr.Box([-5.0, -3.0], [3.0, 7.0])], weights=[1.5], cost=cost,
             control_step=sr.Box([-0.75], [0.75]), names=sr.Names(time="s"),
+            measurements=sr.Measurements([[1.25, 0.5]], sr.Box([-0.5], [0.25]), 0.75),
         ),
         sr.OptimalControlProblem(
             **system, integral=[sr.IntegralConstraint([[1.0, 3.0]], [[5.0]], [-7.0], [11.0], 0.5, 2.5, "sum")],
@@ -166,8 +190,33 @@ def test_every_number_of_every_record_of_a_problem_is_converted_or_has_no_unit()
         assert [path for path, _ in mine] == [path for path, _ in its]
         for (path, value), (_, converted), (_, returned) in zip(mine, its, again, strict=True):
             np.testing.assert_array_equal(returned, value, err_msg=path)
-            assert np.array_equal(converted, value) == (path in UNITLESS or not value.any()), path
+            assert np.array_equal(converted, value) == (path in NUMBERS or not value.any()), path
             met.add(path.split(".")[0])
         met |= {one.name for one in fields(problem) if isinstance(getattr(problem, one.name), str | sr.Names)}
     left = {one.name for one in fields(sr.OptimalControlProblem)} - met
-    assert left <= {"disturbances", "repeat", "measurements"}, left
+    assert left <= {"disturbances", "repeat"}, left
+
+
+def test_what_is_left_of_a_problem_in_two_steps_is_what_is_left_of_it_in_one():
+    for problem in problems():
+        if not problem.integral:
+            once, twice = problem.remaining(1.0, 2.0), problem.remaining(0.75, 2.25).remaining(0.25, 2.0)
+            for (path, value), (_, other) in zip(numbers(once), numbers(twice), strict=True):
+                np.testing.assert_allclose(other, value, rtol=1e-15, err_msg=path)
+            whole = [value.tolist() for _, value in numbers(problem.remaining(0.0, 3.0))]
+            assert whole == [value.tolist() for _, value in numbers(problem)]
+            assert once.horizon == 2.0 and all(0.0 <= one.start <= one.stop <= 2.0 for one in once.windows)
+    first, *_ = problems()
+    assert [one.name for one in first.remaining(2.0, 1.0).windows] == ["wall"]  # the other one is over
+    assert first.windows[0].remaining(1.0, 2.0).relative_to.tolist() == [
+        [0.0, 0.5 + 1 / 3, 0.25 + 1 / 6],
+        [2.0, 1.5, 0.75],
+    ]
+
+
+def test_an_integral_that_has_begun_is_no_integral_any_more():
+    entry = problems()[1].integral[0]
+    assert (late := entry.remaining(0.25, 2.75)).start == 0.25 and late.stop == 2.25
+    assert entry.remaining(2.5, 0.5) is None
+    with pytest.raises(sr.InputError, match="known as a state only"):
+        entry.remaining(0.75, 2.25)

@@ -47,7 +47,7 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
     unknown = {one.name for one in fields(problem)} - WRITTEN
     if unknown:
         raise InputError(path=sorted(unknown)[0], expected="a field that a config can say", got="another one")
-    path = [entry for entry in problem.path if not isinstance(entry, Return)]
+    path = [entry for entry in problem.windows if not isinstance(entry, Return)]
     fixed = bool(problem.repeat) and bool((widths(problem.initial_set, problem.system.states) == 0.0).any())
     ends = problem.terminal[: len(problem.terminal) - fixed]  # what repeat adds is said by repeat
     keys: dict[str, Any] = {
@@ -186,8 +186,7 @@ def _initial_keys(problem: OptimalControlProblem) -> Any:
     return {"centre": centre, **deviations}
 
 
-def _path_keys(where: str, entry: PathConstraint | MixedConstraint | ConvexSet) -> dict[str, Any]:
-    assert not isinstance(entry, ConvexSet)  # a problem has made constraints of its sets
+def _path_keys(where: str, entry: PathConstraint | MixedConstraint) -> dict[str, Any]:
     window = {"from": entry.start, "to": entry.stop, **({} if entry.name is None else {"name": entry.name})}
     if isinstance(entry, MixedConstraint):
         kept = np.isfinite(np.asarray(entry.h))

@@ -1,0 +1,106 @@
+"""Terms of a problem: records whose fields say what becomes of them in other units, and from a later time on.
+
+A field of a term has a quantity as its metadata, such as ``field(metadata=TIME)``. What is done to a whole problem is
+then one traversal of its fields, whatever terms it is made of, and a new term says all of it where it is declared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from typing import Any, Self, TypeAlias
+
+import numpy as np
+
+from sparserob_core.shapes import sealed
+
+Quantity: TypeAlias = Mapping[str, Callable[..., Any]]
+Unit: TypeAlias = Callable[[Any], Any]  # of the `Units` of a problem, what one of a quantity is in the user's
+Remaining: TypeAlias = Callable[[Any, float, float], Any]  # of a value, when, and how long from then on
+
+
+SAME_TIME = 1e-12
+"""Of the horizon, what is rounding. With ten times less, sums of steps leave pieces of no length; with ten times more,
+a clock could tell what is taken for one."""
+
+
+def over(stop: float, begin: float, horizon: float) -> bool:
+    """Whether of what lasts until ``stop`` nothing but rounding is left from ``begin`` on, for as long as
+    ``horizon``."""
+    return stop <= begin + SAME_TIME * (begin + horizon)
+
+
+class Term:
+    """A fact about a problem: a frozen dataclass, every field of which has a `Quantity` as its metadata."""
+
+    def __post_init__(self) -> None:
+        sealed(self)
+
+    def in_units(self, units: Any) -> Self:
+        """The same with every number in these `Units`."""
+        return self._changed("in_units", units)
+
+    def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
+        """Itself from the time ``begin`` on, for as long as ``horizon``, with times that are counted from ``begin``;
+        ``None`` where nothing of it is left. ``given``: fields that are told anew."""
+        return self._changed("remaining", begin, horizon, **given)
+
+    def _changed(self, verb: str, *how: Any, **given: Any) -> Self:
+        kept: Any = self
+        changes = {
+            one.name: _each(one.metadata[verb], getattr(self, one.name), *how)
+            for one in fields(kept)
+            if one.name not in given
+        }
+        changed: Self = replace(kept, **changes, **given)
+        return changed
+
+
+def _each(change: Callable[..., Any], value: Any, *how: Any) -> Any:
+    """A value that is changed, or each of a tuple, without those of which nothing is left; of ``None`` nothing is."""
+    if isinstance(value, tuple):
+        every = [(one, _each(change, one, *how)) for one in value]
+        return tuple(new for one, new in every if new is not None or one is None)
+    return None if value is None else change(value, *how)
+
+
+def unchanged(value: Any, *how: Any) -> Any:
+    """What has no unit, or does not depend on time."""
+    return value
+
+
+def measured(unit: Unit, remaining: Remaining = unchanged) -> Quantity:
+    """A number, an array, or a set of points, counted in a ``unit``; of a term, the `Units` in which its own fields
+    are."""
+
+    def in_units(value: Any, units: Any) -> Any:
+        return value.in_units(unit(units)) if hasattr(value, "in_units") else np.asarray(value) / unit(units)
+
+    return {"in_units": in_units, "remaining": remaining}
+
+
+def timed(unit: Unit, remaining: Remaining) -> Quantity:
+    """Rows ``(q, 1 + d)`` of a time and what is counted in a ``unit``; or ``(d,)`` of what is the same at all times."""
+
+    def row(units: Any) -> Any:
+        return np.append(units.time, unit(units))
+
+    def in_units(value: Any, units: Any) -> Any:
+        return np.asarray(value) / (row if np.ndim(value) == 2 else unit)(units)
+
+    return {"in_units": in_units, "remaining": remaining}
+
+
+def _clipped(time: float, begin: float, horizon: float) -> float:
+    return min(max(0.0, time - begin), horizon)
+
+
+def _of_term(value: Any, begin: float, horizon: float) -> Any:
+    return value.remaining(begin, horizon)
+
+
+UNITLESS: Quantity = {"in_units": unchanged, "remaining": unchanged}
+TIME = measured(lambda of: of.time, _clipped)
+STATES = measured(lambda of: of.states)
+CONTROLS = measured(lambda of: of.controls)
+TERMS = measured(lambda of: of, _of_term)
