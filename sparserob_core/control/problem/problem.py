@@ -72,7 +72,7 @@ def _pieces(times: Array, begin: float, horizon: float) -> Array:
     return np.array([0.0, *later[:-1], horizon])
 
 
-class _Window(Term):
+class _Window(Term, ABC):
     """What holds from a ``start`` to a ``stop``."""
 
     start: float
@@ -82,6 +82,15 @@ class _Window(Term):
         if self.stop is not None and over(self.stop, begin, horizon):
             return None
         return super().remaining(begin, horizon, **given)
+
+    @property
+    @abstractmethod
+    def bounds(self) -> ConvexSet:
+        """The set that a factor enlarges; raises `InputError` where there is none."""
+
+    @abstractmethod
+    def scaled(self, factor: float) -> Self:
+        """Itself with its `bounds` larger by that factor about their middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +108,13 @@ class PathConstraint(_Window):
     relative_to: npt.ArrayLike | None = field(default=None, metadata=timed(lambda of: of.states, _moved))
 
     __repr__ = noun
+
+    @property
+    def bounds(self) -> ConvexSet:
+        return self.set
+
+    def scaled(self, factor: float) -> Self:
+        return replace(self, set=self.set.scaled(factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +139,15 @@ class MixedConstraint(_Window):
     def set(self) -> Polytope:
         """The set of all ``(x, u)`` that are allowed, ``d + m`` coordinates."""
         return Polytope(np.hstack([np.asarray(self.H), np.asarray(self.G)]), np.asarray(self.h))
+
+    @property
+    def bounds(self) -> ConvexSet:
+        if not (np.asarray(self.h) > 0.0).all():
+            raise InputError("bounds state and control together, and h is not positive: 0 is no middle of it")
+        return self.set
+
+    def scaled(self, factor: float) -> Self:
+        return replace(self, h=factor * np.asarray(self.h, dtype=float))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +175,14 @@ class IntegralConstraint(_Window):
         if left is not None and self.start < begin:
             raise InputError("an integral that has begun is known as a state only: see `accumulated`", path="integral")
         return left
+
+    @property
+    def bounds(self) -> Box:
+        return Box(np.asarray(self.lower), np.asarray(self.upper))
+
+    def scaled(self, factor: float) -> Self:
+        box = self.bounds.scaled(factor)
+        return replace(self, lower=box.lower, upper=box.upper)
 
 
 @final

@@ -106,6 +106,11 @@ class Equality:
         """The same values as ``values / units``, ``(d,)`` each."""
         return Equality(self.values / units)
 
+    @property
+    def bounds(self) -> ConvexSet:
+        """None that a factor enlarges: raises `InputError`."""
+        raise InputError("fixes final values, which no factor enlarges; expected a set")
+
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
         """Whether points ``(..., d)`` deviate by at most the absolute ``tolerance``."""

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, final
+from functools import partial
+from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
 
 from sparserob_core.control.problem.names import joined
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
+from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.messages import nearest
 
@@ -100,38 +101,48 @@ def _choices(
     problem: OptimalControlProblem, members: Sequence[Sequence[int]], ends: Sequence[Sequence[int]]
 ) -> Iterator[tuple[str, Callable[[], Scaling]]]:
     if problem.disturbance is not None:
-        yield "disturbance", lambda: _disturbance(problem)
+        label = "factor on the disturbance set"
+        yield "disturbance", partial(_set, problem, "disturbance", label, "largest", "largest |w_i|")
     if problem.system.parameters is not None:
-        yield "parameters", lambda: _parameters(problem)
-    yield "initial_state", lambda: _initial_state(problem)
-    yield "control", lambda: _control(problem)
+        yield "parameters", partial(_parameters, problem)
+    yield "initial_state", partial(_initial_state, problem)
+    yield "control", partial(_control, problem)
     if problem.control_step is not None:
-        yield "control_step", lambda: _control_step(problem)
+        label = "factor on the steps of the control"
+        yield "control_step", partial(_set, problem, "control_step", label, "smallest", "largest step of a control")
     if problem.execution is not None:
-        yield "execution", lambda: _execution(problem)
+        yield "execution", partial(_execution, problem)
     for i, positions in enumerate(members):
         if positions:
-            yield f"path.{i}", lambda i=i, positions=positions: _path(problem, f"path.{i}", positions)  # type: ignore[misc]
-            yield f"path.{i}.from", lambda i=i, positions=positions: _window(problem, f"path.{i}", positions)  # type: ignore[misc]
+            yield f"path.{i}", partial(_listed, problem, "path", f"path.{i}", positions)
+            yield f"path.{i}.from", partial(_window, problem, f"path.{i}", positions)
     for i in range(len(problem.integral)):
-        yield f"integral.{i}", lambda i=i: _integral(problem, i)  # type: ignore[misc]
+        yield f"integral.{i}", partial(_listed, problem, "integral", f"integral.{i}", [i])
     for i, positions in enumerate(ends):
         if positions:
-            yield f"terminal.{i}", lambda i=i, positions=positions: _terminal(problem, f"terminal.{i}", positions)  # type: ignore[misc]
+            yield f"terminal.{i}", partial(_listed, problem, "terminal", f"terminal.{i}", positions)
 
 
-def _disturbance(problem: OptimalControlProblem) -> Scaling:
-    bound = problem.disturbance
-    assert bound is not None
-    resized = _resizing("disturbance", bound)
+def _set(problem: OptimalControlProblem, of: str, label: str, sense: Sense, quantity: str) -> Scaling:
+    """A set of the problem, which is the field ``of``."""
+    resized = _resizing(of, getattr(problem, of))
     return Scaling(
-        "disturbance",
-        "factor on the disturbance set",
-        "largest",
-        lambda f: replace(problem, disturbance=resized(f)),
-        "largest |w_i|",
-        lambda f: _reach(resized(f)),
+        of, label, sense, lambda f: replace(problem, **{of: resized(f)}), quantity, lambda f: _reach(resized(f))
     )
+
+
+def _listed(problem: OptimalControlProblem, field: str, of: str, positions: Sequence[int]) -> Scaling:
+    """Some constraints of a list of the problem, those that one entry of a config has made."""
+    entries = list(getattr(problem, field))
+    resized = {i: _resizing(of, entries[i]) for i in positions}
+
+    def at(factor: float) -> OptimalControlProblem:
+        changed: Any = [resized[i](factor) if i in resized else entry for i, entry in enumerate(entries)]
+        return replace(problem, **{field: changed})
+
+    width = max(_half_width(_bounds(entries[i])) for i in positions)
+    what = "bounds" if field == "integral" else "set"
+    return Scaling(of, f"factor on the {what} {of}", "smallest", at, "largest half-width", _times(width))
 
 
 def _parameters(problem: OptimalControlProblem) -> Scaling:
@@ -187,29 +198,8 @@ def _control(problem: OptimalControlProblem) -> Scaling:
     paths = problem.windows
     named = [i for i, entry in enumerate(paths) if entry.name == "control"]
     if named:  # where the rate is the control, the bounds of the control itself are constraints of the augmented state
-        return replace(_path(problem, "control", named), label=CONTROL)
-    resized = _resizing("control", problem.control)
-    return Scaling(
-        "control",
-        CONTROL,
-        "smallest",
-        lambda f: replace(problem, control=resized(f)),
-        "largest |u_i|",
-        lambda f: _reach(resized(f)),
-    )
-
-
-def _control_step(problem: OptimalControlProblem) -> Scaling:
-    assert problem.control_step is not None
-    resized = _resizing("control_step", problem.control_step)
-    return Scaling(
-        "control_step",
-        "factor on the steps of the control",
-        "smallest",
-        lambda f: replace(problem, control_step=resized(f)),
-        "largest step of a control",
-        lambda f: _reach(resized(f)),
-    )
+        return replace(_listed(problem, "path", "control", named), label=CONTROL)
+    return _set(problem, "control", CONTROL, "smallest", "largest |u_i|")
 
 
 def _execution(problem: OptimalControlProblem) -> Scaling:
@@ -225,60 +215,6 @@ def _execution(problem: OptimalControlProblem) -> Scaling:
         affine=False,  # a factor times the sizes of the decision
         highest=1.0 / most,
     )
-
-
-def _path(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
-    paths = problem.windows
-    resized = {i: _resized(of, paths[i]) for i in positions}
-    return Scaling(
-        of,
-        f"factor on the set {of}",
-        "smallest",
-        lambda f: replace(problem, path=[resized[i](f) if i in resized else entry for i, entry in enumerate(paths)]),
-        "largest half-width",
-        _times(max(_half_width(paths[i].set) for i in positions)),
-    )
-
-
-def _resized(of: str, entry: PathConstraint | MixedConstraint) -> Callable[[float], PathConstraint | MixedConstraint]:
-    """A window with its set scaled; bounds of state and control together about 0, which must be within them."""
-    if isinstance(entry, PathConstraint):
-        scaled = _resizing(of, entry.set)
-        return lambda f: replace(entry, set=scaled(f))
-    h = np.asarray(entry.h, dtype=float)
-    if not (h > 0.0).all():
-        raise InputError(f"of: {of} bounds state and control together, and h is not positive: 0 is no middle of it")
-    return lambda f: replace(entry, h=f * h)
-
-
-def _terminal(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
-    ends = list(problem.terminal)
-    sets = {i: end for i in positions if not isinstance(end := ends[i], Equality)}
-    if len(sets) < len(positions):
-        raise InputError(f"of: {of} fixes final values, which no factor enlarges; expected a set")
-    resized = {i: _resizing(of, end) for i, end in sets.items()}
-    return Scaling(
-        of,
-        f"factor on the set {of}",
-        "smallest",
-        lambda f: replace(problem, terminal=[resized[i](f) if i in resized else end for i, end in enumerate(ends)]),
-        "largest half-width",
-        _times(max(map(_half_width, sets.values()))),
-    )
-
-
-def _integral(problem: OptimalControlProblem, number: int) -> Scaling:
-    entry, of = problem.integral[number], f"integral.{number}"
-    bounds = Box(np.asarray(entry.lower), np.asarray(entry.upper))
-    resized = _resizing(of, bounds)
-
-    def at(factor: float) -> OptimalControlProblem:
-        box = resized(factor).bounding_box()
-        listed = list(problem.integral)
-        listed[number] = replace(entry, lower=box.lower, upper=box.upper)
-        return replace(problem, integral=listed)
-
-    return Scaling(of, f"factor on the bounds {of}", "smallest", at, "largest half-width", _times(_half_width(bounds)))
 
 
 def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int]) -> Scaling:
@@ -308,9 +244,19 @@ def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int])
     )
 
 
-def _resizing(of: str, bound: ConvexSet) -> Callable[[float], ConvexSet]:
-    """The set scaled by a factor about its middle; raises `InputError` for a single point, and for a set without a
-    middle. A curved set stays curved, however small the factor."""
+def _bounds(value: Any) -> ConvexSet:
+    """A set, or that of a constraint."""
+    bounds: ConvexSet = getattr(value, "bounds", value)
+    return bounds
+
+
+def _resizing(of: str, value: Any) -> Callable[[float], Any]:
+    """A set, or a constraint, scaled by a factor about its middle; raises `InputError` for a single point, and for a
+    set without a middle. A curved set stays curved, however small the factor."""
+    try:
+        bound = _bounds(value)
+    except InputError as error:
+        raise InputError(f"of: {of} {error.sentence}") from None
     try:
         middle = bound.middle()
     except InputError as error:
@@ -322,7 +268,7 @@ def _resizing(of: str, bound: ConvexSet) -> Callable[[float], ConvexSet]:
     if not (np.isinf(reach) | (reach != np.concatenate([middle, -middle]))).any():
         raise InputError(f"of: {of} is a single point, which no factor enlarges; expected a set with an extent")
     least = 0.0 if bound.halfspaces() is not None else POINT
-    return lambda factor: bound.scaled(max(factor, least))
+    return lambda factor: value.scaled(max(factor, least))
 
 
 def _reach(bound: ConvexSet) -> float:

@@ -220,3 +220,15 @@ def test_an_integral_that_has_begun_is_no_integral_any_more():
     assert entry.remaining(2.5, 0.5) is None
     with pytest.raises(sr.InputError, match="known as a state only"):
         entry.remaining(0.75, 2.25)
+
+
+def test_a_factor_on_a_constraint_is_one_on_its_bounds_about_their_middle():
+    for entry in [*problems()[0].windows, *problems()[1].integral]:
+        for wider in (entry.scaled(2.0), entry.scaled(4.0).scaled(0.5)):
+            axes = np.vstack([np.eye(entry.bounds.dimension), -np.eye(entry.bounds.dimension)])
+            widths = [one.bounds.support(axes).reshape(2, -1).sum(axis=0) for one in (entry, wider)]
+            np.testing.assert_allclose(widths[1], 2.0 * widths[0], rtol=1e-15)
+    with pytest.raises(sr.InputError, match="0 is no middle"):
+        _ = sr.MixedConstraint([[1.0]], [[1.0]], [0.0]).bounds
+    with pytest.raises(sr.InputError, match="no factor enlarges"):
+        _ = sr.Equality([0.0]).bounds
