@@ -7,25 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from sparserob_core.control.policies.measurements import Measurements
-from sparserob_core.control.problem.cost import Cost, Quadratic
+from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import (
-    IntegralConstraint,
     MixedConstraint,
     OptimalControlProblem,
-    PathConstraint,
     Return,
     widths,
 )
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.problem.tracing import traced
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
+from sparserob_core.control.term import Term
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.matrices.packed import pack
 from sparserob_core.experiment.plugins.hookspecs import SetPlugin
@@ -38,6 +36,8 @@ WRITTEN = {
     "measurements", "repeat", "execution", "disturbance_breakpoints",
 }  # fmt: skip
 """The fields of a problem that are written; one that is added and not named here is refused, not lost."""
+CALLED = {"start": "from", "stop": "to"}
+"""Fields of a term that a config calls otherwise."""
 MANY = 2500  # entries of a matrix that nobody reads: of ten times more a config has as many values as it may have
 WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
 
@@ -58,9 +58,9 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         "control": set_keys("control", problem.control),
         "weights": np.asarray(problem.weights).tolist(),
         "disturbance_class": _class_of(problem, 0),
-        "path": [_path_keys(f"path.{i}", entry) for i, entry in enumerate(path)],
+        "path": [_term_keys(f"path.{i}", entry) for i, entry in enumerate(path)],
         "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
-        "integral": [_integral_keys(entry) for entry in problem.integral],
+        "integral": [_term_keys(f"integral.{i}", entry) for i, entry in enumerate(problem.integral)],
         **_cost_keys(problem.cost),
         **_names_keys(problem.names),
     }
@@ -69,7 +69,7 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
     if problem.control_step is not None:
         keys["control_step"] = set_keys("control_step", problem.control_step)
     if problem.measurements is not None:
-        keys["measurements"] = _measurement_keys(problem.measurements)
+        keys["measurements"] = _term_keys("measurements", problem.measurements)
     if problem.initial_control is not None and (problem.control_step is not None or problem.system.delay > 0.0):
         keys["initial_control"] = np.asarray(problem.initial_control).tolist()
     if problem.repeat:
@@ -186,27 +186,34 @@ def _initial_keys(problem: OptimalControlProblem) -> Any:
     return {"centre": centre, **deviations}
 
 
-def _path_keys(where: str, entry: PathConstraint | MixedConstraint) -> dict[str, Any]:
-    window = {"from": entry.start, "to": entry.stop, **({} if entry.name is None else {"name": entry.name})}
-    if isinstance(entry, MixedConstraint):
-        kept = np.isfinite(np.asarray(entry.h))
-        rows = {key: np.asarray(getattr(entry, key))[kept].tolist() for key in ("H", "G", "h")}
-        return {"mixed": rows, **window}
-    moved = {} if entry.relative_to is None else {"relative_to": np.asarray(entry.relative_to).tolist()}
-    return {**set_keys(where, entry.set), **window, **moved}
+def _term_keys(where: str, term: Term) -> dict[str, Any]:
+    """A key for every field of a term that is told, a set by its kind; a bound that is infinite is none."""
+    told = {one.name: value for one in fields(cast("Any", term)) if (value := getattr(term, one.name)) is not None}
+    keys: dict[str, Any] = {}
+    if isinstance(term, MixedConstraint):
+        kept = np.isfinite(np.asarray(term.h))
+        keys["mixed"] = {name: _listed(told.pop(name)[kept]) for name in ("H", "G", "h")}
+    for name, value in told.items():
+        if not isinstance(value, ConvexSet):
+            keys[CALLED.get(name, name)] = value if isinstance(value, str) else _listed(value)
+        elif name == "set":
+            keys |= set_keys(where, value)
+        else:
+            keys[name] = set_keys(f"{where}.{name}", value)
+    return keys
 
 
-def _integral_keys(entry: IntegralConstraint) -> dict[str, Any]:
-    sides = {"lower": np.asarray(entry.lower), "upper": np.asarray(entry.upper)}
-    bounds = {key: [float(v) if np.isfinite(v) else None for v in side] for key, side in sides.items()}
-    named = {} if entry.name is None else {"name": entry.name}
-    rows = {key: np.asarray(getattr(entry, key)).tolist() for key in ("H", "G")}
-    return {**rows, "from": entry.start, "to": entry.stop, **bounds, **named}
+def _listed(value: Any) -> Any:
+    """Numbers as lists of them, none where they are not finite."""
+    numbers = np.asarray(value, dtype=float)
+    found = numbers.astype(object)
+    found[~np.isfinite(numbers)] = None
+    return found.tolist()
 
 
 def _terminal_keys(where: str, entry: ConvexSet | Equality) -> dict[str, Any]:
     if isinstance(entry, Equality):
-        return {"equals": [None if np.isnan(value) else float(value) for value in entry.values]}
+        return {"equals": _listed(entry.values)}
     return set_keys(where, entry)
 
 
@@ -216,20 +223,8 @@ def _cost_keys(cost: Cost) -> dict[str, Any]:
         keys["group"] = [list(group) for group in cost.group]
     for key, term in zip(("state", "control", "final"), cost.terms, strict=True):
         if term is not None:
-            keys[key] = _term_keys(key, term)
+            keys[key] = {"R": np.asarray(term.Q).tolist()} if key == "control" else _term_keys(key, term)
     return {"cost": keys} if keys else {}
-
-
-def _term_keys(key: str, term: Quadratic) -> dict[str, Any]:
-    matrix: Array = np.asarray(term.Q)
-    if key == "control":
-        return {"R": matrix.tolist()}
-    return {"Q": matrix.tolist(), "reference": np.asarray(term.reference).tolist()}
-
-
-def _measurement_keys(measured: Measurements) -> dict[str, Any]:
-    noise = {} if measured.noise is None else {"noise": set_keys("measurements.noise", measured.noise)}
-    return {"C": np.asarray(measured.C).tolist(), **noise, "latency": measured.latency}
 
 
 def _names_keys(names: Names) -> dict[str, Any]:
