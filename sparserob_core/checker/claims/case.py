@@ -23,6 +23,7 @@ from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.integrals import integrating
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.measurable import Execution
+from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.known import known
@@ -61,7 +62,10 @@ class Case:
     policy: Policy | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "problem", integrating(self.problem))
+        known = parted(self.problem)
+        if known is not self.problem and self.policy is not None:
+            raise Unchecked("the checker knows no feedback beside parameters and the time")
+        object.__setattr__(self, "problem", integrating(known))
         if self.problem.disturbance_breakpoints is not None:
             known_by, joint = on_one_grid(self.problem, self.disturbance)
             object.__setattr__(self, "problem", known_by)

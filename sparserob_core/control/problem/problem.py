@@ -321,6 +321,8 @@ class OptimalControlProblem(Term):
         self._set("integral", tuple(self._integrated(f"integral.{i}", entry) for i, entry in integrals))
         if isinstance(self.system, VaryingSystem):
             self._check_varying(self.system)
+            if self.system.parameters is not None:
+                self._check_uncertain()
         if self.repeat is not Repeating.IMPOSED:
             self._return()
         self._set("execution", self._executed())
@@ -385,6 +387,24 @@ class OptimalControlProblem(Term):
                     expected=f"a time that is after {begin:g} by more than rounding",
                     got=f"{until!r}",
                 )
+
+    def _check_uncertain(self) -> None:
+        """Raise `InputError` for what is not proven of a system that changes with time and has parameters."""
+        if self.repeat:
+            raise InputError(path="repeat", expected="false where parameters stand beside the time t", got="true")
+        where = [(f"path.{i}", one.set) for i, one in enumerate(self.path) if not isinstance(one, ConvexSet)]
+        for i, end in enumerate(self.terminal):
+            if isinstance(end, Equality):
+                raise InputError(
+                    path=f"terminal.{i}",
+                    expected="no fixed final values where parameters stand beside the time t, which reach them",
+                    got="some",
+                )
+            where.append((f"terminal.{i}", end))
+        for path, bound in where:
+            if bound.halfspaces() is None:
+                expected = "a set with flat sides where parameters stand beside the time t"
+                raise InputError(path=path, expected=expected, got=bound.kind)
 
     def _executed(self) -> Array | None:
         """The errors of execution, ``None`` where there are none; raises `InputError` for what they are not proven

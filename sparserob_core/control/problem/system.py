@@ -1,5 +1,5 @@
-"""Linear systems: uncertain ones ``x' = A(p) x + B(p) u + E(p) w + c(p)``, such that take turns, and known ones that
-change with time."""
+"""Linear systems: uncertain ones ``x' = A(p) x + B(p) u + E(p) w + c(p)``, such that take turns, and such that change
+with time."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
+from sparserob_core.control.enclosures.dependence import PARTS, Dependence, dependence
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import (
     ExpressionMatrix,
@@ -228,6 +229,10 @@ class LinearSystem:
     def describe(self, parameter: Float[Array, " nu"]) -> str:
         """A parameter vector in words, such as ``p1 = 0.1, p2 = -0.1``."""
         return ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.names, parameter, strict=True))
+
+    def entry(self, name: str) -> _Entry | None:
+        """``A``, ``B``, ``E`` or ``c (d, 1)`` as an array, expressions, or a function of ``p (nu,)``."""
+        return None if name == "c" and self.c is None else self._entry(name)
 
     def _entry(self, name: str) -> _Entry:
         entry: _Entry = getattr(self, name)
@@ -534,27 +539,28 @@ class SwitchedSystem:
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingSystem:
-    """``x'(t) = A(t) x(t) + B(t) u(t - delay) + E(t) w(t) + c(t)`` for ``t`` from 0 to the ``horizon``, without
-    uncertain parameters.
+    """``x'(t) = A(t) x(t) + B(t) u(t - delay) + E(t) w(t) + c(t)`` for ``t`` from 0 to the ``horizon``.
 
-    ``law``: a `LinearSystem` whose one parameter is the time: its matrices at ``p = (t,)`` are those at the time ``t``.
-    ``later``: times, one after another, each with the law that holds from then on. ``delay``, as that of a
-    `LinearSystem`: what was commanded acts through the ``B`` of the time at which it acts. Made of expressions by `of`
-    and `taking_turns`. Raises `InputError`.
+    ``law``: a `LinearSystem` whose first parameter is the time: its matrices at ``p = (t,)`` are those at the time
+    ``t``. ``later``: times, one after another, each with the law that holds from then on. ``delay``, as that of a
+    `LinearSystem`: what was commanded acts through the ``B`` of the time at which it acts. ``parameters``: a box of
+    uncertain parameters, which follow the time in the laws, and of which the state must be an affine function; ``None``
+    where everything is known. Made of expressions by `of` and `taking_turns`. Raises `InputError`.
     """
 
     law: LinearSystem
     horizon: float
     delay: float = 0.0
     later: tuple[tuple[float, LinearSystem], ...] = ()
+    parameters: Box | None = None
 
     __repr__ = noun
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "delay", _duration(self.delay))
         every = [self.law, *(law for _, law in self.later)]
-        if any(law.parameter_count != 1 or law.delay for law in every):
-            expected = "a law whose one parameter is the time, without a delay of its own"
+        if any(law.parameter_count != 1 + self.parameter_count or law.delay for law in every):
+            expected = "a law whose first parameter is the time, before those of the system, without a delay of its own"
             raise InputError(path="system", expected=expected, got="another")
         times = [0.0, *(begin for begin, _ in self.later), self.horizon]
         for i, (begin, until) in enumerate(pairwise(times)):
@@ -567,6 +573,32 @@ class VaryingSystem:
             drifting = [law if law.c is not None else replace(law, c=np.zeros((law.states, 1))) for law in every]
             object.__setattr__(self, "law", drifting[0])
             object.__setattr__(self, "later", tuple(zip(times[1:-1], drifting[1:], strict=True)))
+        if self.parameters is not None:
+            _ = self.dependence
+
+    @cached_property
+    def dependence(self) -> Dependence:
+        """How the state depends on the parameters; raises `InputError` where that is not affinely."""
+        centre = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
+        entries = [[law.entry(name) for name in PARTS] for _, _, law in self.laws]
+        found = dependence(entries, centre)
+        if isinstance(found, Dependence):
+            return found
+        number, name, i, j = found
+        entry = entries[number][PARTS.index(name)]
+        raise InputError(
+            path=(f"system.pieces.{number}" if self.later else "system") + f".{name}.{i}.{j}",
+            expected="parameters that the state depends on affinely, beside the time t: to the first power in B, E and"
+            " c, and in A where they multiply what depends on none; of others nothing is proven yet. What they do to"
+            " the state may be put into the disturbance, with a bound of the states",
+            got=entry.entries[i][j].text if isinstance(entry, ExpressionMatrix) else "a function of them",
+        )
+
+    def with_parameters(self, parameters: ConvexSet) -> VaryingSystem:
+        """The same system with its parameters in another box."""
+        box = boxed(parameters)
+        laws = [(begin, law.with_parameters(_and_time(begin, until, box))) for begin, until, law in self.laws]
+        return replace(self, law=laws[0][1], later=tuple(laws[1:]), parameters=box)
 
     @staticmethod
     def of(
@@ -577,24 +609,33 @@ class VaryingSystem:
         c: Sequence[str | float] | None = None,
         define: Mapping[str, str | float] | None = None,
         delay: float = 0.0,
+        parameters: ConvexSet | None = None,
+        names: Sequence[str] = (),
     ) -> VaryingSystem:
-        """The system whose entries are numbers and expressions in ``t`` and in the names that ``define`` gives to
-        expressions in ``t``; see `parse_expression`. Raises `InputError` that begins with the key of a config."""
-        return VaryingSystem(_law("system", (A, B, E, c), (0.0, horizon), define), horizon, delay)
+        """The system whose entries are numbers and expressions in ``t``, in the ``names`` of uncertain ``parameters``
+        (p1, p2, ... unless given), and in those that ``define`` gives to such expressions; see `parse_expression`.
+        Raises `InputError` that begins with the key of a config."""
+        known = _Uncertain.of(parameters, names)
+        law = _law("system", (A, B, E, c), (0.0, horizon), define, known)
+        return VaryingSystem(law, horizon, delay, parameters=known.box)
 
     @staticmethod
     def taking_turns(
-        pieces: Sequence[tuple[float, InTime]], define: Mapping[str, str | float] | None = None, delay: float = 0.0
+        pieces: Sequence[tuple[float, InTime]],
+        define: Mapping[str, str | float] | None = None,
+        delay: float = 0.0,
+        parameters: ConvexSet | None = None,
+        names: Sequence[str] = (),
     ) -> VaryingSystem:
         """Systems as those of `of`, each up to a time with its ``A``, ``B``, ``E`` and ``c``; ``t`` counts from 0 in
         all of them, and the last one ends at the horizon."""
-        begins = [0.0, *(float(until) for until, _ in pieces[:-1])]
+        begins, known = [0.0, *(float(until) for until, _ in pieces[:-1])], _Uncertain.of(parameters, names)
         laws = [
-            _law(f"system.pieces.{i}", given, (begin, float(until)), define)
+            _law(f"system.pieces.{i}", given, (begin, float(until)), define, known)
             for i, (begin, (until, given)) in enumerate(zip(begins, pieces, strict=True))
         ]
         later = tuple(zip(begins[1:], laws[1:], strict=True))
-        return VaryingSystem(laws[0], float(pieces[-1][0]), delay, later)
+        return VaryingSystem(laws[0], float(pieces[-1][0]), delay, later, known.box)
 
     @property
     def laws(self) -> tuple[tuple[float, float, LinearSystem], ...]:
@@ -605,7 +646,7 @@ class VaryingSystem:
 
     def lawful(self, laws: Sequence[tuple[float, LinearSystem]]) -> VaryingSystem:
         """The same with other ``laws``, each with the time from which it holds, the first from 0 on."""
-        return VaryingSystem(laws[0][1], self.horizon, self.delay, tuple(laws[1:]))
+        return replace(self, law=laws[0][1], later=tuple(laws[1:]))
 
     def remaining(self, begin: float, horizon: float) -> VaryingSystem:
         """None yet; raises `InputError`."""
@@ -628,19 +669,14 @@ class VaryingSystem:
         return self.law.disturbances
 
     @property
-    def parameters(self) -> None:
-        """No uncertain parameters."""
-        return
-
-    @property
     def parameter_count(self) -> int:
-        """0."""
-        return 0
+        """Number ``nu`` of uncertain parameters."""
+        return 0 if self.parameters is None else self.parameters.dimension
 
     @property
     def names(self) -> Sequence[str]:
-        """No names, since there are no parameters."""
-        return ()
+        """Names of the uncertain parameters."""
+        return self.law.names[1:]
 
     @property
     def switches(self) -> tuple[float, ...]:
@@ -664,7 +700,7 @@ class VaryingSystem:
         # Chebyshev's points, closer to the ends: an entry that is 0 at evenly spaced times is seen
         shares = (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
         for begin, until, law in self.laws:
-            times = begin + (until - begin) * shares
+            times = self._points(begin + (until - begin) * shares)
             A, B, E = law.matrices(times)
             drifts = [None] * LOOKS if self.c is None else list(law.forced.matrices(times)[1][:, :, -1:])
             found += [LinearSystem(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True)]
@@ -681,14 +717,21 @@ class VaryingSystem:
         time: float = 1.0,
     ) -> VaryingSystem:
         """As `LinearSystem.in_units`; the time of the law is divided too."""
-        first, *others = (law.in_units(A, B, E, np.array([time]), c, 1.0) for _, _, law in self.laws)
+        every = np.concatenate([[time], parameters])
+        first, *others = (law.in_units(A, B, E, every, c, 1.0) for _, _, law in self.laws)
         later = tuple((begin / time, law) for (begin, _), law in zip(self.later, others, strict=True))
-        return VaryingSystem(first, self.horizon / time, self.delay / time, later)
+        bound = None if self.parameters is None else boxed(self.parameters.in_units(parameters))
+        return VaryingSystem(first, self.horizon / time, self.delay / time, later, bound)
+
+    def _points(self, times: Array) -> Array:
+        """``times (k, 1)`` as parameters of the law, with those of the system in the middle of their box."""
+        middle = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
+        return np.hstack([times, np.tile(middle, (len(times), 1))])
 
     @shaped
     def describe(self, parameter: Float[Array, " nu"]) -> str:
-        """Nothing: no parameter is uncertain."""
-        return ""
+        """As `LinearSystem.describe`."""
+        return ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.names, parameter, strict=True))
 
 
 System: TypeAlias = LinearSystem | SwitchedSystem | VaryingSystem
@@ -702,7 +745,7 @@ def require_period(system: VaryingSystem) -> None:
         return
     every = [[part[0] for part in mode.forced.matrices(np.zeros((1, 0)))] for mode in system.modes]
     sizes = [np.abs(parts).max(axis=0) for parts in zip(*every, strict=True)]
-    ends = system.law.forced.matrices(np.array([[0.0], [system.horizon]]))
+    ends = system.law.forced.matrices(system._points(np.array([[0.0], [system.horizon]])))
     for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
         for i, j in np.argwhere(np.abs(last - first) > PERIODIC * size):
             entry = f"c[{i + 1}]" if name == "B" and j >= system.controls else f"{name}[{i + 1}][{j + 1}]"
@@ -726,11 +769,51 @@ def _check_piece(i: int, pair: object, before: float) -> None:
         raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=said)
 
 
+def boxed(parameters: ConvexSet) -> Box:
+    """A set of parameters beside the time, which must be a box."""
+    if not parameters.is_box or not parameters.is_bounded:
+        raise InputError(
+            path="system.parameters", expected="a bounded box beside the time t, one interval each", got=parameters.kind
+        )
+    return parameters.bounding_box()
+
+
+def _and_time(begin: float, until: float, parameters: Box | None) -> Box:
+    """The times from one to another, and the parameters."""
+    if parameters is None:
+        return Box([begin], [until])
+    return Box(np.append(begin, parameters.lower), np.append(until, parameters.upper))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Uncertain:
+    """The box of parameters beside the time, and the names of both."""
+
+    box: Box | None
+    names: tuple[str, ...]
+
+    @staticmethod
+    def of(parameters: ConvexSet | None, names: Sequence[str]) -> _Uncertain:
+        """Those that are given; raises `InputError` for a set that is no box, or as many names."""
+        box = None if parameters is None else boxed(parameters)
+        count = 0 if box is None else box.dimension
+        given = tuple(names) or tuple(f"p{i + 1}" for i in range(count))
+        if len(given) != count or TIME in given:
+            expected = f"{count} names, none of them {TIME}, which is the time"
+            raise InputError(path="system.parameters", expected=expected, got=", ".join(given))
+        return _Uncertain(box, (TIME, *given))
+
+
 def _law(
-    where: str, given: InTime, during: tuple[float, float], define: Mapping[str, str | float] | None
+    where: str,
+    given: InTime,
+    during: tuple[float, float],
+    define: Mapping[str, str | float] | None,
+    uncertain: _Uncertain,
 ) -> LinearSystem:
     """The law that is ``given`` at a key of a config, whose entries speak of the time between two."""
-    names, (A, B, E, c) = (TIME,), given
+    names, (A, B, E, c) = uncertain.names, given
     try:
         defined = parse_definitions(define or {}, names)
     except InputError as error:
@@ -742,7 +825,7 @@ def _law(
         parse_matrix(f"{where}.A", A, names, defined),
         parse_matrix(f"{where}.B", B, names, defined),
         None if E is None else parse_matrix(f"{where}.E", E, names, defined),
-        Box([begin], [until]),
+        _and_time(begin, until, uncertain.box),
         names,
         None if c is None else parse_column(f"{where}.c", c, names, defined),
     )
@@ -817,6 +900,13 @@ class SystemInUnits(LinearSystem):
         mine, units = self.factors, parameters * self.units
         earlier = self.base.delay / self.delay if self.delay else 1.0
         return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], units, c * mine["c"], time * earlier)
+
+    def entry(self, name: str) -> _Entry | None:
+        base, factor, units = self.base.entry(name), self.factors[name], self.units
+        if callable(base):
+            function = base
+            return lambda p: np.asarray(function(np.asarray(p, dtype=object) * units), dtype=object) * factor
+        return None if base is None else base * factor
 
     def _shape(self, name: str) -> tuple[int, int]:
         return self.base._shape(name)

@@ -228,8 +228,11 @@ def _equal(H: Array, h: Array) -> tuple[Array, Array]:
     return np.vstack([H, -H]), np.append(h, -h)
 
 
-def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, cost: str) -> None:
-    """Raise `InputError` for what a policy is not built for, in one sentence."""
+def refuse(
+    problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, cost: str, uncertain: bool
+) -> None:
+    """Raise `InputError` for what a policy is not built for, in one sentence; ``uncertain``: the system has parameters,
+    which may be states by now."""
     disturbed = problem.disturbance is not None
     paths = problem.windows
     sets = [entry.set for entry in paths] + problem.terminal_sets
@@ -242,9 +245,7 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
         ),
-        "system without uncertain parameters: else what is measured is not the disturbance alone": bool(
-            problem.system.parameter_count
-        ),
+        "system without uncertain parameters: else what is measured is not the disturbance alone": uncertain,
         "disturbance of one class, piecewise_constant or measurable, not "
         f"{kind if isinstance(kind, str) else ' and '.join(sorted(set(kind)))}": disturbed
         and kind not in ("piecewise_constant", "measurable"),

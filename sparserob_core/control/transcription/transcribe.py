@@ -27,7 +27,6 @@ from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times, merge_grids
-from sparserob_core.control.transcription.accumulated import accumulated
 from sparserob_core.control.transcription.own_units import (
     own_units,
     rough_units,
@@ -37,6 +36,7 @@ from sparserob_core.control.transcription.own_units import (
 from sparserob_core.control.transcription.program import OpenLoop, held_nominally, held_units, transcribed, way_back
 from sparserob_core.control.transcription.record import Acting, Posed, Transcription
 from sparserob_core.control.transcription.steps import refuse_without_steps
+from sparserob_core.control.transcription.terms.accumulated import accumulated
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import OwnUnits, SemiInfiniteProgram
@@ -106,7 +106,7 @@ def prepare(
         from sparserob_core.control.transcription import feedback
 
         control = control.by_values()  # what answers a measurement is a value, which must not reach back before it
-        feedback.refuse(problem, control, disturbance, policy.charge.cost)
+        feedback.refuse(problem, control, disturbance, policy.charge.cost, stated.system.parameter_count > 0)
         if formulation != "reduced":
             raise InputError(
                 f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"

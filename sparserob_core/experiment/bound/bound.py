@@ -13,7 +13,7 @@ from sparserob_core.control.policies.policy import answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.suprema import bound_rows
-from sparserob_core.control.transcription.accumulated import accumulated
+from sparserob_core.control.transcription.terms.accumulated import accumulated
 from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import build, dictionaries_of, name_of, problem_of
 from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case

@@ -144,7 +144,7 @@ class SystemOptions(Options):
 
     parameters: Parameters | None = None
     """Intervals ``{name: [lower, upper]}``, or names and a set, as ``{names: [...], polytope: {H: ..., h: ...}}``; none
-    if known."""
+    if known. Beside entries in ``t`` intervals, of parameters that the state depends on affinely."""
 
     c: Column | None = None
     """Constant drift such as gravity, one entry per state, in units of the state per time; none unless given."""
@@ -196,7 +196,7 @@ class SystemOptions(Options):
         parameters, every = self._parameter_set(names), self.matrices()
         where, until, first = every[0]
         if self._changes(names, every):
-            return self._varying(every, horizon)
+            return self._varying(every, horizon, parameters)
         try:
             defined = parse_definitions(self.define or {}, names)
         except InputError as error:
@@ -215,19 +215,18 @@ class SystemOptions(Options):
             texts += [entry for rows in (A, B, E or []) for row in rows for entry in row] + (c or [])
         return any(TIME in re.findall(r"[A-Za-z_]\w*", text) for text in texts if isinstance(text, str))
 
-    def _varying(self, every: list[tuple[str, float | None, Matrices]], horizon: float | None) -> VaryingSystem:
-        if self.parameters:
-            expected = "none where the system changes with the time t, of which known ones are proven"
-            raise InputError(path="system.parameters", expected=expected, got="one")
+    def _varying(
+        self, every: list[tuple[str, float | None, Matrices]], horizon: float | None, parameters: ConvexSet | None
+    ) -> VaryingSystem:
         if horizon is None:
             raise InputError(path="system", expected="a system that stays the same with time here", got="one in t")
         for where, _, of in every:
             _check_shapes(where, of)
         if self.pieces is None:
             A, B, E, c = every[0][2]
-            return VaryingSystem.of(A, B, horizon, E, c, self.define, self.delay)
+            return VaryingSystem.of(A, B, horizon, E, c, self.define, self.delay, parameters, self.names())
         turns = [(float(until or 0.0), of) for _, until, of in every]
-        return VaryingSystem.taking_turns(turns, self.define, self.delay)
+        return VaryingSystem.taking_turns(turns, self.define, self.delay, parameters, self.names())
 
     def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
         if isinstance(self.parameters, ParameterSetOptions):
@@ -550,7 +549,8 @@ class ProblemKeys(ProblemFactory, Options):
                     path=f"{where}.E", expected=f"{system.states} rows, one per state", got=f"{len(one.E)}"
                 )
             rows = None if one.E is None else one.E + [[0.0] * len(one.E[0])] * below
-            E = None if rows is None else parse_matrix(f"{where}.E", rows, tuple(system.names))
+            names = system.law.names if isinstance(system, VaryingSystem) else system.names
+            E = None if rows is None else parse_matrix(f"{where}.E", rows, tuple(names))
             width = system.disturbances if one.E is None else len(one.E[0])
             bound, times = one.bound.build(f"{where}.set", width), one.times(where, self.horizon)
             found.append(Disturbance(bound, E, one.kind, one.start or 0.0, one.stop, times))

@@ -166,7 +166,7 @@ def _between(lower: float, upper: float) -> str:
 
 
 def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> MarginSearch | HorizonSearch:
-    from sparserob_core.control.transcription.accumulated import accumulated
+    from sparserob_core.control.transcription.terms.accumulated import accumulated
     from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
     tools = tools_of(loaded)

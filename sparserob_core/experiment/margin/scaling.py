@@ -11,7 +11,6 @@ import numpy as np
 
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.messages import nearest
@@ -147,7 +146,7 @@ def _listed(problem: OptimalControlProblem, field: str, of: str, positions: Sequ
 
 def _parameters(problem: OptimalControlProblem) -> Scaling:
     bound, system = problem.system.parameters, problem.system
-    assert bound is not None and not isinstance(system, VaryingSystem)
+    assert bound is not None
     resized = _resizing("parameters", bound)
     return Scaling(
         "parameters",

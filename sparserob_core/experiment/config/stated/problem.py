@@ -125,6 +125,8 @@ def _system_keys(system: System) -> dict[str, Any]:
     if isinstance(system, VaryingSystem):
         late: dict[str, Any] = {"delay": system.delay} if system.delay else {}
         late.update(_defined_keys([law for _, _, law in system.laws]))
+        if system.parameters is not None:
+            late["parameters"] = _parameter_keys(system.parameters, system.names)
         if not system.later:
             return {**_matrix_keys(system.law), **late}
         return {"pieces": [{"until": until, **_matrix_keys(law)} for _, until, law in system.laws], **late}

@@ -21,6 +21,7 @@ from sparserob_core.control.problem.problem import (
 )
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Equality, Polytope, cylinder, product
+from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 
@@ -41,7 +42,9 @@ class Running:
 def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same problem without integrals: each row of them is a state more, or the sum of two, known at the beginning
     and not measured, that is bounded at one time. The system stays a single one where it is one and all windows begin
-    at 0: integrals then go on to the horizon, since nothing looks at them again."""
+    at 0: integrals then go on to the horizon, since nothing looks at them again. Parameters beside the time became
+    states before (`superposed`), of which there are integrals too."""
+    problem = superposed(problem)
     if not problem.integral:
         return problem
     running, ends, d = list[Running](), list[Accumulated](), problem.system.states

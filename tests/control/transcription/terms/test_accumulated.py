@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.transcription.accumulated import accumulated
+from sparserob_core.control.transcription.terms.accumulated import accumulated
 
 SPRING = sr.LinearSystem([[0, 1], [-2, -0.5]], [[0], [1]])
 

@@ -1,0 +1,335 @@
+"""Parameters beside the time, as coordinates of a larger state: derived from the problem's records alone.
+
+Where every entry of ``[A B E c]`` is a sum ``f_0(t) + sum_j f_j(t) s_j``, ``s_j`` what parameter ``j`` deviates from a
+middle one by, the state is ``x = x_0 + sum_j s_j y_j``, if no entry of ``A`` that has an ``s_j`` meets a state that
+depends on a parameter: then ``y_j' = A_0 y_j + A_j x_0 + B_j u + E_j w + c_j``. After the ``d`` states of the problem
+come the coordinates of ``y_1`` that anything moves, then those of ``y_2``, and so on. Rows on ``x`` are affine in
+``s``, and hold on a box where they hold at its corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cached_property
+from itertools import product
+from math import inf, nextafter
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.control.policies.measurements import Measurements
+from sparserob_core.control.problem.cost import Quadratic
+from sparserob_core.control.problem.problem import IntegralConstraint, MixedConstraint, OptimalControlProblem
+from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, Polytope, Product
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from sparserob_core.control.problem.problem import PathConstraint
+
+NAMES = ("A", "B", "E", "c")
+FREE = -1  # the key of what no parameter multiplies
+
+
+@final
+class Something:
+    """Any number at all, as a time of which nothing is known; nothing that is made of it counts as 0."""
+
+    def _any(self, *_: object) -> Something:
+        return self
+
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = __rtruediv__ = __pow__ = _any
+    __rpow__ = __neg__ = __pos__ = sin = cos = tan = exp = sqrt = log = tanh = kepler = _any
+
+
+@final
+class Sum:
+    """``parts[FREE] + sum_j parts[j] s_j``; ``bent``: it is, or may be, something else."""
+
+    __slots__ = ("bent", "parts")
+
+    def __init__(self, parts: dict[int, Any], bent: bool = False) -> None:
+        self.parts, self.bent = parts, bent
+
+    @property
+    def is_free(self) -> bool:
+        return not self.bent and self.parts.keys() == {FREE}
+
+    @staticmethod
+    def _of(other: object) -> Sum:
+        return other if isinstance(other, Sum) else Sum({FREE: other})
+
+    def __add__(self, other: object) -> Sum:
+        more, parts = Sum._of(other), dict(self.parts)
+        for key, value in more.parts.items():
+            parts[key] = parts[key] + value if key in parts else value
+        return Sum(parts, self.bent or more.bent)
+
+    def __neg__(self) -> Sum:
+        return Sum({key: -value for key, value in self.parts.items()}, self.bent)
+
+    def __pos__(self) -> Sum:
+        return self
+
+    def __sub__(self, other: object) -> Sum:
+        return self + -Sum._of(other)
+
+    def __rsub__(self, other: object) -> Sum:
+        return Sum._of(other) + -self
+
+    def __mul__(self, other: object) -> Sum:
+        more = Sum._of(other)
+        whole, factor = (self, more) if more.is_free else (more, self)
+        if not factor.is_free:
+            return Sum(self.parts, True)
+        by = factor.parts[FREE]
+        return Sum({key: value * by for key, value in whole.parts.items()}, whole.bent)
+
+    def __truediv__(self, other: object) -> Sum:
+        under = Sum._of(other)
+        if not under.is_free:
+            return Sum(self.parts, True)
+        return Sum({key: value / under.parts[FREE] for key, value in self.parts.items()}, self.bent)
+
+    def __rtruediv__(self, other: object) -> Sum:
+        return Sum._of(other) / self
+
+    def __pow__(self, other: object) -> Sum:
+        exponent = Sum._of(other)
+        if not (self.is_free and exponent.is_free):
+            return Sum(self.parts, True)
+        return Sum({FREE: self.parts[FREE] ** exponent.parts[FREE]})
+
+    def __rpow__(self, other: object) -> Sum:
+        return Sum._of(other) ** self
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def _through(self, function: Callable[[Any], Any]) -> Sum:
+        return Sum({FREE: function(self.parts[FREE])}) if self.is_free else Sum(self.parts, True)
+
+    def sin(self) -> Sum:
+        return self._through(np.sin)
+
+    def cos(self) -> Sum:
+        return self._through(np.cos)
+
+    def tan(self) -> Sum:
+        return self._through(np.tan)
+
+    def exp(self) -> Sum:
+        return self._through(np.exp)
+
+    def log(self) -> Sum:
+        return self._through(np.log)
+
+    def sqrt(self) -> Sum:
+        return self._through(np.sqrt)
+
+    def tanh(self) -> Sum:
+        return self._through(np.tanh)
+
+    def kepler(self, eccentricity: float) -> Sum:
+        from sparserob_core.control.problem.expression import kepler
+
+        return self._through(lambda anomaly: kepler(anomaly, eccentricity))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The system of a problem about the ``middle (nu,)`` of its parameters."""
+
+    system: VaryingSystem
+    middle: tuple[float, ...]
+
+    def tables(self, entry: object, time: object) -> list[np.ndarray]:
+        """``f_0, f_1, ..., f_nu`` of a matrix at a time; raises `Unchecked` where it is no such sum."""
+        nothing: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
+        p = np.empty(1 + len(self.middle), dtype=object)
+        p[0] = Sum({FREE: time})
+        for j, value in enumerate(self.middle):
+            p[1 + j] = Sum({FREE: nothing + value, j: nothing + 1.0})
+        with np.errstate(all="ignore"):
+            whole = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
+        found = [np.zeros(whole.shape, dtype=object) for _ in p]
+        for place, value in np.ndenumerate(whole):
+            one = Sum._of(value)
+            if one.bent:
+                raise Unchecked("the checker knows parameters beside the time that the state depends on affinely")
+            for key, part in one.parts.items():
+                found[1 + key][place] = part
+        return found
+
+    @cached_property
+    def moved(self) -> list[list[int]]:
+        """The coordinates of every ``y_j``; raises `Unchecked` where the state is not affine in the parameters."""
+        d, nu = self.system.states, len(self.middle)
+        steady, own, driven = np.zeros((d, d), dtype=bool), np.zeros((nu, d, d), dtype=bool), np.zeros((nu, d), bool)
+        for _, _, law in self.system.laws:
+            for name in NAMES:
+                entry = law.entry(name)
+                if entry is None:
+                    continue
+                first, *others = (
+                    [[_may_be(v) for v in row] for row in part] for part in self.tables(entry, Something())
+                )
+                if name == "A":
+                    steady |= np.array(first)
+                    own |= np.array(others)
+                driven |= np.array(others).any(axis=2)
+        onward = np.minimum(np.eye(d) + steady, 1.0)
+        for _ in range(d.bit_length()):  # where a state may go in 1, 2, 4, ... steps
+            onward = np.minimum(onward @ onward, 1.0)
+        found = [np.flatnonzero(onward @ start > 0.0).tolist() for start in driven.astype(float)]
+        if any(own[:, :, places].any() for places in found):
+            raise Unchecked("the checker knows parameters beside the time that the state depends on affinely")
+        return found
+
+    @property
+    def size(self) -> int:
+        """All coordinates."""
+        return self.system.states + sum(map(len, self.moved))
+
+    def seen(self, shares: tuple[float, ...]) -> Array:
+        """``x`` as rows on all coordinates, ``(d, size)``, at deviations of the parameters."""
+        d = self.system.states
+        found, column = np.zeros((d, self.size)), d
+        found[:, :d] = np.eye(d)
+        for share, places in zip(shares, self.moved, strict=True):
+            for place in places:
+                found[place, column] = share
+                column += 1
+        return found
+
+    def corners(self) -> Iterator[tuple[float, ...]]:
+        """Those of a box that holds all deviations; of parameters that move nothing one suffices."""
+        box, ends = self.system.parameters, []
+        if not isinstance(box, Box):
+            raise Unchecked("the checker knows boxes of parameters beside the time")
+        for low, high, middle, places in zip(
+            box.lower.tolist(), box.upper.tolist(), self.middle, self.moved, strict=True
+        ):
+            least, most = (
+                _beyond(Fraction(low) - Fraction(middle), -inf),
+                _beyond(Fraction(high) - Fraction(middle), inf),
+            )
+            ends.append(([least] if least == most else [least, most]) if places else [0.0])
+        return product(*ends)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Larger:
+    """One of the matrices of the system of all coordinates."""
+
+    parts: Parts
+    name: str
+    entry: object
+
+    def __call__(self, p: Any) -> np.ndarray:
+        """The matrix at a time ``(1,)``."""
+        whole, moved, d = self.parts.tables(self.entry, p[0]), self.parts.moved, self.parts.system.states
+        if self.name != "A":
+            return np.concatenate([whole[0], *(one[places] for one, places in zip(whole[1:], moved, strict=True))])
+        found, row = np.zeros((self.parts.size, self.parts.size), dtype=object), d
+        found[:d, :d] = whole[0]
+        for one, places in zip(whole[1:], moved, strict=True):
+            rows = slice(row, row + len(places))
+            found[rows, :d], found[rows, rows] = one[places], whole[0][np.ix_(places, places)]
+            row += len(places)
+        return found
+
+
+def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem with coordinates for its parameters beside the time; it itself where there are none."""
+    system = problem.system
+    if not isinstance(system, VaryingSystem) or system.parameters is None:
+        return problem
+    parts = Parts(system, tuple(system.parameters.interior_point().tolist()))
+    d, more = system.states, parts.size - system.states
+    corners = [parts.seen(shares) for shares in parts.corners()]
+    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
+    if problem.repeat or any(isinstance(end, Equality) for end in problem.terminal):
+        raise Unchecked("the checker knows no return, and no fixed final values, beside parameters and the time")
+    called = list(problem.names.states or [f"x{i + 1}" for i in range(d)])
+    units = list(problem.names.state_units)
+    for name, places in zip(system.names, parts.moved, strict=True):
+        called += [f"{called[i]} per {name}" for i in places]
+        units += [units[i] for i in places] if problem.names.state_units else []
+    laws = [(begin, _law(parts, law, begin, until)) for begin, until, law in system.laws]
+    costs = [None if q is None else Quadratic(np.pad(q.Q, (0, more)), np.pad(q.reference, (0, more)))
+             for q in problem.cost.terms]  # fmt: skip
+    return replace(
+        problem,
+        system=VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:])),
+        initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(more)]),
+        initial_set=None if begun is None else _begun(begun, more),
+        path=[_seen(entry, corners) for entry in problem.path],
+        terminal=[_polytope(end, corners) for end in problem.terminal if not isinstance(end, Equality)],
+        integral=[_sums(entry, corners) for entry in problem.integral],
+        cost=replace(problem.cost, state=costs[0], final=costs[2]),
+        names=replace(problem.names, states=called, state_units=units),
+        measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, more)))),
+    )
+
+
+def _may_be(value: object) -> bool:
+    return isinstance(value, Something) or float(value) != 0.0  # type: ignore[arg-type]  # a number then
+
+
+def _beyond(exact: Fraction, side: float) -> float:
+    """The double next to a number on one side of it, or the number itself."""
+    found = float(exact)
+    off = Fraction(found) - exact
+    return nextafter(found, side) if (off < 0 < side) or (side < 0 < off) else found
+
+
+def _law(parts: Parts, law: LinearSystem, begin: float, until: float) -> LinearSystem:
+    made = {name: Larger(parts, name, law.entry(name)) for name in NAMES if law.entry(name) is not None}
+    return LinearSystem(made["A"], made["B"], made["E"], Box([begin], [until]), ("t",), made.get("c"))
+
+
+def _begun(bound: ConvexSet, more: int) -> ConvexSet:
+    zero = np.zeros(more)
+    if isinstance(bound, Box):
+        return Box(np.append(bound.lower, zero), np.append(bound.upper, zero))
+    return Product((bound, Box(zero, zero)))
+
+
+def _rows(blocks: list[Array]) -> Array:
+    """All rows, every one once, in the order in which they come first."""
+    return np.array(list(dict.fromkeys(tuple(row) for block in blocks for row in block.tolist())))
+
+
+def _polytope(bound: ConvexSet, corners: list[Array]) -> Polytope:
+    flat = bound.halfspaces()
+    if flat is None:
+        raise Unchecked("beside parameters and the time the checker knows sets with flat sides")
+    every = _rows([np.column_stack([flat[0] @ seen, flat[1]]) for seen in corners])
+    return Polytope(every[:, :-1], every[:, -1])
+
+
+def _seen(
+    entry: PathConstraint | MixedConstraint | ConvexSet, corners: list[Array]
+) -> PathConstraint | MixedConstraint:
+    assert not isinstance(entry, ConvexSet)
+    d, size = corners[0].shape
+    if isinstance(entry, MixedConstraint):
+        H, G = np.asarray(entry.H), np.asarray(entry.G)
+        every = _rows(
+            [np.column_stack([H @ seen, G, np.broadcast_to(np.asarray(entry.h), len(H))]) for seen in corners]
+        )
+        return replace(entry, H=every[:, :size], G=every[:, size:-1], h=every[:, -1])
+    rows = None if entry.relative_to is None else np.asarray(entry.relative_to)
+    moved = None if rows is None else np.pad(rows, ((0, 0), (0, size - d)))
+    return replace(entry, set=_polytope(entry.set, corners), relative_to=moved)
+
+
+def _sums(entry: IntegralConstraint, corners: list[Array]) -> IntegralConstraint:
+    size, sides = corners[0].shape[1], [np.asarray(one, dtype=float) for one in (entry.lower, entry.upper)]
+    every = _rows([np.column_stack([np.asarray(entry.H) @ seen, np.asarray(entry.G), *sides]) for seen in corners])
+    return replace(entry, H=every[:, :size], G=every[:, size:-2], lower=every[:, -2], upper=every[:, -1])

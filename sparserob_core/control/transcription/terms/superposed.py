@@ -1,0 +1,153 @@
+"""Parameters beside the time as states: a problem whose state is an affine function of them, as one of a known system,
+of which every bound of the state is one for each corner of their box."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from itertools import product as every_choice
+
+import numpy as np
+
+from sparserob_core.control.enclosures.dependence import PARTS, Dependence, Superposed
+from sparserob_core.control.policies.measurements import Measurements
+from sparserob_core.control.problem.cost import Cost, Quadratic
+from sparserob_core.control.problem.names import Names
+from sparserob_core.control.problem.problem import (
+    IntegralConstraint,
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+)
+from sparserob_core.control.problem.system import TIME, LinearSystem, VaryingSystem
+from sparserob_core.control.sets.sets import Box, Equality, Polytope, product
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+CORNERS = 64  # of a box of parameters: rows are as many times more, with ten times as many it would take minutes
+
+
+def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The same problem without parameters beside the time. The states of one in the middle of their box stay the first
+    ones, after which come what each parameter adds per unit of it; both obey known equations. A bound of the state
+    holds for all parameters where it holds at the corners. Differences to the middle are rounded outwards."""
+    system = problem.system
+    if not isinstance(system, VaryingSystem) or system.parameters is None:
+        return problem
+    depends = system.dependence
+    corners = _corners(system.parameters, depends)
+    d, size = system.states, depends.states
+    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
+    rows = [depends.rows(corner) for corner in corners]
+    return replace(
+        problem,
+        system=_known(system, depends),
+        initial_state=np.append(np.asarray(problem.initial_state), np.zeros(size - d)),
+        initial_set=None if begun is None else product([begun, Box(np.zeros(size - d), np.zeros(size - d))]),
+        path=[_window(entry, rows) for entry in problem.path],
+        terminal=[_everywhere(end, rows) for end in problem.terminal],
+        integral=[_integral(entry, rows) for entry in problem.integral],
+        cost=_cost(problem.cost, size - d),
+        names=_names(problem.names, system, depends),
+        measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, size - d)))),
+    )
+
+
+def _corners(box: Box, depends: Dependence) -> list[Array]:
+    """The corners of the box as deviations from its middle, of parameters that reach a state; rounded outwards."""
+    ends = [
+        sorted({_outwards(low, middle, up=False), _outwards(high, middle, up=True)}) if any(reached) else [0.0]
+        for low, high, middle, reached in zip(
+            box.lower.tolist(), box.upper.tolist(), depends.centre.tolist(), depends.reached.tolist(), strict=True
+        )
+    ]
+    count = int(np.prod([len(one) for one in ends]))
+    if count > CORNERS:
+        expected = f"a box with at most {CORNERS} corners beside the time t"
+        raise InputError(path="system.parameters", expected=expected, got=f"{count}")
+    return [np.array(one) for one in every_choice(*ends)]
+
+
+def _outwards(end: float, middle: float, up: bool) -> float:
+    """The difference of two numbers, or the next double beyond it."""
+    exact, found = Fraction(end) - Fraction(middle), end - middle
+    short = Fraction(found) < exact if up else Fraction(found) > exact
+    return float(np.nextafter(found, np.inf if up else -np.inf)) if short else found
+
+
+def _known(system: VaryingSystem, depends: Dependence) -> VaryingSystem:
+    """The system of all states."""
+    laws = []
+    for begin, until, law in system.laws:
+        parts = {name: law.entry(name) for name in PARTS}
+        made = {name: Superposed(name, part, depends) for name, part in parts.items() if part is not None}
+        times = Box([begin], [until])
+        laws.append((begin, LinearSystem(made["A"], made["B"], made["E"], times, (TIME,), made.get("c"))))
+    return VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:]))
+
+
+def _window(
+    entry: PathConstraint | MixedConstraint | ConvexSet, rows: list[Array]
+) -> PathConstraint | MixedConstraint | ConvexSet:
+    assert not isinstance(entry, ConvexSet)  # a problem has made constraints of its sets
+    more = rows[0].shape[1] - rows[0].shape[0]
+    if isinstance(entry, MixedConstraint):
+        H, G, h = (np.asarray(part) for part in (entry.H, entry.G, entry.h))
+        both, limits = _apart(
+            np.vstack([np.hstack([H @ one, G]) for one in rows]), np.tile(np.broadcast_to(h, len(H)), len(rows))
+        )
+        return replace(entry, H=both[:, : rows[0].shape[1]], G=both[:, rows[0].shape[1] :], h=limits)
+    moved = None if entry.relative_to is None else np.pad(np.asarray(entry.relative_to), ((0, 0), (0, more)))
+    return replace(entry, set=_everywhere(entry.set, rows), relative_to=moved)
+
+
+def _everywhere(bound: ConvexSet | Equality, rows: list[Array]) -> ConvexSet:
+    """The states of which all that a corner makes are in a set with flat sides."""
+    assert not isinstance(bound, Equality)  # which was refused, as curved sets were
+    flat = bound.halfspaces()
+    assert flat is not None
+    return Polytope(*_apart(np.vstack([flat[0] @ one for one in rows]), np.tile(flat[1], len(rows))))
+
+
+def _apart(rows: Array, limits: Array) -> tuple[Array, Array]:
+    """The rows without those that another one repeats."""
+    _, first = np.unique(np.column_stack([rows, limits]), axis=0, return_index=True)
+    kept = np.sort(first)
+    return rows[kept], limits[kept]
+
+
+def _integral(entry: IntegralConstraint, rows: list[Array]) -> IntegralConstraint:
+    H, G = np.asarray(entry.H), np.asarray(entry.G)
+    lower, upper = (np.asarray(side, dtype=float) for side in (entry.lower, entry.upper))
+    every = np.vstack([np.hstack([H @ one, G, lower[:, None], upper[:, None]]) for one in rows])
+    _, first = np.unique(every, axis=0, return_index=True)
+    every, size = every[np.sort(first)], rows[0].shape[1]
+    return replace(entry, H=every[:, :size], G=every[:, size:-2], lower=every[:, -2], upper=every[:, -1])
+
+
+def _cost(cost: Cost, more: int) -> Cost:
+    """The same cost, of the nominal trajectory: that in the middle of the box."""
+
+    def widened(term: Quadratic | None) -> Quadratic | None:
+        return None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
+
+    state, _, final = cost.terms
+    return replace(cost, state=widened(state), final=widened(final))
+
+
+def _names(names: Names, system: VaryingSystem, depends: Dependence) -> Names:
+    """Those of the states, and of what a parameter adds to one per unit of it."""
+    added = [
+        (i, name)
+        for name, reached in zip(system.names, depends.reached, strict=True)
+        for i in np.flatnonzero(reached).tolist()
+    ]
+    units = [names.state_units[i] for i, _ in added] if names.state_units else []
+    return replace(
+        names,
+        states=[
+            *(names.state(i) for i in range(system.states)),
+            *(f"{names.state(i)} per {name}" for i, name in added),
+        ],
+        state_units=[*names.state_units, *units],
+    )

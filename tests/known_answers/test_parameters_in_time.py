@@ -1,0 +1,207 @@
+"""Guards parameters beside the time: costs by closed forms, by systems that do not change with time, and by linear
+programs at the corners of the box, each checked."""
+
+from __future__ import annotations
+
+import copy
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import linprog
+
+import sparserob_core as sr
+from sparserob_core.experiment.assemble import assemble
+from sparserob_core.experiment.check.check import check
+from sparserob_core.experiment.config.load import load_config
+
+Config = dict[str, Any]
+
+BASE: Config = {
+    "problem": {
+        "name": "linear",
+        "system": {
+            "A": [[0, 1], ["-1 - 0.3*sin(t)", -0.2]],
+            "B": [[0], ["(1 + p) * (1 + 0.1*cos(t))"]],
+            "E": [[0], ["1 + q"]],
+            "c": [0, "0.1 * q * cos(2*t)"],
+            "parameters": {"p": [-0.05, 0.05], "q": [-0.2, 0.3]},
+        },
+        "horizon": 5.0,
+        "initial_state": [-0.5, 0.5],
+        "control": {"box": 1.5},
+        "disturbance": {"box": [0.02]},
+        "path": [{"box": [0.7, None], "from": 0.2}],
+        "terminal": [{"box": [0.25, 0.25]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 10}},
+    "observers": [],
+}
+
+
+def solved(config: Config, directory: Path) -> sr.Outcome:
+    outcome = sr.run(config, out=directory, quiet=True, figures=False)
+    assert check(directory).status == "verified"
+    return outcome
+
+
+def beside(**system: Any) -> Config:
+    config = copy.deepcopy(BASE)
+    config["problem"]["system"].update(system)
+    return config
+
+
+@pytest.mark.slow
+def test_the_gain_of_an_integrator_is_paid_for_at_its_weakest(tmp_path: Path) -> None:
+    """``x' = (1 + p) (2 - t) u``: the strongest pieces are the first ones; at ``|p| <= 0.1`` the end is within 0.2 of 1
+    where 0.9 of what is given reaches 0.8, and 1.1 of it stays below 1.2."""
+    config: Config = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[0]], "B": [["(1 + p) * (2 - t)"]], "parameters": {"p": [-0.1, 0.1]}},
+            "horizon": 2.0,
+            "initial_state": [-1.0],
+            "control": {"box": 1.0},
+            "terminal": [{"box": [0.2]}],
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 8}},
+        "observers": [],
+    }
+    gains = np.array([2 - (k + 0.5) / 4 for k in range(8)]) / 4
+    needed, cost = 0.8 / 0.9, 0.0
+    for gain in gains:
+        share = min(1.0, needed / gain)
+        needed, cost = needed - share * gain, cost + share / 4
+        if needed <= 0.0:
+            break
+    outcome = solved(config, tmp_path / "run")
+    assert outcome.result.status == "certified"
+    assert outcome.result.cost == pytest.approx(cost, rel=1e-8)
+
+
+def at_the_corners(config: Config) -> float:
+    """The least cost of the config for disturbances on the control's pieces and parameters at the corners of their box,
+    the rows of the path at the ends of fine parts of the pieces: a bound from below that misses little."""
+    N, T, parts = 10, 5.0, 12
+    marks = np.linspace(0.0, T, N * parts + 1)
+    rows, limits = [], []
+    for p in (-0.05, 0.05):
+        for q in (-0.2, 0.3):
+
+            def rate(t: float, y: np.ndarray, p: float = p, q: float = q) -> np.ndarray:
+                X = y.reshape(2, 2 + 2 * N)
+                A = np.array([[0, 1], [-1 - 0.3 * np.sin(t), -0.2]])
+                drive, piece = np.zeros((2, 2 + 2 * N)), min(int(t / T * N), N - 1)
+                drive[1, 0] = 0.1 * q * np.cos(2 * t)
+                drive[1, 2 + piece] = (1 + p) * (1 + 0.1 * np.cos(t))
+                drive[1, 2 + N + piece] = 1 + q
+                return (A @ X + drive).ravel()
+
+            state = np.zeros((2, 2 + 2 * N))
+            state[:, 0] = [-0.5, 0.5]
+            for i, (start, stop) in enumerate(pairwise(marks.tolist())):
+                inside = (start + 1e-9 * T, stop - 1e-9 * T)  # a piece is looked up by the time
+                state = solve_ivp(rate, inside, state.ravel(), method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+                state = state.reshape(2, -1)
+                if stop >= 0.2:
+                    rows.append(state[0, 2 : 2 + N])
+                    limits.append(0.7 - state[0, 0] - 0.02 * np.abs(state[0, 2 + N :]).sum())
+                    rows.append(-state[0, 2 : 2 + N])
+                    limits.append(0.7 + state[0, 0] - 0.02 * np.abs(state[0, 2 + N :]).sum())
+                if i == marks.size - 2:
+                    for one in state:
+                        far = 0.25 - 0.02 * np.abs(one[2 + N :]).sum()
+                        rows += [one[2 : 2 + N], -one[2 : 2 + N]]
+                        limits += [far - one[0], far + one[0]]
+    G = np.array(rows)
+    found = linprog(np.ones(2 * N) * T / N, np.hstack([G, -G]), limits, bounds=(0, 1.5))
+    assert found.success
+    return float(found.fun)
+
+
+@pytest.mark.slow
+def test_a_plant_with_an_uncertain_gain_and_drift_costs_what_a_program_at_the_corners_does(tmp_path: Path) -> None:
+    outcome = solved(BASE, tmp_path / "run")
+    assert outcome.result.status == "certified"
+    assert outcome.result.cost == pytest.approx(at_the_corners(BASE), rel=1e-6)
+
+
+PLAIN: Config = {
+    "A": [[0, 1], [-1, -0.4]],
+    "B": [["0.2 + p", 0], [0, "1 - 0.5*p"]],
+    "E": [[1, 0], [0, "1 + q"]],
+    "c": [0, "0.05 + q"],
+    "parameters": {"p": [-0.03, 0.05], "q": [-0.02, 0.03]},
+}
+ADDED: dict[str, Config] = {
+    "nothing": {},
+    "moving set": {
+        "path": [{"box": [0.8, None], "from": 0.3, "relative_to": [[0, -0.2, 0], [3, 0.1, 0]]}],
+    },
+    "mixed": {"path": [{"mixed": {"H": [[0, 1]], "G": [[0.2, 0.5]], "h": [0.9]}, "from": 0.5}]},
+    "initial set": {"initial_state": {"centre": [-0.5, 0.5], "box": [0.02, 0.02]}},
+    "integral": {
+        "integral": [{"H": [[1, 0]], "G": [[0, 0.1]], "from": 0, "to": 2.5, "lower": [-0.05], "upper": [0.3]}]
+    },
+    "quadratic cost": {"cost": {"l1": 1.0, "control": {"R": [[0.1, 0], [0, 0.1]]}, "state": {"Q": [[0.1, 0], [0, 0]]}}},
+    "list of disturbances": {
+        "disturbance": [{"set": {"box": 0.03}, "E": [[1], [0]]}, {"set": {"box": 0.02}, "E": [[0], [1]], "pieces": 3}]
+    },
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("added", ADDED)
+def test_entries_that_do_not_change_cost_what_the_system_without_the_time_does(added: str, tmp_path: Path) -> None:
+    config = copy.deepcopy(BASE)
+    problem = config["problem"]
+    problem.update(horizon=3.0, control={"box": 1.0}, disturbance={"box": [0.03, 0.03]}, system=copy.deepcopy(PLAIN))
+    problem.update(path=[{"box": [0.6, None], "from": 0.2}])
+    problem.update(copy.deepcopy(ADDED[added]))
+    config["dictionaries"] = {"control": {"name": "piecewise_constant", "pieces": 6}}
+    plain = sr.run(config, out=tmp_path / "plain", quiet=True, figures=False)
+    dressed = copy.deepcopy(config)
+    dressed["problem"]["system"]["A"][1][1] = "-0.4 + 0*t"
+    ours = solved(dressed, tmp_path / "dressed")
+    assert ours.result.status == plain.result.status == "certified"
+    assert ours.result.cost == pytest.approx(plain.result.cost, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_parameter_of_a_that_multiplies_what_depends_on_none_is_proven(tmp_path: Path) -> None:
+    """``x2`` is a known motion of its own; ``x1' = (1 + p) x2 + u``."""
+    config = beside(
+        A=[["-0.1*t", "1 + p"], [0, "-0.2*cos(t)"]], B=[[1], [0]], E=[[1], [0]], c=None, parameters={"p": [-0.2, 0.2]}
+    )
+    config["problem"].update(initial_state=[-0.5, 0.3], path=[], terminal=[{"box": [0.2, None]}])
+    assert solved(config, tmp_path / "run").result.status == "certified"
+
+
+@pytest.mark.slow
+def test_a_certificate_whose_decision_serves_the_middle_alone_is_refuted(tmp_path: Path) -> None:
+    known = beside(parameters={"p": [0.0, 0.0], "q": [0.05, 0.05]})
+    sr.run(BASE, out=tmp_path / "run", quiet=True, figures=False)
+    sr.run(known, out=tmp_path / "known", quiet=True, figures=False)
+    theirs = json.loads((tmp_path / "known" / "certificate.json").read_text())
+    mine = tmp_path / "run" / "certificate.json"
+    mine.write_text(json.dumps({**json.loads(mine.read_text()), "decision": theirs["decision"]}))
+    assert {one.name: one.verdict for one in check(tmp_path / "run").claims}["terminal"] == "fails"
+
+
+@pytest.mark.parametrize(
+    ("system", "key"),
+    [
+        ({"A": [[0, 1], ["-1 + p*sin(t)", -0.2]]}, r"system\.A\.1\.0"),
+        ({"B": [[0], ["exp(p*t)"]]}, r"system\.B\.1\.0"),
+        ({"B": [[0], ["1 + p*q*t"]]}, r"system\.B\.1\.0"),
+        ({"c": ["t / (1 + q)", 0]}, r"system\.c\.0\.0"),
+        ({"parameters": {"names": ["p", "q"], "norm": {"p": 2, "radius": 0.1}}}, r"system\.parameters"),
+    ],
+)
+def test_what_the_state_is_no_affine_function_of_is_refused(system: Config, key: str) -> None:
+    with pytest.raises(sr.InputError, match=key):
+        assemble(load_config(beside(**system)))
