@@ -23,7 +23,7 @@ from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.sides import Bounded, Sides
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.disturbances import columns_of
-from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array
 
@@ -158,8 +158,6 @@ def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | N
 def _followed(case: Case, asked: Asked) -> Worst | None:
     """The row by its adjoint, where the system is known and does not change; ``None`` elsewhere."""
     system = case.problem.system
-    if isinstance(system, VaryingSystem):
-        raise Unchecked("worst cases of a system that changes with time are not derived")
     if case.problem.execution is not None and case.theta.any():
         raise Unchecked("worst cases of a control that is delivered with errors are not derived")
     if not isinstance(system, LinearSystem) or system.parameter_count or not case.alike:
@@ -249,7 +247,8 @@ def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
     ends = ([], []) if box is None else (box.lower.tolist(), box.upper.tolist())
     lower, upper = (np.array([[t, *p]]) for t, p in zip((window.start, window.stop), ends, strict=True))
     covered(case, alone, lower, upper)
-    cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist())})
+    segments = [] if case.changing is None else case.changing.ends[:-1]
+    cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist()), *segments})
     times = cut(np.array(case.grid), np.array(cuts), window.start, window.stop)
     work: Sequence[Work] = [((tuple(ends[0]), tuple(ends[1])), Sides([bounded]), times)]
     shown = prove(

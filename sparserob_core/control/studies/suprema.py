@@ -18,7 +18,7 @@ from sparserob_core.control.problem.problem import (
     PathConstraint,
     Return,
 )
-from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
@@ -167,12 +167,6 @@ def bound_row(
 ) -> BoundedRow:
     """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it, or to `LEAST`
     of the largest value that the row has anywhere in its window. Dictionaries are those of control and disturbance."""
-    if isinstance(problem.system, VaryingSystem):
-        raise InputError(
-            path="system",
-            expected="a system that does not change with time, or has pieces",
-            got="one with entries in t",
-        )
     known = followed(problem, dictionaries, theta, row)
     if known is not None:
         return _of_known(known, row, tolerance, notify, deadline)
@@ -182,8 +176,8 @@ def bound_row(
 def followed(
     problem: OptimalControlProblem, dictionaries: tuple[Dictionary, Dictionary], theta: Array, row: Row
 ) -> WorstRow | None:
-    """The row by its adjoint; ``None`` where the system has parameters or pieces, or where disturbances are of a kind
-    that adds up otherwise."""
+    """The row by its adjoint; ``None`` where the system has parameters or pieces, or changes with time, or where
+    disturbances are of a kind that adds up otherwise."""
     control, disturbance = dictionaries
     system, d = problem.system, problem.system.states
     alike = isinstance(problem.disturbance_class, str) and problem.disturbance_breakpoints is None
