@@ -13,6 +13,7 @@ import pytest
 from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.outcome import Clock, Unchecked
+from sparserob_core.checker.reach import adjoint as module
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion, Worst
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Box, Polytope
@@ -161,3 +162,101 @@ def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
         tops, highest = some(blurred).most(times)[0], some(up).most(times)[0]
         assert (highest <= tops + 1e-12).all()
         assert (tops <= highest + slack).all()
+
+
+def told(monkeypatch: pytest.MonkeyPatch, unit: float, half: float, outward: float) -> None:
+    """Let the module believe that its arithmetic is as coarse as it is told."""
+    monkeypatch.setattr(module, "rounding", lambda count: count * unit)
+    monkeypatch.setattr(module, "HALF_ULP", half)
+    monkeypatch.setattr(module, "OUTWARD", outward)
+
+
+COARSE = 1e-6
+
+
+def radii(kind: str) -> dict[str, np.ndarray]:
+    """Every radius that is told of one row, in a name each."""
+    row = worst(kind)
+    known, times = row.adjoint, np.array([0.3, 2.2, 3.99])
+    sums, rounded = known.integrals(times)
+    low, high = row.along(2.2, np.array([0.05, 0.02, -0.01]), GRID, np.array([[0.5, -0.2, 0.1, 0.3]]))
+    found = {
+        "at": known.at(times).rad,
+        "driven": known.driven.rad,
+        "sums": known.sums.rad[1:],
+        "integrals": sums.rad,
+        "rounded": rounded,
+        "between": known.between(times, 0.1, 0.2).rad,
+        "drives": row._driven(times)[1],
+        "most": row.most(times)[1],
+        "along": np.array([high - low]),
+        "supported": module._supported(Box([-0.2], [0.5]), Enclosed(np.array([[0.7]]), np.array([[1e-9]])))[1],
+    }
+    if kind == "measurable":
+        found |= {"swept": row._swept[1][1:], "part": row._part(np.array([3, 9]), np.array([0.25, 0.75]))[1]}
+        found["measurable"] = row._measurable(times)[1]
+    return found
+
+
+@pytest.mark.parametrize("kind", ["constant", "measurable"])
+def test_what_rounding_may_lose_is_in_every_radius(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sum of ``n`` products is off by at most ``n u`` of the sum of their sizes (Higham 2002, section 3.1): with a
+    unit that is told, every radius is at least that, of the sizes that are summed up."""
+    with monkeypatch.context() as patched:
+        told(patched, 0.0, 0.0, 1.0)
+        plain, row = radii(kind), worst(kind)
+        known, times = row.adjoint, np.array([0.3, 2.2, 3.99])
+        steps, shares = known.placed(times)
+        d, order = 3, module.ORDER
+        sizes = np.abs(known.nodes.mid[steps])
+        terms = np.einsum("kd,jdn->kjn", sizes, np.abs(known.motion.rows.mid))
+        powers = shares[:, None] ** np.arange(order + 1)
+        at = np.einsum("kjn,kj->kn", terms, powers)
+        values = np.abs(known.at(times).mid)
+        driven = np.abs(known.nodes.mid[:-1]) @ np.abs(known.motion.inputs.mid).transpose(1, 0, 2).reshape(d, -1)
+        driven = driven.reshape(-1, order + 1, 2)
+        moved = known.step * np.einsum("kjq,j->kq", np.abs(known.driven.mid), 1.0 / np.arange(1.0, order + 2.0))
+        part = known.between(times, 0.7, 1.9)
+        used = np.abs(part.mid[1:, :1]) @ np.array([1.0])  # of the second drive, which is -1
+        states = np.abs(known.at(times).mid) @ np.abs(row.centre)
+    with monkeypatch.context() as patched:
+        told(patched, COARSE, 0.0, 1.0)
+        rough = radii(kind)
+    more = {name: (rough[name] - plain[name]) / COARSE for name in plain}
+    share = 1.0 - 1e-6
+    assert (more["at"] >= share * d * at).all()
+    assert (more["at"] >= share * 3 * order * values).all()
+    assert (more["driven"] >= share * d * driven).all()
+    assert (more["sums"] >= share * (order + 2) * np.cumsum(moved, axis=0)).all()
+    assert (more["integrals"] >= share * (order + 2) * np.cumsum(moved, axis=0)[np.maximum(steps - 1, 0)]).all()
+    assert (more["drives"][1:] >= share * (1 + GRID.size) * used).all()
+    assert (more["most"] >= 3.0 * share * d * states).all()
+    assert (more["along"] >= 2.0 * share * d * states[1]).all()
+    assert more["supported"] == pytest.approx([0.7 * 0.5], rel=1e-6)
+    for name, each in more.items():
+        assert (each[..., :1] > 0.0).any(), name
+
+
+@pytest.mark.parametrize("kind", ["constant", "measurable"])
+def test_every_radius_is_enlarged_by_what_its_own_sum_may_round(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        told(patched, COARSE, 0.0, 1.0)
+        plain = radii(kind)
+    with monkeypatch.context() as patched:
+        told(patched, COARSE, 0.0, 2.0)
+        outward = radii(kind)
+    for name in plain:
+        if name in ("drives", "measurable"):  # whoever adds these up enlarges their sum
+            continue
+        larger = plain[name] > 0.0
+        assert larger.any() and (outward[name][larger] >= 1.999 * plain[name][larger]).all(), name
+    with monkeypatch.context() as patched:
+        told(patched, 0.0, 0.0, 1.0)
+        plain = radii(kind)
+    with monkeypatch.context() as patched:
+        told(patched, 0.0, COARSE, 1.0)
+        half = radii(kind)
+    values = np.abs(worst(kind).most(np.array([0.3, 2.2, 3.99]))[0])
+    assert (half["most"] - plain["most"] >= 3.0 * 8.0 * COARSE * values * 0.99).all()
+    assert (half["along"] > plain["along"]).all()
+    assert (half["rounded"] > plain["rounded"]).all() and (half["between"] > plain["between"]).all()
