@@ -260,3 +260,15 @@ def test_every_radius_is_enlarged_by_what_its_own_sum_may_round(kind: str, monke
     assert (half["most"] - plain["most"] >= 3.0 * 8.0 * COARSE * values * 0.99).all()
     assert (half["along"] > plain["along"]).all()
     assert (half["rounded"] > plain["rounded"]).all() and (half["between"] > plain["between"]).all()
+
+
+@pytest.mark.parametrize("rate", [2.0, 5.0])
+def test_what_is_left_of_the_expansion_of_a_bend_is_in_its_bound(rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``l = e^{a s}`` grows on every step, so that its bend is largest at the end; one term is expanded."""
+    monkeypatch.setattr(module, "BENDING", 0)
+    known = Adjoint.of(Motion.of(arb_mat([[rate]]), arb_mat([[1.0]]), HORIZON, Clock()), np.ones(1))
+    ends = known.nodes.mid[1:, 0]
+    rows, once, twice = (part[:, 0] for part in known.bends)
+    for bound, power in ((rows, 2), (once, 1), (twice, 2)):
+        assert (rate**power * ends <= bound).all()
+        assert (bound <= rate**power * ends * (1.0 + known.motion.growth * known.step)).all()
