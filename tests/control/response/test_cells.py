@@ -15,6 +15,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem, PathCo
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Polytope
 from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.errors import NotEnclosable
 from tests.support.families import FLAT
 from tests.support.plants import indicators, uniform, walsh
 
@@ -102,3 +103,12 @@ def test_no_cell_is_bounded_below_what_is_met_in_it_and_narrow_ones_hardly_above
             if share < 0.1:
                 near = top > 0.0
                 assert (bounds - top)[near].max(initial=0.0) <= 1e-2, (name, family.name, bounds, top)
+
+
+def test_measurable_disturbances_beside_parameters_have_no_enclosure_and_that_is_said() -> None:
+    said = {"system": UNSURE, "disturbance": BOX, "disturbance_class": "measurable", "path": FLAT[:1]}
+    made = OptimalControlProblem(horizon=HORIZON, initial_state=[-1.0, 0.5], control=Box([-1.0], [1.0]), **said)
+    family = prepare(made, uniform(4, HORIZON), uniform(4, HORIZON)).program.families[0]
+    assert family.enclosure is not None
+    with pytest.raises(NotEnclosable, match="with disturbance_class piecewise_constant there is one"):
+        family.enclosure(np.zeros(4), *family.cells)

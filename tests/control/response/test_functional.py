@@ -16,6 +16,7 @@ from sparserob_core.control.response.disturbance import disturbance_model
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.response import Outputs, Response, TimeGrid, merge_grids
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Product
+from sparserob_core.errors import InputError
 from tests.support.plants import indicators, random_system, simulated, uniform, walsh
 
 HORIZON = 3.0
@@ -125,6 +126,12 @@ def test_a_disturbance_on_own_pieces_keeps_its_value_there_and_pushes_as_its_cor
     held = model.held(np.array([0.1, 0.0]))
     assert held.support(weights) == pytest.approx(0.1 * weights[:, :, 0].sum(axis=1))
     assert model.held(np.zeros(2)) is None
+
+
+def test_few_functions_are_not_proven_beside_measurable_disturbances() -> None:
+    few = walsh(4, HORIZON, 2)
+    with pytest.raises(InputError, match="fewer functions than pieces are not proven beside measurable"):
+        disturbance_model(("piecewise_constant", "measurable"), TWO, few, merge_grids(few.breakpoints, few.breakpoints))
 
 
 def test_of_two_classes_one_is_on_blocks_and_the_other_is_measurable() -> None:
