@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, final
 
@@ -118,6 +119,10 @@ class Series:
 
     def held(self, inputs: Series, time: arb) -> tuple[Series, Series]:
         """``e^{matrix time}`` and ``int_0^time e^{matrix s} ds inputs`` from one exponential (Van Loan 1978)."""
+        return self.beside(inputs).scaled(time).exp().apart(self.parts[0].nrows())
+
+    def beside(self, inputs: Series) -> Series:
+        """What drives a state and an input that stays as it is."""
         from flint import arb, arb_mat
 
         n, m = self.parts[0].nrows(), inputs.parts[0].ncols()
@@ -126,11 +131,54 @@ class Series:
             arb_mat([a + b for a, b in zip(left.tolist(), right.tolist(), strict=True)] + below)
             for left, right in zip(self.parts, inputs.parts, strict=True)
         ]
-        whole = [part.tolist() for part in Series(self.monomials, joined).scaled(time).exp().parts]
+        return Series(self.monomials, joined)
+
+    def apart(self, n: int) -> tuple[Series, Series]:
+        """The first ``n`` rows: of the state, and of the input."""
+        from flint import arb_mat
+
+        whole = [part.tolist() for part in self.parts]
         return (
             Series(self.monomials, [arb_mat([row[:n] for row in part[:n]]) for part in whole]),
             Series(self.monomials, [arb_mat([row[n:] for row in part[:n]]) for part in whole]),
         )
+
+
+@final
+class Exponentials:
+    """``e^{matrix t}`` at whole numbers of ticks, each remembered: that of the longest time before it, times that of
+    the time between, which is remembered too, since cells are halves of halves. A product costs a tenth of a series,
+    and balls hardly grow."""
+
+    def __init__(self, matrix: Series, tick: float) -> None:
+        self.matrix, self.tick = matrix, tick
+        self._known: dict[int, Series] = {}
+        self._times: list[int] = []
+        self._steps: dict[int, Series] = {}
+
+    def at(self, ticks: int) -> Series:
+        """After that many ticks, exactly."""
+        if ticks not in self._known:
+            place = bisect_right(self._times, ticks)
+            before = self._times[place - 1] if place else 0
+            step = self.over(ticks - before)
+            self._known[ticks] = step * self._known[before] if before else step
+            self._times.insert(place, ticks)
+        return self._known[ticks]
+
+    def over(self, ticks: int) -> Series:
+        """The same, of a time that occurs often, by its own series."""
+        from flint import arb
+
+        if ticks not in self._steps:
+            self._steps[ticks] = self.matrix.scaled(arb(self.tick) * ticks).exp()
+        return self._steps[ticks]
+
+    def around(self, ticks: int) -> Series:
+        """From so many ticks before to so many after."""
+        from flint import arb
+
+        return self.matrix.scaled(arb(0, self.tick * ticks)).exp()
 
 
 def _tail(size: arb, terms: int) -> arb:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.jets import Monomials
-from sparserob_core.checker.arithmetic.series import Series
+from sparserob_core.checker.arithmetic.series import Exponentials, Series
 from sparserob_core.checker.reach.flow import Flow, in_time, stacked, up_to
 from sparserob_core.checker.reach.lasting import Lasting
 from sparserob_core.checker.sets.known import known
@@ -165,10 +165,10 @@ class DisturbanceSupports:
     _operators: dict[int, Operator] = field(default_factory=dict)
     _selves: dict[int, Operator] = field(default_factory=dict)
     _onward: dict[int, Operator] = field(default_factory=dict)
-    _steps: dict[int, Series] = field(default_factory=dict)
     _rows: tuple[list[int], list[Series]] | None = None
     _floats: dict[int, Enclosed] = field(default_factory=dict)
     _latest: tuple[tuple[float, int], Array, Array] | None = None
+    _latest_factors: tuple[int, list[Series]] | None = None
     _sums: dict[tuple[int, int, bytes], Sums] = field(default_factory=dict)
 
     def bounds(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array, Array]:
@@ -389,7 +389,7 @@ class DisturbanceSupports:
     def _later(self, ticks: int) -> Operator:
         """From a row to that after so many ticks."""
         if ticks not in self._onward:
-            self._onward[ticks] = Operator.of([self.flow.rows.scaled(self.scene.duration(ticks)).exp()], 0)
+            self._onward[ticks] = Operator.of([self._exponentials.at(ticks)], 0)
         return self._onward[ticks]
 
     def _operator(self, ticks: int) -> Operator:
@@ -409,12 +409,25 @@ class DisturbanceSupports:
         either side is included, since lags are rounded to ticks twice."""
         from flint import arb
 
+        if self._latest_factors is not None and self._latest_factors[0] == ticks:
+            return self._latest_factors[1]
         A, length = self.flow.rows, self.scene.duration(ticks)
         size = A.parts[0].nrows()
         unit = Series.constant(A.monomials, stacked([[arb(int(i == j)) for j in range(size)] for i in range(size)]))
         factors = [unit] + (in_time(A, A, length, A.scaled(up_to(length)).exp()) if ticks else [])
-        widened = A.scaled(arb(0, 2 * self.scene.tick)).exp()
-        return [factor * widened for factor in factors]
+        found = [factor * self._widened for factor in factors]
+        self._latest_factors = ticks, found
+        return found
+
+    @cached_property
+    def _exponentials(self) -> Exponentials:
+        """What becomes of rows."""
+        return Exponentials(self.flow.rows, self.scene.tick)
+
+    @cached_property
+    def _widened(self) -> Series:
+        """What a row does in two ticks to either side."""
+        return self._exponentials.around(2)
 
     def _row(self, ticks: int) -> Enclosed:
         """The rows after that many ticks, as columns: ``(M, n, b)``."""
@@ -433,9 +446,7 @@ class DisturbanceSupports:
         before = known[0][place - 1]
         if before == ticks:
             return known[1][place - 1]
-        if ticks - before not in self._steps:
-            self._steps[ticks - before] = self.flow.rows.scaled(self.scene.duration(ticks - before)).exp()
-        row = self._steps[ticks - before] * known[1][place - 1]
+        row = self._exponentials.over(ticks - before) * known[1][place - 1]
         known[0].insert(place, ticks)
         known[1].insert(place, row)
         return row

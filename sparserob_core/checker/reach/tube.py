@@ -13,7 +13,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.jets import Monomials
-from sparserob_core.checker.arithmetic.series import Series, norm, upper
+from sparserob_core.checker.arithmetic.series import Exponentials, Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
 from sparserob_core.checker.reach.flow import Flow, Remainder, beyond, held, in_time, middles, stacked, up_to
 from sparserob_core.checker.sets.known import known
@@ -67,6 +67,8 @@ class Tube:
     _growths: dict[tuple[int, int], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
     _ahead: dict[tuple[int, int], tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict)
     _inside: dict[tuple[int, int], Series] = field(default_factory=dict)
+    _parts: dict[tuple[int, int], tuple[Series, Series]] = field(default_factory=dict)
+    _exponentials: dict[int, tuple[Exponentials, Series]] = field(default_factory=dict)
     _states: dict[tuple[int, float, int], Enclosed] = field(default_factory=dict)
 
     @property
@@ -198,7 +200,6 @@ class Tube:
 
     def _state_part(self, piece: int, start: float, ticks: int) -> Enclosed:
         """``basis x`` of the undisturbed state, ``(J + 1, M, b)``."""
-        from flint import arb
 
         if (piece, start, ticks) in self._states:
             return self._states[piece, start, ticks]
@@ -206,7 +207,7 @@ class Tube:
         leg = self.scene.leg(piece)
         states, inputs = self.flows[leg].states, self.flows[leg].inputs
         if start != self.scene.grid[piece]:
-            Phi, Gamma = states.held(inputs, arb(start) - arb(self.scene.grid[piece]))
+            Phi, Gamma = self._since(piece, start)
             x = Phi * x + Gamma.applied(u)
         if ticks and self.flow.monomials.size == 1:
             return self._kept(piece, start, ticks, self._of_known(leg, ticks, x.parts[0], u))
@@ -218,6 +219,24 @@ class Tube:
             terms += in_time(states, states * x + inputs.applied(u), length, self._inside[leg, ticks])
         every = [self._rows * part for term in terms for part in term.parts]
         return self._kept(piece, start, ticks, every)
+
+    def _since(self, piece: int, start: float) -> tuple[Series, Series]:
+        """What a part of a piece of the grid, until ``start``, makes of a state and of an input. Over a box of
+        parameters parts that are equal but for half a tick are one ball."""
+        from flint import arb
+
+        leg, node = self.scene.leg(piece), self.scene.grid[piece]
+        states, inputs = self.flows[leg].states, self.flows[leg].inputs
+        if self.flow.monomials.size == 1:
+            return states.held(inputs, arb(start) - arb(node))
+        ticks = round((start - node) / self.scene.tick)
+        if (leg, ticks) not in self._parts:
+            if leg not in self._exponentials:
+                every = Exponentials(states.beside(inputs), self.scene.tick)
+                self._exponentials[leg] = every, every.around(1)
+            every, widened = self._exponentials[leg]
+            self._parts[leg, ticks] = (every.at(ticks) * widened).apart(states.parts[0].nrows())
+        return self._parts[leg, ticks]
 
     @cached_property
     def _rows(self) -> arb_mat:

@@ -11,7 +11,7 @@ import scipy.linalg
 from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.arithmetic.jets import Monomials
-from sparserob_core.checker.arithmetic.series import Series, _tail, norm
+from sparserob_core.checker.arithmetic.series import Exponentials, Series, _tail, norm
 
 
 def matrix(values):
@@ -43,6 +43,27 @@ def test_the_exponential_of_a_number_that_depends_on_a_parameter_is_held_to_all_
                     assert ball.contains(truth.mid()), (a, b, precision, k)
                     # squaring back is exact but for rounding: relative to the first coefficient
                     assert float(ball.rad()) < 2.0 ** (40 - precision) * math.exp(max(a, 0.0) + abs(b))
+
+
+def test_exponentials_that_are_products_of_one_another_hold_the_exact_ones_and_hardly_grow():
+    """``exp((a + b delta) s)`` at ticks in any order, and up to half a tick beside them."""
+    known, (a, b), tick = Monomials(1, 4), (-1.7, 0.3), 2.0**-40
+    rng = np.random.default_rng(3)
+    with ctx.workprec(96):
+        every = Exponentials(Series(known, [matrix([[a]]), matrix([[b]]), *[matrix([[0.0]])] * 3]), tick)
+        for ticks in (
+            *(2**38 * k for k in (2, 1, 3)),
+            *(2**36 * k + 1 for k in range(12)),
+            *rng.integers(1, 2**41, 20),
+        ):
+            at, near = every.at(int(ticks)), every.at(int(ticks)) * every.around(1)
+            for part, beside, k in zip(at.parts, near.parts, range(5), strict=True):
+                with ctx.workprec(300):
+                    for found, off in ((part, 0.0), (beside, 0.5), (beside, -0.5)):
+                        time = arb(tick) * (arb(int(ticks)) + arb(off))
+                        assert found[0, 0].contains((arb(a) * time).exp() * (arb(b) * time) ** k / arb(k).fac())
+                assert float(part[0, 0].rad()) < 2.0**-70
+                assert float(beside[0, 0].rad()) < 2.0**-34
 
 
 def test_the_exponential_of_a_matrix_that_depends_on_two_parameters_is_that_at_each_of_them():
