@@ -149,6 +149,66 @@ def test_no_causal_policy_is_cheaper_than_what_its_signals_prove(cost: str, tmp_
     assert quick.result.causal.lower <= slow.result.causal.lower * (1 + 1e-9)
 
 
+def hidden(cost: str, radius: float, out: Path, **more: Any) -> sr.Outcome:
+    """``x' = u + w`` in two steps, of which ``y_1 = 2 + u_0 + w_0 + v_1`` is measured, with ``|w| <= 1``, ``|v| <=
+    0.2`` and ``|x(2)| <= radius``: nothing seen of it, ``w_0`` may still be ``+-0.2``."""
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0]], "B": [[1]], "E": [[1]]},
+        "horizon": 2.0,
+        "initial_state": [2.0],
+        "control": {"box": 3.0},
+        "disturbance": {"box": 1.0},
+        "terminal": [{"box": radius}],
+        **more,
+    }
+    return run(problem, {"C": [[1]], "noise": {"box": 0.2}}, out, 2, cost=cost, causal_signals=20)
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize(
+    ("cost", "radius", "least"),
+    [
+        ("nominal", 1.5, 2.0 + 0.2 + 1.0 - 1.5),  # of the affine policy too
+        ("nominal", 1.21, 2.0 + 0.2 + 1.0 - 1.21),
+        ("peak", 1.5, 2.0 + 1.0 + 1.0 - 1.5),  # w_0 = 1 is seen, and 2.75 is what answers in proportion cost
+    ],
+)
+def test_what_a_noise_hides_no_causal_policy_answers(cost: str, radius: float, least: float, tmp_path: Path) -> None:
+    outcome = hidden(cost, radius, tmp_path / "run")
+    proven(outcome)
+    assert least - 1e-6 <= outcome.result.causal.lower <= least
+    assert outcome.result.cost == pytest.approx(least if cost == "nominal" else 2.75, rel=1e-6)
+
+
+def test_no_causal_policy_is_there_where_the_noise_hides_more_than_may_be_left(tmp_path: Path) -> None:
+    """``w_0 = +-0.2`` and then ``w_1 = +-1`` after the same outputs: 1.2 on either side."""
+    outcome = hidden("nominal", 1.199999, tmp_path / "run")
+    assert outcome.status == "infeasible" and outcome.summary["causal_infeasible"] is True
+    assert sr.check(outcome.directory).status == "verified"
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize(
+    ("noise", "C", "more"),
+    [
+        ({"norm": {"p": 2, "radius": 0.3}}, [[1, 0], [0, 1]], {}),
+        ({"polytope": {"H": [[1], [-1]], "h": [0.3, 0.1]}}, [[1, 0]], {}),
+        ({"box": 0.2}, [[1, 0]], {"initial_state": {"centre": [0.3, 0.0], "box": [0.05, 0.0]}, "disturbance": None}),
+        ({"box": 0.2}, [[1, 0]], {"disturbance": {"polytope": {"H": [[1], [-2]], "h": [0.06, 0.08]}}}),
+    ],
+)
+def test_whatever_hides_is_proven_to_hide(noise, C, more, tmp_path: Path) -> None:
+    """Bounds are higher than those of controls that know the disturbance, which no outputs tell."""
+    problem = {key: value for key, value in {**SHORT, **more}.items() if value is not None}
+    outcome = run(problem, {"C": C, "noise": noise}, tmp_path / "run", causal_signals=10)
+    proven(outcome)
+    causal = json.loads((outcome.directory / "certificate.json").read_text())["causal"]
+    assert np.shape(causal["outputs"]) == (len(causal["signals"]), 4, len(C))
+    plain = run(problem, {"C": C}, tmp_path / "plain", causal_signals=10)
+    assert plain.result.causal.lower < outcome.result.causal.lower <= outcome.result.cost * (1 + 1e-9)
+
+
 @pytest.mark.parametrize("measured", [None, POSITION])
 def test_what_costs_nothing_costs_no_causal_policy_less(measured, tmp_path: Path) -> None:
     problem = {**SHORT, "initial_state": [0.0, 0.0], "disturbance": {"box": 0.001}}
@@ -202,6 +262,36 @@ def test_a_forged_certificate_is_found(name: str, honest: Path, tmp_path: Path) 
     FORGERIES[name](data)
     file.write_text(json.dumps(data))
     assert sr.check(tmp_path / "run").status == "refuted"
+
+
+HIDDEN = {
+    "outputs of no noise in its set": lambda causal: causal["outputs"][0][1].__setitem__(0, 5.0),
+    "a little more than can be hidden": lambda causal: [
+        signal[0].__setitem__(0, 0.2000001 * np.sign(signal[0][0])) for signal in causal["signals"]
+    ],
+    "an output too few": lambda causal: causal["outputs"][0].pop(),
+    "a signal without outputs": lambda causal: causal["outputs"].pop(),
+    "a signal that begins nowhere": lambda causal: causal["initial_states"].pop(),
+    "no outputs": lambda causal: [causal.pop("outputs"), causal.pop("initial_states")],
+    "a higher bound": lambda causal: causal.update(lower_bound=causal["lower_bound"] + 1e-6),
+    "a worse disturbance": lambda causal: [signal[0].__setitem__(0, 1.0) for signal in causal["signals"]],
+}
+
+
+@pytest.fixture(scope="module")
+def behind_noise(tmp_path_factory) -> Path:
+    return hidden("nominal", 1.5, tmp_path_factory.mktemp("hidden") / "run").directory
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_a_bound_that_hides_what_no_noise_can_is_found(name: str, behind_noise: Path, tmp_path: Path) -> None:
+    shutil.copytree(behind_noise, tmp_path / "run")
+    file = tmp_path / "run" / "certificate.json"
+    data = json.loads(file.read_text())
+    HIDDEN[name](data["causal"])
+    file.write_text(json.dumps(data))
+    verdicts = {one.name: one.verdict for one in sr.check(tmp_path / "run").claims}
+    assert verdicts["causal"] == "fails"
 
 
 @pytest.mark.parametrize("name", ["gains", "observer"])

@@ -1,9 +1,13 @@
 """The claim against every causal policy, derived anew in balls from signals and multipliers alone.
 
 A control on piece ``k`` depends on the disturbance before ``tau_k`` only, or before the last measurement that is known
-by then, whatever is measured: it is one vector for all signals that agree until then. So a weighted sum of constraints
-under the signals is, for every causal policy, at least what the least of every such vector over the set of the control
-leaves, its part of the cost included.
+by then, whatever is measured: it is one vector for all signals that agree until then. Of outputs with a noise it
+depends on these alone: a signal comes with its outputs beside the nominal ones, as exact numbers, and with the noise
+that makes up what its disturbance and its initial state leave of them, which is derived in balls and must be proven to
+be in its set. Then the control is one vector for all signals whose known outputs are the same numbers: piece by piece,
+since with the same controls so far the same outputs follow. So a weighted sum of constraints under the signals is, for
+every causal policy, at least what the least of every such vector over the set of the control leaves, its part of the
+cost included.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.duality import Row
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import middle
+from sparserob_core.checker.reach.closed_loop import arb_of, middle
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
 
@@ -28,7 +32,8 @@ if TYPE_CHECKING:
 
 MOST = 100_000  # multipliers
 PEAK, WORST = "peak", "worst"
-Rows: TypeAlias = "dict[tuple[str, float, bytes], tuple[Row, list[list[arb]]]]"
+Pushed: TypeAlias = "tuple[Row, list[list[arb]], list[arb]]"  # a row, what disturbance and initial state give to it
+Rows: TypeAlias = dict[tuple[str, float, bytes], Pushed]
 SHARE = 1.0 - 2.0**-40  # of a price, that is shared: so that rounding does not share more than there is
 
 
@@ -44,6 +49,11 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     points, measured = case.control.breakpoints, case.problem.measurements
     known_last = points[:-1] if measured is None else measured.latest(points)
     seen = [bisect_left(changes, float(t)) for t in known_last]  # blocks that began before what is known was measured
+    reports, begun = signals, None
+    if measured is not None and "outputs" in data:
+        seen = measured.known(points).sum(axis=1).tolist()
+        begun = _begun(case, data, len(signals))
+        reports, rest = _outputs(case, data, signals, begun, max(seen)), np.zeros((measured.outputs, K))
     groups: list[dict[bytes, list[arb]]] = [{_until(rest, n): [arb(0)] * m} for n in seen]
     entries = listed(data, "multipliers")
     if len(entries) > MOST:
@@ -51,20 +61,21 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     known_rows: Rows = {}
     for entry in entries:
         case.clock.check()
-        y, which, (row, pushed) = _row(case, entry, len(signals), known_rows)
+        y, which, (row, pushed, carried) = _row(case, entry, len(signals), known_rows)
         weight, signal = arb(y), signals[which]
         noise = [a * arb(float(w)) for block, column in zip(pushed, signal.T, strict=True)
                  for a, w in zip(block, column, strict=True)]  # fmt: skip
+        noise += [] if begun is None else [c * x for c, x in zip(carried, begun[which], strict=True)]
         total = total + weight * sum(noise, row.constant)
         for k in range(K):
             if any(not x.is_zero() for x in row.slope[k]):
-                group = groups[k].setdefault(_until(signal, seen[k]), [arb(0)] * m)
+                group = groups[k].setdefault(_until(reports[which], seen[k]), [arb(0)] * m)
                 group[:] = [a + weight * x for a, x in zip(group, row.slope[k], strict=True)]
     shared = _shares(data, len(signals)) if priced and case.charge == WORST else None
     for k in range(K):
         prices: dict[bytes, arb] = {_until(rest, seen[k]): arb(1)} if shared is None else {}
-        for signal, share in zip(signals, shared or (), strict=False):
-            key = _until(signal, seen[k])
+        for report, share in zip(reports, shared or (), strict=False):
+            key = _until(report, seen[k])
             prices[key] = prices.get(key, arb(0)) + share
             groups[k].setdefault(key, [arb(0)] * m)
         total = total + _of_piece(case, k, groups[k], prices, priced)
@@ -91,7 +102,7 @@ def _refuse(case: Case) -> None:
         raise Unchecked("the checker bounds causal policies in indicators")
 
 
-def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, tuple[Row, list[list[arb]]]]:
+def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, Pushed]:
     """The multiplier of an entry, its signal, and the constraint that it names, with what the disturbance gives."""
     if not isinstance(entry, Mapping):
         raise Broken("causal: expected a signal, a constraint, a time, a direction and a number each")
@@ -108,14 +119,17 @@ def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, in
         raise Broken(f"causal: {name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
     key = (name, time, direction.tobytes())
     if key not in rows:
-        row = case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False)
+        row, carried = (
+            case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False),
+            list[Any](),
+        )
         if case.problem.initial_set is not None:  # its middle is one of the initial states
             about = middle(case.problem.initial_set)
             if not known(case.problem.initial_set).contains(about):
                 raise Unchecked("the middle of the initial states is not shown to be one of them")
-            parts = zip(case.duality.carried(direction, time), balls(about), strict=True)
-            row = replace(row, constant=sum((c * x for c, x in parts), row.constant))
-        rows[key] = row, case.duality.pushed(direction, time)
+            carried = case.duality.carried(direction, time)
+            row = replace(row, constant=sum((c * x for c, x in zip(carried, balls(about), strict=True)), row.constant))
+        rows[key] = row, case.duality.pushed(direction, time), carried
     return y, which, rows[key]
 
 
@@ -147,6 +161,55 @@ def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
                 raise Broken(f"causal: the disturbance {column.tolist()} is not shown to be in its set")
         found.append(w)
     return found
+
+
+def _begun(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
+    """By how much the initial state of every signal is beside the middle of its set, in which it must be; nothing
+    where there is no set."""
+    shape, told = case.problem.initial_set, listed(data, "initial_states")
+    if len(told) != count:
+        raise Broken(f"causal: {len(told)} initial states of {count} signals")
+    if shape is None:
+        return [[] for _ in told]
+    about, found = balls(middle(shape)), []
+    for said in told:
+        start = numbers(said, "causal: initial state")
+        if start.shape != (shape.dimension,) or not known(shape).contains(start):
+            raise Broken(f"causal: the initial state {start.tolist()} is not shown to be in its set")
+        found.append([a - b for a, b in zip(balls(start), about, strict=True)])
+    return found
+
+
+def _outputs(
+    case: Case, data: Mapping[str, Any], signals: list[Array], begun: list[list[arb]], known_at_all: int
+) -> list[Array]:
+    """The outputs ``(p, K)`` under every signal beside the nominal ones. The noise that makes up for what is left of
+    each must be in its set, as far as anybody knows of it."""
+    measured, told, times = case.problem.measurements, listed(data, "outputs"), case.control.breakpoints
+    assert measured is not None
+    C, K = np.asarray(measured.C, dtype=float), case.control.pieces
+    if measured.noise is None or len(told) != len(signals):
+        raise Broken(f"causal: outputs of {len(told)} signals, expected those of {len(signals)}, under a noise")
+    about, centre = balls(middle(measured.noise)), [balls(x) for x in middle_of(case).T]
+    found = [numbers(said, "causal: outputs") for said in told]
+    for outputs in found:
+        if outputs.shape != (K, measured.outputs):
+            raise Broken(f"causal: outputs of shape {outputs.shape}, expected {(K, measured.outputs)}")
+    for j in range(known_at_all):
+        time = float(times[j])
+        pushed = [case.duality.pushed(row, time) for row in C] if j else [[] for _ in C]
+        carried = [case.duality.carried(row, time) if j else balls(row) for row in C]
+        for w, start, outputs in zip(signals, begun, found, strict=True):
+            case.clock.check()
+            noise = []
+            for a in range(measured.outputs):
+                given = [c * x for c, x in zip(carried[a], start, strict=True)] if start else []
+                for block, column, rest in zip(pushed[a], [balls(x) for x in w.T], centre, strict=True) if j else ():
+                    given += [c * (x - m) for c, x, m in zip(block, column, rest, strict=True)]
+                noise.append(sum((-x for x in given), about[a] + arb_of(outputs[j, a])))
+            if not known(measured.noise).holds(noise):
+                raise Broken(f"causal: no noise is shown to make what is said to be measured at t = {time:.6g}")
+    return [np.ascontiguousarray(outputs.T) for outputs in found]
 
 
 def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[bytes, arb], priced: bool) -> arb:

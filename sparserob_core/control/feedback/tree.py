@@ -3,14 +3,15 @@ signals did.
 
 Let ``w_1 .. w_S`` be signals of the disturbance's set. Whatever a causal policy does, its controls on piece ``k`` under
 two of them are equal unless the signals differ before ``tau_k``: a difference within the piece comes too late, and a
-policy that sees less than the disturbance itself can do no more. So the controls under the signals are a point of a
-linear program, the tree of the signals, and the value of this is a lower bound of the cost of every causal policy with
-this dictionary, affine or not (the scenarios of Hadjiyiannis, Goulart and Kuhn 2011, who have two stages; here with
-every stage, and with finitely many times).
+policy that sees less than the disturbance itself can do no more. Where a noise hides the difference, they are equal for
+longer (`knowledge`). So the controls under the signals are a point of a linear program, the tree of the signals, and
+the value of this is a lower bound of the cost of every causal policy with this dictionary, affine or not (the scenarios
+of Hadjiyiannis, Goulart and Kuhn 2011, who have two stages; here with every stage, and with finitely many times).
 
-Most signals need no variables. A signal that leaves one of the tree at a block, and is the worst for one row from there
-on, is met by the controls that can know of it as that row would have it: the least of a linear function over the set of
-the control, a number. So every signal of the tree stands for many, and those that have multipliers are written out.
+Most signals need no variables. A signal that leaves one of the tree at a report, and is the worst for one row from
+there on, is met by the controls that can know of it as that row would have it: the least of a linear function over the
+set of the control, a number. So every signal of the tree stands for many, and those that have multipliers are written
+out.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Literal, final
 import numpy as np
 
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
+from sparserob_core.control.feedback.knowledge import Knowledge, sums
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.inner.simplex.counterpart import Growing
 
@@ -36,8 +38,8 @@ ROOM = 1.0  # how far a row may be kept within its limit, of its size
 @dataclass(frozen=True, eq=False)
 class Sampled:
     """Constraints on the state at finitely many times: ``T u + N z <= b`` for the control ``u (m, K)`` and deviations
-    ``z (Q,)``; ``T (R, m, K)``, ``N (R, Q)``, ``b (R,)``. Of every row its ``constraint`` and ``side``, by number, and
-    its ``time``; ``begun (R,)``: how many blocks of the disturbance began before that."""
+    ``z (Q,)`` of disturbance and initial state; ``T (R, m, K)``, ``N (R, Q)``, ``b (R,)``. Of every row its
+    ``constraint`` and ``side``, by number, and its ``time``."""
 
     T: Array
     N: Array
@@ -45,11 +47,10 @@ class Sampled:
     constraint: np.ndarray
     side: np.ndarray
     time: Array
-    begun: np.ndarray
 
     @staticmethod
-    def of(loop: ClosedLoop, constraints: list[tuple[Array, Array, Array]], starts: Array) -> Sampled:
-        """Of constraints ``H x(t) <= h`` at times each, ``(H, h, times)``; ``starts``: of the disturbance's blocks."""
+    def of(loop: ClosedLoop, constraints: list[tuple[Array, Array, Array]]) -> Sampled:
+        """Of constraints ``H x(t) <= h`` at times each, ``(H, h, times)``."""
         parts: list[tuple[np.ndarray, ...]] = []
         response, K = loop.functionals.response, loop.functionals.dictionary.pieces
         for number, (H, h, times) in enumerate(constraints):
@@ -61,21 +62,22 @@ class Sampled:
             constant = constant + np.einsum("rli,li->r", on_noise, loop.middles)
             T = loop.functionals.on_decision(weights).reshape(at.size, -1, K)
             N = np.einsum("rli,liq->rq", on_noise, loop.entries[..., : loop.noise.start])
+            N = np.concatenate([N, free @ loop.begins[:, loop.spread.size - int(loop.begins.sum()) :]], axis=1)
             limits, numbers = h[side] - constant, np.full(at.size, number)
-            parts.append((T, N, limits, numbers, side, at, np.searchsorted(starts, at)))
-        m, Q = loop.answers.shape[1], loop.noise.start
+            parts.append((T, N, limits, numbers, side, at))
+        m, Q = loop.answers.shape[1], loop.noise.start + int(loop.begins.sum())
         if not parts:
             none = np.zeros(0, dtype=int)
-            return Sampled(np.zeros((0, m, K)), np.zeros((0, Q)), np.zeros(0), none, none, np.zeros(0), none)
-        T, N, b, constraint, side, time, begun = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return Sampled(T, N, b, constraint, side, time, begun)
+            return Sampled(np.zeros((0, m, K)), np.zeros((0, Q)), np.zeros(0), none, none, np.zeros(0))
+        T, N, b, constraint, side, time = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return Sampled(T, N, b, constraint, side, time)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Grown:
     """A solved tree: the controls ``u (S, m, K)`` under every signal, the ``value`` of its program, and of the rows
-    with a multiplier the signal, the row, the block from which on the worst for that row replaces the signal, and the
+    with a multiplier the signal, the row, the report from which on the worst for that row replaces the signal, and the
     multiplier; ``x``: the columns; ``shares``: with the cost ``worst`` what every signal's effort counts."""
 
     value: float
@@ -83,7 +85,7 @@ class Grown:
     u: Array
     signals: np.ndarray
     rows: np.ndarray
-    blocks: np.ndarray
+    reports: np.ndarray
     multipliers: Array
     shares: Array
 
@@ -91,21 +93,18 @@ class Grown:
 @final
 @dataclass(eq=False)
 class Tree:
-    """The program of a tree of signals, which grows. Deviations ``z (Q,)`` come in blocks of ``width``,
-    ``worst (R, Q)`` are those that are the worst for every row; ``seen (K,)``: how many blocks began before every piece
-    of the control; ``prices (m, K)``: what an absolute value costs. The first signal must be the nominal one; with
-    the cost ``nominal`` its absolute values are charged, with ``peak`` the largest over all signals, with ``worst``
-    those of the signal that costs most. With a ``highest`` factor its program is that of the largest factor of all
+    """The program of a tree of signals, which grows; ``knowledge``: what a control can tell of them, and what it
+    cannot. ``prices (m, K)``: what an absolute value costs. The first signal must be the nominal one; with the cost
+    ``nominal`` its absolute values are charged, with ``peak`` the largest over all signals, with ``worst`` those of the
+    signal that costs most. With a ``highest`` factor its program is that of the largest factor of all
     deviations, without prices. ``seconds`` tells how many a solution may take; ``work`` counts what was done, the same
     on every machine.
     """
 
     sampled: Sampled
-    worst: Array
+    knowledge: Knowledge
     control: ConvexSet
     prices: Array
-    seen: np.ndarray
-    width: int
     cost: Literal["nominal", "peak", "worst"]
     highest: float | None = None
     seconds: Callable[[], float] = lambda: np.inf
@@ -167,27 +166,22 @@ class Tree:
         """What the columns give to the rows, ``(R, m, K)``."""
         return np.asarray(self.sampled.T * self._far[:, None])
 
-    @property
-    def blocks(self) -> int:
-        """How many blocks a signal has."""
-        return int(self.sampled.N.shape[1] // max(1, self.width))
-
     @cached_property
     def units(self) -> Array:
         """What every row is divided by: how large it can be."""
         s = self.sampled
-        size = np.abs(self._moves).sum(axis=(1, 2)) + np.abs(s.N * self.worst).sum(axis=1) + np.abs(s.b)
+        size = np.abs(self._moves).sum(axis=(1, 2)) + self.knowledge.most + np.abs(s.b)
         return np.where(size > 0.0, size, 1.0)
 
     def add(self, z: Array) -> bool:
-        """One more signal, of deviations ``(Q,)``; whether it is new."""
+        """One more signal; whether it is new."""
         z = np.asarray(z, dtype=float) + 0.0
         if any(np.array_equal(z, other) for other in self.signals):
             return False
         m, K = self.prices.shape
         columns, nominal, flat = np.zeros((m, K), dtype=int), not self.signals, self._flat
         for k in range(K):
-            key = (k, self._until(z, int(self.seen[k])))
+            key = self._known(z, k)
             fresh = key not in self._groups
             if fresh:
                 self._groups[key] = self._linear.variables(self._low, self._high, np.zeros(m))
@@ -203,7 +197,7 @@ class Tree:
                 for sign in (1.0, -1.0):
                     self._rows([(which, columns[:, k], np.full(m, sign)), (which, sizes, -np.ones(m))], np.zeros(m))
         if self.priced and self.cost == "worst":
-            own = [self._own[k, self._until(z, int(self.seen[k]))] for k in range(K)]
+            own = [self._own[self._known(z, k)] for k in range(K)]
             column = np.concatenate([*own, self._charged])
             self._efforts.append(
                 self._rows([(np.zeros(column.size, dtype=int), column, np.append(self._rates.T, -1.0))], np.zeros(1))
@@ -215,25 +209,24 @@ class Tree:
     def _rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], upper: Array) -> int:
         return int(self._linear.rows(entries, np.full(upper.size, -np.inf), upper)[0])
 
-    def _until(self, z: Array, block: int) -> bytes:
-        return z[: block * self.width].tobytes()
+    def _known(self, z: Array, k: int) -> tuple[int, bytes]:
+        """What is equal for signals that the control on a piece cannot tell apart."""
+        return k, self.knowledge.history(z, int(self.knowledge.seen[k]))
 
-    def changed(self, signal: int, row: int, block: int) -> Array:
-        """The signal ``(Q,)`` that is one of the tree before a block, and the worst for a row from there on."""
-        z, begun = self.signals[signal].copy(), self.sampled.begun[row] * self.width
-        z[block * self.width : begun] = self.worst[row, block * self.width : begun]
-        return z
+    def changed(self, signal: int, row: int, report: int) -> Array:
+        """The worst signal for a row of those with the reports of one of the tree before this one."""
+        return self.knowledge.changed(self.signals[signal], row, report)[1]
 
-    def _impose(self, signal: int, row: int, block: int) -> bool:
+    def _impose(self, signal: int, row: int, report: int) -> bool:
         """One row under a `changed` signal; whether it was not there."""
         s, z = self.sampled, self.signals[signal]
-        key = (row, block, self._until(z, block))
+        key = (row, report, self.knowledge.history(z, report))
         if key in self._imposed:
             return False
         self._imposed.add(key)
-        late, unit, end = self.seen > block, self.units[row], block * self.width
+        late, unit = self.knowledge.seen > report, self.units[row]
         channel, piece = np.nonzero(self._moves[row] * ~late)
-        noise = float(s.N[row, :end] @ z[:end]) + float(self._pushed[row, block])
+        noise, _ = self.knowledge.changed(z, row, report)
         columns, values = [self._columns[signal][channel, piece]], [self._moves[row][channel, piece]]
         columns.append(np.zeros(1, dtype=int))
         values.append(np.array([-unit if self.priced else noise]))
@@ -246,7 +239,7 @@ class Tree:
             limit -= float(self._least[row, late].sum())
         column, value = np.concatenate(columns), np.concatenate(values) / unit
         self._numbers.append(self._rows([(np.zeros(column.size, dtype=int), column, value)], np.array([limit / unit])))
-        self._order.append((signal, row, block))
+        self._order.append((signal, row, report))
         return True
 
     @property
@@ -273,15 +266,6 @@ class Tree:
     def _least(self) -> Array:
         """The least that the control on every piece can give to every row, ``(R, K)``."""
         return np.asarray(-self.control.support(-self.sampled.T.swapaxes(1, 2)))
-
-    @cached_property
-    def _pushed(self) -> Array:
-        """The most that the disturbance from every block on gives to every row, ``(R, blocks + 1)``."""
-        gives = self._by_block(self.sampled.N * self.worst).sum(axis=2)
-        return _sums(gives[:, ::-1])[:, ::-1]
-
-    def _by_block(self, a: Array) -> Array:
-        return a.reshape(*a.shape[:-1], self.blocks, max(1, self.width))
 
     def least(self) -> Grown | None:
         """The least cost, or the largest factor; ``None`` where nothing is feasible or nothing was solved."""
@@ -322,11 +306,11 @@ class Tree:
                 return None
             u, mine = x[np.array(self._columns)] * self._far[:, None], np.array([y[at] for at in self._numbers])
             kept = np.flatnonzero(mine > 0.0)
-            signals, rows, blocks = np.array(self._order, dtype=int).reshape(-1, 3)[kept].T
+            signals, rows, reports = np.array(self._order, dtype=int).reshape(-1, 3)[kept].T
             unit = 1.0 if relaxed or not self.priced else self._unit
             value = float(x[0]) if relaxed or not self.priced else unit * float(self._charges @ x[self._charged])
             shares = np.maximum([y[at] for at in self._efforts], 0.0)
-            found = Grown(value, x, u, signals, rows, blocks, unit * mine[kept] / self.units[rows], shares)
+            found = Grown(value, x, u, signals, rows, reports, unit * mine[kept] / self.units[rows], shares)
             if not self._separate(found):
                 break
         return found
@@ -339,29 +323,24 @@ class Tree:
             some = over[:, at].reshape(over.shape[0], -1)
             for signal, places in enumerate(np.argsort(-some, axis=1)[:, :AT_ONCE]):
                 for place in places[some[signal, places] > EXCEEDED].tolist():
-                    row, block = divmod(place, over.shape[2])
-                    grew |= self._impose(signal, int(at[row]), block)
+                    row, report = divmod(place, over.shape[2])
+                    grew |= self._impose(signal, int(at[row]), report)
         return grew
 
     def excess(self, found: Grown) -> Array:
         """By how many units every row is exceeded under every `changed` signal, whatever the controls that can know of
-        the change, ``(S, R, blocks + 1)``; ``-inf`` where the change comes after the row."""
-        s = self.sampled
-        own, noise = np.einsum("rmk,smk->srk", s.T, found.u), s.N * np.array(self.signals)[:, None]
-        past = _sums(self._by_block(noise).sum(axis=3)) + self._pushed
+        the change, ``(S, R, reports + 1)``, or less than 0 where it is not; ``-inf`` where the change comes after the
+        row."""
+        s, knowledge = self.sampled, self.knowledge
+        own = np.einsum("rmk,smk->srk", s.T, found.u)
         best = self._least
         if self._limited:
             best = (self._fixed - self._by_size * found.x[self._sizes]).sum(axis=1)
-        rest = _sums(best[:, ::-1])[:, ::-1]  # of every piece and all later ones
-        blocks = np.arange(self.blocks + 1)
-        knows = np.searchsorted(self.seen, blocks, side="right")  # the first piece that can know of a block
-        past = past if self.priced else past * found.x[0]
-        over = (past + _sums(own)[:, :, knows] + rest[:, knows] - s.b[:, None]) / self.units[:, None]
+        rest = sums(best[:, ::-1])[:, ::-1]  # of every piece and all later ones
+        reports, scale = np.arange(knowledge.reports + 1), 1.0 if self.priced else max(found.x[0], np.finfo(float).tiny)
+        beside = sums(own)[:, :, knowledge.first] + rest[:, knowledge.first] - s.b[:, None]
         if self.priced:
-            over = over - found.x[0]
-        return np.asarray(np.where(blocks <= s.begun[:, None], over, -np.inf))
-
-
-def _sums(a: Array) -> Array:
-    """The sums over the last axis of what is before each place, and of all."""
-    return np.concatenate([np.zeros((*a.shape[:-1], 1)), np.cumsum(a, axis=-1)], axis=-1)
+            beside = beside - found.x[0] * self.units[:, None]
+        beside = np.where(reports <= knowledge.begun[:, None], beside, -np.inf)
+        over = beside + scale * knowledge.gives(np.array(self.signals), beside / scale)
+        return np.asarray(over / self.units[:, None])

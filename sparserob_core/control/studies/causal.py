@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.feedback.knowledge import Knowledge, OfDisturbances, OfOutputs, extreme
 from sparserob_core.control.feedback.tree import Grown, Sampled, Tree
 from sparserob_core.control.policies.policy import Charge
 from sparserob_core.control.transcription.record import Transcription
@@ -32,6 +33,8 @@ ANSWERED = (1.0, 0.5, 0.0)
 WORK, EACH, PER = 1e7, 2e6, 3e3  # that a search may do anyway; for each of a run's programs, and for its columns
 CELLS = 2e7  # numbers of one kind about all signals of a tree: 160 MB
 INSIDE = 1  # times sampled within every piece, beside its ends and the times that the policy's bound rests on
+AGAIN = 4  # times that a noise hides its share of a smaller factor, each of which gains less than the one before
+NARROWER = 1e-3  # of a factor, by which it must have come down for that
 NEARLY = 1e-6  # of a factor, by which the first one that is excluded lies above the largest one that is not
 
 
@@ -53,13 +56,16 @@ class CausalBound:
     """What no causal policy can do: cost less than ``lower``; infinite: exist at all; ``-inf`` where nothing was
     proven. ``signals``: values ``(mw, blocks)`` of the disturbance, ``rows``: constraints under them whose multipliers
     prove it. ``ended``: why no more was sought. ``shares``: with the cost ``worst`` what the effort under every signal
-    counts, no more than 1 together."""
+    counts, no more than 1 together. Of outputs that a noise hides, ``outputs (K, p)``: what is measured under every
+    signal beside the nominal one, and ``begun (d,)``: where it begins."""
 
     lower: float
     signals: tuple[Array, ...] = ()
     rows: tuple[Weighed, ...] = ()
     ended: Ended = "settled"
     shares: tuple[float, ...] = ()
+    outputs: tuple[Array, ...] = ()
+    begun: tuple[Array, ...] = ()
 
 
 @final
@@ -90,7 +96,7 @@ class Limits:
         most = CELLS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
         if not self.seconds or self._passed():
             self.ended = "seconds"
-        elif tree.work > self.work or len(tree.signals) > most:
+        elif tree.work + tree.knowledge.work > self.work or len(tree.signals) > most:
             self.ended = "work"
         elif not self.room(tree):
             self.ended = "signals"
@@ -98,7 +104,7 @@ class Limits:
 
     def begin(self, tree: Tree) -> None:
         """The signals that are at hand do not count."""
-        self._beside = len(tree.signals)
+        self._beside, self.ended = len(tree.signals), "settled"
 
     def room(self, tree: Tree) -> int:
         """How many signals may be added to the tree; before the search begins: as many as there are."""
@@ -122,7 +128,7 @@ class CausalSearch:
         self.starts = grid.breakpoints[places]
         self.spread = Spread(() if disturbance is None else self.loop.spread.sets[:1])
         asked = [(one.H, one.h, self._times(one, active)) for one in self.constraints]
-        self.sampled = Sampled.of(self.loop, asked, self.starts)
+        self.sampled = Sampled.of(self.loop, asked)
         self._active = active
 
     def _times(self, one: FlatConstraint, active: Sequence[tuple[str, float, Array | None]]) -> Array:
@@ -134,27 +140,56 @@ class CausalSearch:
         return np.unique([one.start, one.stop, *own, *inside[(inside > one.start) & (inside < one.stop)]])
 
     def tree(self, limits: Limits, highest: float | None = None) -> Tree:
-        """A tree of the nominal signal and those that the policy's bound rests on."""
+        """A tree of the nominal signal and those that the policy's bound rests on, of which a control knows all that
+        the disturbance does until the last measurement that is known: outputs tell no more."""
+        points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
+        seen = np.searchsorted(self.starts, points[:-1] if measured is None else measured.latest(points))
+        N = s.N[:, : self.spread.size]
+        width, begun = self.spread.size // max(1, self.starts.size), np.searchsorted(self.starts, s.time)
+        known = [extreme(self.spread, z) for _, _, z in self._active if z is not None and z.any()]
+        return self._planted(OfDisturbances(N, self.spread, width, seen, begun), known, limits, highest)
+
+    def hiding(self, limits: Limits, beside: tuple[Tree, Grown] | None, highest: float | None = None) -> Tree | None:
+        """A tree of signals that a noise hides, with those that have a multiplier in one ``beside`` it; ``None`` where
+        nothing is hidden. Noise and initial states stay what they are under all factors up to the ``highest``."""
+        points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
+        if measured is None:
+            return None
+        seen, share = measured.known(points).sum(axis=1), 1.0 if highest is None else 1.0 / highest
+        knowledge = OfOutputs.of(self.loop, s.N, s.time, points[:-1], seen, share)
+        if knowledge is None:
+            return None
+        knowledge.limit = limits.work
+        known = [beside[0].signals[one] for one in np.unique(beside[1].signals)] if beside is not None else []
+        return self._planted(knowledge, known, limits, highest)
+
+    def _planted(self, knowledge: Knowledge, known: list[Array], limits: Limits, highest: float | None) -> Tree:
         problem, feedback = self.model.problem, self.model.feedback
         assert feedback is not None
         prices = problem.prices(self.model.control.breakpoints)
-        points, measured = self.model.control.breakpoints, problem.measurements
-        seen = np.searchsorted(self.starts, points[:-1] if measured is None else measured.latest(points))
-        width = self.spread.size // max(1, self.starts.size)
-        worst = extreme(self.spread, self.sampled.N)
-        tree = Tree(self.sampled, worst, problem.control, prices, seen, width, feedback.charge.cost, highest)
-        tree.add(np.zeros(self.spread.size))
+        tree = Tree(self.sampled, knowledge, problem.control, prices, feedback.charge.cost, highest)
         tree.seconds = lambda: limits.seconds
-        for _, _, deviation in self._active:
-            if deviation is not None and deviation.any() and not limits.over(tree):
-                tree.add(extreme(self.spread, deviation))
+        tree.add(knowledge.nominal)
+        for z in known:
+            if not limits.over(tree):
+                tree.add(knowledge.known(z))
         limits.begin(tree)
         return tree
 
-    def least_cost(self, cost: float, limits: Limits) -> tuple[Tree, Grown, bool] | None:
+    def least_cost(self, cost: float, limits: Limits, hides: bool = True) -> tuple[Tree, Grown, bool] | None:
         """The tree that was found, its multipliers, and whether they prove that no causal policy exists; ``cost``: of
-        the policy, an upper bound of what the tree can prove, infinite where none is known."""
-        tree = self.tree(limits)
+        the policy, an upper bound of what the tree can prove, infinite where none is known. First as if no noise hid
+        anything, and then, where it ``hides``, with what that took to prove."""
+        found = self._least_cost(self.tree(limits), cost, limits)
+        if not hides or (found is not None and found[2]):
+            return found
+        tree = self.hiding(limits, None if found is None else found[:2])
+        better = None if tree is None else self._least_cost(tree, cost, limits)
+        if found is None or (better is not None and (better[2] or better[1].value > found[1].value)):
+            return better
+        return found
+
+    def _least_cost(self, tree: Tree, cost: float, limits: Limits) -> tuple[Tree, Grown, bool] | None:
         best, idle = tree.least(), 0
         while best is not None and idle < IDLE and not limits.over(tree):
             aim = cost if np.isfinite(cost) else np.inf
@@ -178,8 +213,19 @@ class CausalSearch:
         return found if found is not None and found.value > NONE else None
 
     def largest_factor(self, highest: float, limits: Limits) -> tuple[Tree, Grown] | None:
-        """The largest factor of all deviations for which the tree is feasible, with its multipliers."""
-        tree = self.tree(limits, highest)
+        """The largest factor of all deviations for which the tree is feasible, with its multipliers. Of outputs with a
+        noise first as if it hid nothing, and then below the factor that was found, for which it hides its share."""
+        found = self._largest_factor(self.tree(limits, highest), limits)
+        for _ in range(AGAIN if found is not None else 0):
+            assert found is not None
+            tree = self.hiding(limits, found, found[1].value * (1.0 + NARROWER))
+            better = None if tree is None else self._largest_factor(tree, limits)
+            if better is None or better[1].value > found[1].value * (1.0 - NARROWER):
+                break
+            found = better
+        return found
+
+    def _largest_factor(self, tree: Tree, limits: Limits) -> tuple[Tree, Grown] | None:
         best, idle = tree.least(), 0
         while best is not None and idle < IDLE and not limits.over(tree):
             if not self._grow(tree, best, limits.room(tree), idle):
@@ -199,40 +245,21 @@ class CausalSearch:
         return any(self._sought(tree, centre, most, share) for share in (*shares[at:], *shares[:at]))
 
     def _sought(self, tree: Tree, centre: Grown, most: int, share: float) -> bool:
-        """Signals that leave one of the tree at a block and are the worst for a row from there on, if the control
+        """Signals that leave one of the tree at a report and are the worst for a row from there on, if the control
         answers them by this ``share`` of what the policy does: those that exceed it most, no two of one signal and
-        block; whether there are.
+        report; whether there are.
         """
-        s, loop, scale = self.sampled, self.loop, 1.0 if tree.priced else max(centre.x[0], NONE)
-        K, Q = s.T.shape[2], self.spread.size
-        effects = (
-            np.zeros((K, s.T.shape[1], Q)) if self.decision is None else share * loop.effects(self.decision)[..., :Q]
-        )
-        answered = np.einsum("rmk,kmq->rq", s.T, effects)
-        closed = answered + s.N
-        closed = np.where(np.abs(closed) > NONE * np.abs(s.N), closed, s.N * NONE)
-        worst = extreme(self.spread, closed)
-        z = np.array(tree.signals)
-        own = np.einsum("rmk,smk->sr", s.T, centre.u)
-        past = _before(tree, s.N * z[:, None])
-        given = _after(tree, answered * z[:, None])
-        tree.work += z.shape[0] * (s.N.size + s.T.size)
-        over = own[:, :, None] - s.b[:, None] + scale * (past - given + _after(tree, closed * worst))
-        over = over / tree.units[:, None]
-        over[:, :, -1] = -np.inf
-        over = np.where(np.arange(over.shape[2]) < s.begun[:, None], over, -np.inf)
-        taken: set[tuple[int, int]] = set()
-        order = np.argsort(-over, axis=None)
-        for place in order.tolist():
-            signal, row, block = (int(v) for v in np.unravel_index(place, over.shape))
-            if over[signal, row, block] <= NONE or len(taken) >= min(AT_ONCE, most):
+        effects = None if self.decision is None else share * self.loop.effects(self.decision)
+        own = np.einsum("rmk,smk->sr", self.sampled.T, centre.u) - self.sampled.b
+        scale = 1.0 if tree.priced else max(centre.x[0], NONE)
+        answered = None if effects is None else np.einsum("rmk,kmq->rq", self.sampled.T, effects)
+        taken, z = set[tuple[int, int]](), np.array(tree.signals)
+        tree.work += z.shape[0] * (self.sampled.N.size + self.sampled.T.size)
+        for signal, report, child in tree.knowledge.leaving(z, own, answered, scale, tree.units):
+            if len(taken) >= min(AT_ONCE, most):
                 break
-            if (signal, block) in taken:
-                continue
-            child, width = z[signal].copy(), tree.width
-            child[block * width :] = worst[row, block * width :]
-            if tree.add(child):
-                taken.add((signal, block))
+            if (signal, report) not in taken and tree.add(child):
+                taken.add((signal, report))
         return bool(taken)
 
     def bound(
@@ -246,24 +273,34 @@ class CausalSearch:
     ) -> CausalBound:
         """The signals in the set of the ``disturbance``, with deviations times ``scale``, and the constraints that have
         a multiplier."""
-        numbers, signals, rows = dict[bytes, int](), list[Array](), list[Weighed]()
-        for signal, row, block, y in zip(found.signals, found.rows, found.blocks, found.multipliers, strict=True):
-            z = tree.changed(int(signal), int(row), int(block))
-            number = numbers.setdefault(z.tobytes(), len(numbers))
-            if number == len(signals):
-                signals.append(_values(z * scale, disturbance, tree.blocks))
+        numbers, every, rows = dict[bytes, int](), list[Array](), list[Weighed]()
+
+        def number(z: Array) -> int:
+            found = numbers.setdefault(z.tobytes(), len(numbers))
+            every.extend([z * scale] * (found == len(every)))
+            return found
+
+        for signal, row, report, y in zip(found.signals, found.rows, found.reports, found.multipliers, strict=True):
+            which = number(tree.changed(int(signal), int(row), int(report)))
             one, s = self.constraints[self.sampled.constraint[row]], self.sampled
-            rows.append(Weighed(number, one.name, float(s.time[row]), one.H[s.side[row]], float(y)))
+            rows.append(Weighed(which, one.name, float(s.time[row]), one.H[s.side[row]], float(y)))
         held = dict[int, float]()
         for signal in np.flatnonzero(found.shares).tolist() if np.isfinite(lower) else ():
-            z = tree.signals[signal]
-            number = numbers.setdefault(z.tobytes(), len(numbers))
-            if number == len(signals):
-                signals.append(_values(z * scale, disturbance, tree.blocks))
-            held[number] = held.get(number, 0.0) + float(found.shares[signal])
+            which = number(tree.signals[signal])
+            held[which] = held.get(which, 0.0) + float(found.shares[signal])
         whole = max(1.0, sum(held.values())) / SHARED
-        shares = tuple(held.get(number, 0.0) / whole for number in range(len(signals)) if held)
-        return CausalBound(lower, tuple(signals), tuple(rows), ended, shares)
+        shares = tuple(held.get(which, 0.0) / whole for which in range(len(every)) if held)
+        signals = tuple(_values(z[: self.spread.size], disturbance, self.starts.size) for z in every)
+        if not isinstance(tree.knowledge, OfOutputs):
+            return CausalBound(lower, signals, tuple(rows), ended, shares)
+        outputs = tuple(tree.knowledge.outputs(z) for z in every)
+        begun = tuple(self._begun(z[self.spread.size : self.sampled.N.shape[1]]) for z in every)
+        return CausalBound(lower, signals, tuple(rows), ended, shares, outputs, begun)
+
+    def _begun(self, z: Array) -> Array:
+        """The initial state of deviations, certainly in its set."""
+        bound = self.model.problem.initial_set
+        return self.loop.start if bound is None else _values(z, bound, 1)[:, 0]
 
 
 def _values(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array:
@@ -277,20 +314,3 @@ def _values(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array:
     else:
         values = middle + INWARDS * deviations
     return np.asarray(np.where(deviations == 0.0, middle, values).T)
-
-
-def extreme(spread: Spread, along: Array) -> Array:
-    """An extreme deviation ``(..., Q)`` of the set that is the worst along ``(..., Q)``; any where nothing is."""
-    if spread.is_box:
-        return np.asarray(np.where(along >= 0.0, 1.0, -1.0) * spread.radii)
-    return np.asarray(spread.worst(along))
-
-
-def _before(tree: Tree, a: Array) -> Array:
-    sums = a.reshape(*a.shape[:-1], tree.blocks, max(1, tree.width)).sum(axis=-1)
-    return np.concatenate([np.zeros((*sums.shape[:-1], 1)), np.cumsum(sums, axis=-1)], axis=-1)
-
-
-def _after(tree: Tree, a: Array) -> Array:
-    past = _before(tree, a)
-    return np.asarray(past[..., -1:] - past)

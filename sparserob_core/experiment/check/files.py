@@ -89,7 +89,8 @@ def _unread(case: Case) -> set[str]:
     left |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
     causal, policy = (data.get(name) if case.answering else None for name in ("causal", "policy"))
     left |= _besides("policy", policy, {"cost", "answers"})
-    left |= _besides("causal", causal, {"lower_bound", "signals", "multipliers", "shares"})
+    hidden = {"outputs", "initial_states"} if noisy else set()
+    left |= _besides("causal", causal, {"lower_bound", "signals", "multipliers", "shares"} | hidden)
     rows = causal.get("multipliers") if isinstance(causal, Mapping) else None
     for entry in rows if isinstance(rows, list) else []:
         left |= _besides("causal.multipliers", entry, (MULTIPLIER - {"parameter"}) | {"signal"})

@@ -96,10 +96,13 @@ def _runs(row: np.ndarray) -> list[list[int]]:
 def causal_data(bound: CausalBound) -> dict[str, Any]:
     """A bound against every causal policy: ``lower_bound``, ``null`` where none exists, the ``signals`` of the
     disturbance, ``(mw, blocks)`` each, and the ``multipliers`` of constraints under one of them; with the cost
-    ``worst`` the ``shares`` with which the effort under every signal counts."""
+    ``worst`` the ``shares`` with which the effort under every signal counts. Of outputs with a noise, the ``outputs (K,
+    p)`` beside the nominal ones and the ``initial_states (d,)`` of every signal: its noise is what makes up for the
+    rest."""
     return {
         "lower_bound": bound.lower if np.isfinite(bound.lower) else None,
         "signals": list(bound.signals),
+        **({"outputs": list(bound.outputs), "initial_states": list(bound.begun)} if bound.outputs else {}),
         **({"shares": list(bound.shares)} if bound.shares else {}),
         "multipliers": [
             {

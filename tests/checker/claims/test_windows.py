@@ -502,6 +502,40 @@ def test_a_bound_against_every_causal_policy_is_by_hand():
     assert "no causal policy exists" in claims._causal(weak)
 
 
+def test_a_bound_behind_a_noise_is_by_hand():
+    """``y_1`` beside the nominal one is ``w_0 + v_1``: with nothing seen and ``|v| <= 0.125`` both pieces are what they
+    are nominally."""
+    measured = sr.Measurements(np.ones((1, 1)), Box([-0.125], [0.125]))
+
+    def bound(w=(0.1, 0.25), outputs=((0.0,), (0.0,)), start=(0.0,), **change):
+        case, _ = causal(signals=(w,))
+        changed = {"measurements": measured, **change}
+        said = {
+            **case.certificate["causal"],
+            "outputs": [[list(one) for one in outputs]],
+            "initial_states": [list(start)],
+        }
+        return float(causal_bound(replace(case, problem=replace(case.problem, **changed)), said, True).mid())
+
+    assert bound() == pytest.approx(0.3 + 0.35)
+    assert bound(w=(0.125, 0.25)) == pytest.approx(0.3 + 0.375)
+    assert bound(w=(0.25, 0.25), outputs=((0.0,), (0.125,))) == pytest.approx(0.8 - 1.0)  # is seen
+    for w, seen in ((0.1251, 0.0), (0.2, 0.0749), (-0.2, 0.0)):
+        with pytest.raises(Broken):
+            bound(w=(w, 0.25), outputs=((0.0,), (seen,)))
+    with pytest.raises(Broken):  # at first nothing but the noise is seen, and that late is known in time
+        bound(outputs=((0.1251,), (0.0,)))
+    late = replace(measured, latency=1.0)
+    assert bound(w=(0.25, 0.25), measurements=late) == pytest.approx(0.8)  # what nobody knows in time hides all
+    begun = Box([-0.05], [0.05])
+    assert bound(w=(0.1, 0.25), start=(0.02,), initial_set=begun) == pytest.approx(0.3 + 0.37)
+    for wrong in ({"w": (0.1, 0.25), "start": (0.03,)}, {"start": (0.051,)}, {"start": (0.0, 0.0)}):
+        with pytest.raises(Broken):  # what is hidden is both, and the initial state is in its set
+            bound(**wrong, initial_set=begun)
+    with pytest.raises(Broken):
+        bound(measurements=sr.Measurements(np.ones((1, 1))))
+
+
 def test_quadratic_costs_are_integrals_by_hand():
     """``x' = u`` from 1 under ``(-1, 0.5)``: ``1 - t``, then ``s / 2``."""
     cost = sr.Cost(l1=0.5, state={"Q": [[2.0]]}, control={"R": [[3.0]]}, final={"Q": [[4.0]], "reference": [1.0]})

@@ -9,8 +9,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sparserob_core.control.feedback.knowledge import OfDisturbances
 from sparserob_core.control.feedback.tree import Sampled, Tree
 from sparserob_core.control.sets.sets import Box, Polytope
+from sparserob_core.sip.finite import Spread
 
 NONE, UP, DOWN = np.zeros(2), np.array([0.25, 0.25]), np.array([-0.25, 0.25])
 COUNT = np.zeros(1, dtype=int)
@@ -18,8 +20,9 @@ COUNT = np.zeros(1, dtype=int)
 
 def tree(cost="nominal", control=1.0, prices=(1.0, 1.0), signals=(NONE,), highest=None, T=(1.0, 1.0)):
     bound = Box([-control], [control]) if isinstance(control, float) else control
-    sampled = Sampled(np.array([[T]]), np.ones((1, 2)), np.array([-0.3]), COUNT, COUNT, np.array([2.0]), COUNT + 2)
-    made = Tree(sampled, np.array([UP]), bound, np.array([prices]), np.array([0, 1]), 1, cost, highest)
+    sampled = Sampled(np.array([[T]]), np.ones((1, 2)), np.array([-0.3]), COUNT, COUNT, np.array([2.0]))
+    known = OfDisturbances(sampled.N, Spread(((2, Box([-0.25], [0.25])),)), 1, np.array([0, 1]), COUNT + 2)
+    made = Tree(sampled, known, bound, np.array([prices]), cost, highest)
     assert all(made.add(z) for z in signals)
     return made
 
@@ -52,7 +55,7 @@ def test_the_least_cost_of_a_tree_is_by_hand(cost, signals, value):
         assert grown.shares.sum() == pytest.approx(1.0)
     asked = sum(
         y * (made.sampled.N[r] @ made.changed(s, r, b) + 0.3)
-        for y, s, r, b in zip(grown.multipliers, grown.signals, grown.rows, grown.blocks, strict=True)
+        for y, s, r, b in zip(grown.multipliers, grown.signals, grown.rows, grown.reports, strict=True)
     )
     assert asked >= grown.value - 1e-9
 
@@ -107,15 +110,14 @@ def test_a_signal_is_added_once_and_changed_from_a_block_on():
     made = tree(signals=(NONE, DOWN))
     assert not made.add(DOWN.copy())
     assert not made.add(-0.0 * NONE)
-    assert made.blocks == 2
+    assert made.knowledge.reports == 2
     assert made.changed(0, 0, 0).tolist() == UP.tolist()
     assert made.changed(0, 0, 1).tolist() == [0.0, 0.25]
     assert made.changed(1, 0, 1).tolist() == DOWN.tolist()
     assert made.changed(0, 0, 2).tolist() == [0.0, 0.0]
-    early = Tree(
-        Sampled(np.ones((1, 1, 2)), np.array([[1.0, 0.0]]), np.array([-0.3]), COUNT, COUNT, np.ones(1), COUNT + 1),
-        np.array([UP]), Box([-1.0], [1.0]), np.ones((1, 2)), np.array([0, 1]), 1, "nominal",
-    )  # fmt: skip
+    sampled = Sampled(np.ones((1, 1, 2)), np.array([[1.0, 0.0]]), np.array([-0.3]), COUNT, COUNT, np.ones(1))
+    known = OfDisturbances(sampled.N, Spread(((2, Box([-0.25], [0.25])),)), 1, np.array([0, 1]), COUNT + 1)
+    early = Tree(sampled, known, Box([-1.0], [1.0]), np.ones((1, 2)), "nominal")
     early.add(NONE)
     assert early.changed(0, 0, 0).tolist() == [0.25, 0.0]
     over = early.excess(early.relaxed())
