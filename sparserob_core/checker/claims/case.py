@@ -30,7 +30,7 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
-from sparserob_core.control.problem.problem import Accumulated, MixedConstraint, OptimalControlProblem, Return
+from sparserob_core.control.problem.problem import Accumulated, OptimalControlProblem, Return
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, Product, product
 from sparserob_core.sip.convex_set import Array
@@ -118,9 +118,7 @@ class Case:
                 entry.start,
                 self.problem.horizon if entry.stop is None else entry.stop,
                 d,
-                None
-                if isinstance(entry, MixedConstraint) or entry.relative_to is None
-                else np.asarray(entry.relative_to),
+                None if entry.relative_to is None else np.asarray(entry.relative_to),
             )
             for i, entry in enumerate(path)
         ]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, final, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Self, final, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -73,10 +73,13 @@ def _pieces(times: Array, begin: float, horizon: float) -> Array:
 
 
 class _Window(Term, ABC):
-    """What holds from a ``start`` to a ``stop``."""
+    """What holds from a ``start`` to a ``stop``, wherever it moves: ``relative_to``. One that is ``lasting`` needs a
+    window of positive length."""
 
     start: float
     stop: float | None
+    relative_to: npt.ArrayLike | None = None
+    lasting: ClassVar[bool] = False
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
         if self.stop is not None and over(self.stop, begin, horizon):
@@ -132,6 +135,7 @@ class MixedConstraint(_Window):
     start: float = field(default=0.0, metadata=TIME)
     stop: float | None = field(default=None, metadata=TIME)
     name: str | None = field(default=None, metadata=UNITLESS)
+    lasting = True  # a control lasts
 
     __repr__ = noun
 
@@ -337,6 +341,11 @@ class OptimalControlProblem(Term):
     def windows(self) -> list[PathConstraint | MixedConstraint]:
         """The constraints on the path, of which none is a bare set any more."""
         return [entry for entry in self.path if not isinstance(entry, ConvexSet)]
+
+    @property
+    def of_states(self) -> list[PathConstraint]:
+        """Those of the `windows` that are about the state alone."""
+        return [entry for entry in self.windows if isinstance(entry, PathConstraint)]
 
     @property
     def terminal_sets(self) -> list[ConvexSet]:
@@ -576,19 +585,19 @@ class OptimalControlProblem(Term):
                 expected=f"0 <= from <= to <= {self.horizon:g} (the horizon)",
                 got=f"from {start:g} to {stop:g}",
             )
-        if isinstance(item, MixedConstraint):
-            if stop - start <= SHORTEST * self.horizon:
-                expected = "a window of positive length, since a control lasts"
-                raise InputError(path=where, expected=expected, got=f"from {start:g} to {stop:g}")
-            return replace(item, start=start, stop=stop)
+        if item.lasting and stop - start <= SHORTEST * self.horizon:
+            expected = "a window of positive length, since a control lasts"
+            raise InputError(path=where, expected=expected, got=f"from {start:g} to {stop:g}")
+        told: dict[str, Any] = {"start": start, "stop": stop}
         if item.relative_to is None:
-            return replace(item, start=start, stop=stop)
+            return replace(item, **told)
         where, slack = f"{where}.relative_to", SHORTEST * self.horizon
         moved = _reference(where, item.relative_to, self.system.states)
         if moved[0, 0] > start + slack or moved[-1, 0] < stop - slack:
             expected = f"rows whose times cover the window, {start:g} to {stop:g}"
             raise InputError(path=where, expected=expected, got=f"{moved[0, 0]:g} to {moved[-1, 0]:g}")
-        return replace(item, start=start, stop=stop, relative_to=moved)
+        told["relative_to"] = moved
+        return replace(item, **told)
 
     def _integrated(self, where: str, entry: object) -> IntegralConstraint:
         """With arrays of the right shapes, and a window in which something can be accumulated."""
@@ -644,7 +653,7 @@ class OptimalControlProblem(Term):
                 expected="none where the plan repeats, of which integrals over a period are not proven yet",
                 got=f"{len(self.integral)}",
             )
-        if any(entry.name == RETURN for entry in self.path if isinstance(entry, PathConstraint | MixedConstraint)):
+        if any(entry.name == RETURN for entry in self.windows):
             raise InputError(path="repeat", expected=f"no path constraint named {RETURN}, which is that of repeat")
         self._set("repeat", Repeating.IMPOSED)
         bound, centre = returning(self.initial_set, np.asarray(self.initial_state, dtype=float))

@@ -19,7 +19,7 @@ from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.prices import weights_between
-from sparserob_core.control.problem.problem import SHORTEST, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import SHORTEST, OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
@@ -90,7 +90,7 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
                 got=f"one that ends at {entry.stop:g}",
             )
         lasts = horizon - entry.start > SHORTEST * horizon
-        if lasts or (entry.start <= horizon and isinstance(entry, PathConstraint)):
+        if lasts or (entry.start <= horizon and not entry.lasting):
             windows.append(replace(entry, stop=None))
     if problem.disturbance_breakpoints is not None:
         expected = "disturbances on the pieces of their dictionary, which become shorter with the horizon"

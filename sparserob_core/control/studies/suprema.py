@@ -100,7 +100,7 @@ def rows_of(problem: OptimalControlProblem) -> list[Row]:
     for name, entry in windows_of(problem):
         if isinstance(entry, Return):
             continue
-        sides, moved = entry.set.halfspaces(), entry.relative_to if isinstance(entry, PathConstraint) else None
+        sides, moved = entry.set.halfspaces(), entry.relative_to
         if sides is None:
             curved.append(name)
             continue

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.directions import sampled
-from sparserob_core.control.sets.sets import Equality
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 TIMES = 17  # at most, at which a reach is looked at
@@ -266,15 +265,11 @@ def _widths(convex: ConvexSet) -> Array:
 def walls(problem: OptimalControlProblem) -> Array:
     """The least bound other than 0 that a row or an equality on it alone gives each state; 1 without one."""
     least = np.full(problem.system.states, np.inf)
-    for item in (*problem.path, *problem.terminal):
-        if isinstance(item, MixedConstraint):
-            continue
-        convex = item.set if isinstance(item, PathConstraint) else item
-        if isinstance(convex, Equality):
-            sizes = np.abs(np.where(np.isnan(convex.values), 0.0, convex.values))
-        else:
-            axes = np.eye(convex.dimension)
-            with np.errstate(invalid="ignore"):
-                sizes = np.minimum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))
+    every = [np.abs(np.where(np.isnan(end.values), 0.0, end.values)) for end in problem.terminal_equalities]
+    axes = np.eye(problem.system.states)
+    for convex in (*(entry.set for entry in problem.of_states), *problem.terminal_sets):
+        with np.errstate(invalid="ignore"):
+            every.append(np.minimum(np.abs(convex.support(axes)), np.abs(convex.support(-axes))))
+    for sizes in every:
         least = np.minimum(least, np.where(sizes > 0.0, sizes, np.inf))
     return np.where(np.isfinite(least), least, 1.0)

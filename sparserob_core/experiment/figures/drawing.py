@@ -300,9 +300,7 @@ def _lines(bounds: ConvexSet, pair: tuple[int, int], around: Array) -> tuple[Arr
 
 def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:
     end = problem.horizon
-    for entry in problem.path:
-        if not isinstance(entry, PathConstraint):  # it bounds no state alone
-            continue
+    for entry in problem.of_states:
         stop = end if entry.stop is None else entry.stop
         moved = Reference.of(entry.relative_to)
         if moved is None:

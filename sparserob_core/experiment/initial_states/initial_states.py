@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sparserob_core.arguments import whole
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.reference import Reference
@@ -142,14 +142,14 @@ def _limit(within: object) -> float | None:
 
 def _far(problem: OptimalControlProblem) -> float:
     """A size beyond which a coordinate counts as unbounded."""
-    flat = [entry.set.halfspaces() for entry in problem.path if isinstance(entry, PathConstraint)]
+    flat = [entry.set.halfspaces() for entry in problem.of_states]
     flat += [end.halfspaces() for end in problem.terminal_sets]
     sizes = [
         float((np.abs(h) / np.linalg.norm(H, axis=1)).max())
         for H, h in (sides for sides in flat if sides is not None)
         if h.size
     ]
-    moved = [entry.relative_to for entry in problem.path if isinstance(entry, PathConstraint)]
+    moved = [entry.relative_to for entry in problem.of_states]
     sizes += [float(np.abs(np.asarray(rows)[:, 1:]).max()) for rows in moved if rows is not None]
     sizes += [float(np.abs(end.values[end.fixed]).max()) for end in problem.terminal_equalities]
     return FAR * max([1.0, float(np.abs(np.asarray(problem.initial_state)).max()), *sizes])
@@ -175,7 +175,7 @@ def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, 
     if not found.outer.shape[0]:
         return ()
     middle = (found.inner if found.inner.shape[0] else found.outer).mean(axis=0)
-    held = [entry for entry in problem.path if isinstance(entry, PathConstraint) and entry.start == 0.0]
+    held = [entry for entry in problem.of_states if entry.start == 0.0]
     view, states, polygons = 10.0 * float(np.abs(found.outer - middle).max()), list(found.states), []
     for entry in held:
         moved = Reference.of(entry.relative_to)

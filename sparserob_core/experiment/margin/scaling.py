@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.control.problem.names import joined
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.messages import nearest
@@ -219,10 +219,10 @@ def _execution(problem: OptimalControlProblem) -> Scaling:
 def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int]) -> Scaling:
     paths = problem.windows
     latest = min(problem.horizon if paths[i].stop is None else float(paths[i].stop or 0.0) for i in positions)
-    if any(isinstance(paths[i], MixedConstraint) for i in positions):
-        latest *= 1.0 - SHORT  # a control lasts
+    if any(paths[i].lasting for i in positions):
+        latest *= 1.0 - SHORT
     for i in positions:
-        moved = getattr(paths[i], "relative_to", None)
+        moved = paths[i].relative_to
         if moved is not None and np.asarray(moved)[0, 0] > 0.0:
             raise InputError(
                 f"of: {path}.from is varied from 0 on, relative_to begins at {np.asarray(moved)[0, 0]:g}; expected rows"
