@@ -4,7 +4,7 @@ other numbers."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from sparserob_core.control.problem.problem import Accumulated, Return
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.sets.sets import Box, Cylinder, Ellipsoid, NormBall, Polytope
-from sparserob_core.control.term import UNITLESS, Term
+from sparserob_core.control.term import TERMS, TIME, UNITLESS, Term, measured
 
 SETS = [
     Box(np.array([-1.0, 0.5]), np.array([2.0, 0.75])),
@@ -92,7 +92,7 @@ def test_an_uncertain_system_in_other_units_is_the_same_in_values_and_taylor_mod
     assert other.describe(points[0] / p) == plain.describe(points[0])
 
 
-TERMS = {
+KNOWN = {
     sr.OptimalControlProblem, sr.PathConstraint, sr.MixedConstraint, sr.IntegralConstraint, Accumulated, Return,
     sr.Cost, Quadratic, sr.Measurements,
 }  # fmt: skip
@@ -100,15 +100,15 @@ TERMS = {
 
 def kinds(term: type) -> set[type]:
     """Every term that there is."""
-    own = {term} if is_dataclass(term) else set()
+    own = {term} if is_dataclass(term) and term.__module__.startswith("sparserob_core") else set()
     return own.union(*(kinds(one) for one in term.__subclasses__()))
 
 
 def test_every_field_of_every_term_says_its_unit_and_what_is_left_of_it() -> None:
-    assert kinds(Term) == TERMS
-    told = [(one, field) for one in TERMS for field in fields(one)]
-    assert not [(one, field.name) for one, field in told if not {"in_units", "remaining"} <= set(field.metadata)]
-    assert {field.name for _, field in told if field.metadata == UNITLESS} == {one.split(".")[-1] for one in NUMBERS}
+    assert kinds(Term) == KNOWN
+    told = [(one, each) for one in KNOWN for each in fields(one)]
+    assert not [(one, each.name) for one, each in told if not {"in_units", "remaining"} <= set(each.metadata)]
+    assert {each.name for _, each in told if each.metadata == UNITLESS} == {one.split(".")[-1] for one in NUMBERS}
 
 
 # What has no unit, by its field: shares, choices, and what a row of the user's is bounded by in the user's own unit.
@@ -232,3 +232,28 @@ def test_a_factor_on_a_constraint_is_one_on_its_bounds_about_their_middle():
         _ = sr.MixedConstraint([[1.0]], [[1.0]], [0.0]).bounds
     with pytest.raises(sr.InputError, match="no factor enlarges"):
         _ = sr.Equality([0.0]).bounds
+
+
+@dataclass(frozen=True, eq=False)
+class Budget(Term):
+    """A fact that no problem knows: at most so much of each control per time, from a time on."""
+
+    most: Any = field(metadata=measured(lambda of: of.controls / of.time))
+    start: float = field(default=0.0, metadata=TIME)
+
+
+@dataclass(frozen=True, eq=False)
+class Listed(Term):
+    """A record that lists such facts beside others, and has no code for any of them."""
+
+    every: tuple[Term, ...] = field(metadata=TERMS)
+
+
+def test_a_new_term_is_its_fields_and_whatever_lists_it_converts_it():
+    units = Units(2.0, np.array([8.0]), np.array([32.0, 4.0]), np.zeros(0), np.zeros(0), 1.0)
+    listed = Listed((Budget(np.array([64.0, 2.0]), 3.0), sr.PathConstraint(sr.Box([-8.0], [16.0]), 0.5, 1.0)))
+    budget, path = listed.in_units(units).every
+    assert budget.most.tolist() == [4.0, 1.0] and budget.start == 1.5 and path.set.upper.tolist() == [2.0]
+    (left,) = listed.remaining(1.0, 4.0).every  # the window is over
+    assert left.most.tolist() == [64.0, 2.0] and left.start == 2.0
+    assert not left.most.flags.writeable
