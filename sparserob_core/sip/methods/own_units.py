@@ -16,7 +16,6 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import (
-    Batch,
     EvaluationsFinished,
     Event,
     Notify,
@@ -149,14 +148,13 @@ class UsersUnits:
             else Box(frozen(own.domain.lower * units), frozen(own.domain.upper * units)),
             lower_bound=own.lower_bound * self.cost,
             sketches={role: _in_units(sketch, units) for role, sketch in own.sketches.items()},
-            batch=Batch(
-                tuple(points * units for points in batch.points),
-                tuple(values * value for values in batch.values),
-                batch.moments,
-                batch.notes,
-                batch.first,
-                batch.best * value,
-                None if batch.origin is None else batch.origin * units,
+            batch=replace(
+                batch,
+                points=tuple(points * units for points in batch.points),
+                values=tuple(values * value for values in batch.values),
+                best=batch.best * value,
+                origin=None if batch.origin is None else batch.origin * units,
+                stood=batch.stood * value,
             ),
         )
 
