@@ -32,7 +32,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import Accumulated, OptimalControlProblem, Return
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
-from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, Product, product
+from sparserob_core.control.sets.sets import Box, ConvexSet, Product, product
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ class Case:
         """The state constraints, under the names that the certificate uses."""
         path = [entry for entry in self.problem.windows if not isinstance(entry, Return)]
         d, own = self.problem.system.states, sum(not isinstance(entry, Accumulated) for entry in path)
-        ends = [end for end in self.problem.terminal if not isinstance(end, Equality)]
+        ends = self.problem.terminal_sets
         found = [
             Window(
                 entry.name or (f"path[{i}]" if own > 1 else "path"),
@@ -160,12 +160,7 @@ class Case:
     @property
     def equalities(self) -> list[tuple[int, float]]:
         """The states that are fixed at the end, and at what."""
-        return [
-            (int(i), float(end.values[i]))
-            for end in self.problem.terminal
-            if isinstance(end, Equality)
-            for i in end.fixed
-        ]
+        return [(int(i), float(end.values[i])) for end in self.problem.terminal_equalities for i in end.fixed]
 
     def window(self, name: str) -> Window:
         """The constraint of that name."""
