@@ -33,7 +33,10 @@ def refuse_remaining(model: Transcription) -> None:
         "a control that acts at once, without a delay": problem.system.delay > 0.0,
         "a policy that measures the whole state, not outputs": model.feedback is not None
         and problem.measurements is not None,
-        "a system that stays the same with time, or has pieces": isinstance(problem.system, VaryingSystem),
+        "a known system where it changes with time: what parameters did is not measured": isinstance(
+            problem.system, VaryingSystem
+        )
+        and model.stated.system.parameter_count > 0,
         "a control_step with flat sides, and no feedback beside it, where the plan repeats": bool(problem.repeat)
         and problem.control_step is not None
         and (problem.control_step.halfspaces() is None or model.feedback is not None),

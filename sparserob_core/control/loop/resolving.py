@@ -15,7 +15,6 @@ from sparserob_core.control.feedback.innovations import DEPENDENT, KNOWN
 from sparserob_core.control.loop.remaining import refuse_remaining, remaining
 from sparserob_core.control.loop.retuning import Retuning, retuned
 from sparserob_core.control.loop.tracking import Tracking, trackable
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
@@ -59,16 +58,17 @@ class Plan:
         problem, response = self.known.problem, self.known.response
         if problem.system.parameters is not None or problem.system.delay > 0.0 or problem.system.switches:
             return None
-        if isinstance(problem.system, VaryingSystem):
+        if self.known.stated.system.parameter_count:  # which are states by now, that nobody measures
             return None
         if problem.disturbance is not None and problem.disturbance_class != "piecewise_constant":
             return None
         steps, grid = response.steps(KNOWN), response.grid
-        driven, pushes, middle = steps.B[0] @ np.append(control, np.ones(grid.constants)), list[Array](), state
+        acting, pushes, middle = np.append(control, np.ones(grid.constants)), list[Array](), state
         for number in np.flatnonzero(grid.control_piece == piece).tolist():
             Phi, Gamma = (part[0, int(response.which[number])] for part in (steps.Phi, steps.Gamma))
-            middle = Phi @ middle + Gamma @ driven
-            pushes = [Phi @ push for push in pushes] + [Gamma @ steps.E[0]]
+            B, E = (grid.of_modes(part[0])[int(grid.modes[number])] for part in (steps.B, steps.E))
+            middle = Phi @ middle + Gamma @ (B @ acting)
+            pushes = [Phi @ push for push in pushes] + [Gamma @ E]
         lower, upper = middle, middle
         if problem.disturbance is not None:
             for push in pushes:
@@ -79,10 +79,14 @@ class Plan:
         """What a ``control (m,)`` on a piece drives every state by, ``(d,)``, if nothing else did: of an integral of
         controls alone, what it adds to it."""
         response, found = self.known.response, np.zeros(self.known.problem.system.states)
-        for number in np.flatnonzero(response.grid.control_piece == piece).tolist():
-            mode = response.system.modes[0 if response.grid.mode is None else int(response.grid.mode[number])]
-            B = mode.matrices(mode.probes[:1])[1][0]
-            found = found + response.grid.lengths[number] * (B[:, : control.size] @ control)
+        grid, system = response.grid, response.system
+        for number in np.flatnonzero(grid.control_piece == piece).tolist():
+            if grid.varying:  # whose pieces are its modes
+                B = grid.of_modes(response.steps(KNOWN).B[0])[number]
+            else:
+                mode = system.modes[0 if grid.mode is None else int(grid.mode[number])]
+                B = mode.matrices(mode.probes[:1])[1][0]
+            found = found + grid.lengths[number] * (B[:, : control.size] @ control)
         return found
 
     def caused(self, piece: int, state: Array, control: Array, after: Array) -> tuple[int, Array, Array, float] | None:

@@ -133,6 +133,18 @@ class LinearSystem:
         """Itself: it does not change with time."""
         return self
 
+    def at_times(self, start: float, stop: float, later: float) -> LinearSystem:
+        """The same law of a first parameter that is the time, from ``start`` to ``stop`` of a clock that shows 0 so
+        much ``later``."""
+        assert isinstance(self.parameters, Box)
+        lower, upper = (
+            np.append(end, side[1:])
+            for end, side in zip((start, stop), (self.parameters.lower, self.parameters.upper), strict=True)
+        )
+        A, B, E, c = (_later(self.entry(name), later) for name in PARTS)
+        assert A is not None and B is not None
+        return LinearSystem(A, B, E, Box(lower, upper), self.names, c)
+
     @shaped
     def accumulating(self, rows: Float[Array, "k d"], inputs: Float[Array, "k m"]) -> LinearSystem:
         """The same system with ``k`` more states after its own, ``z' = rows x + inputs u(t - delay)``: integrals of
@@ -649,9 +661,13 @@ class VaryingSystem:
         return replace(self, law=laws[0][1], later=tuple(laws[1:]))
 
     def remaining(self, begin: float, horizon: float) -> VaryingSystem:
-        """None yet; raises `InputError`."""
-        expected = "a system that stays the same with time, or has pieces"
-        raise InputError(path="system", expected=expected, got="one in t")
+        """What is left of it from a time on, which is 0 then."""
+        left = [
+            (max(0.0, start - begin), law.at_times(max(0.0, start - begin), until - begin, begin))
+            for start, until, law in self.laws
+            if not over(until, begin, horizon)
+        ]
+        return VaryingSystem(left[0][1], horizon, self.delay, tuple(left[1:]), self.parameters)
 
     @property
     def states(self) -> int:
@@ -767,6 +783,24 @@ def _check_piece(i: int, pair: object, before: float) -> None:
     if not isinstance(system, LinearSystem) or system.delay:
         said = "a delay of its own" if isinstance(system, LinearSystem) else type(system).__name__
         raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=said)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Later:
+    """A function of the time, and of parameters after it, on a clock that shows 0 at the time ``begin``."""
+
+    entry: Callable[..., object]
+    begin: float
+
+    def __call__(self, p: npt.NDArray[np.object_]) -> object:
+        moved = p.copy()
+        moved[0] = p[0] + self.begin
+        return self.entry(moved)
+
+
+def _later(entry: _Entry | None, begin: float) -> _Entry | None:
+    return _Later(entry, begin) if callable(entry) else entry
 
 
 def boxed(parameters: ConvexSet) -> Box:
