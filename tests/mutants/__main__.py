@@ -50,12 +50,20 @@ KEPT = ROOT / ".mutants"  # what unchanged tests said, for as long as the tree d
 
 @dataclass
 class Tally:
-    """What became of the mutants of one folder."""
+    """What became of the mutants of one folder, or of one kind."""
 
     drawn: int = 0
     beside: int = 0
     later: int = 0
     survivors: list[Mutant] = field(default_factory=list)
+
+    def add(self, mutant: Mutant, beside: Verdict, later: Verdict | None) -> None:
+        """Count one."""
+        self.drawn += 1
+        self.beside += beside.killed
+        self.later += later is not None and later.killed
+        if not (beside if later is None else later).killed:
+            self.survivors.append(mutant)
 
 
 def drawn(folders: tuple[str, ...], count: int, seed: int) -> list[Mutant]:
@@ -110,7 +118,7 @@ def main(arguments: list[str]) -> int:
         options[name] = value or options[name]
     folders = tuple(options["FOLDERS"].split(","))
     chosen = drawn(folders, int(options["COUNT"]), int(options["SEED"]))[int(options["SKIP"]) :]
-    tallies = {folder: Tally() for folder in folders}
+    tallies = {name: Tally() for name in (*folders, *KINDS)}
     with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:
         copies: SimpleQueue[Path] = SimpleQueue()
         for number in range(int(options["JOBS"])):
@@ -133,37 +141,38 @@ def main(arguments: list[str]) -> int:
         started = time.perf_counter()
         with ThreadPoolExecutor(int(options["JOBS"])) as pool:
             for mutant, beside, later in pool.map(judged, chosen):
-                tally = tallies[folder_of(mutant, folders)]
-                tally.drawn += 1
-                tally.beside += beside.killed
-                tally.later += later is not None and later.killed
+                for name in (folder_of(mutant, folders), mutant.kind):
+                    tallies[name].add(mutant, beside, later)
                 verdict = beside if later is None else later
-                if not verdict.killed:
-                    tally.survivors.append(mutant)
                 stage = "beside" if beside.killed else "first stage" if verdict.killed else "SURVIVED"
                 print(f"{stage:11} {beside.seconds:5.1f} s  {mutant}  [{verdict.by}]", flush=True)
         print(f"{time.perf_counter() - started:.0f} s")
-    _print(tallies, options["STAGE"] == "first")
+    _print(folders, tallies, options["STAGE"] == "first")
     return 0
 
 
-def _print(tallies: dict[str, Tally], whole: bool) -> None:
-    print(f"\n{'folder':22} drawn  killed beside" + ("  killed by the first stage" if whole else ""))
+def _print(folders: tuple[str, ...], tallies: dict[str, Tally], whole: bool) -> None:
+    """Both rates of every folder, of all, and of every kind: what no test can be asked to notice is of few kinds."""
+    print(f"\n{'folder':26} drawn  killed beside" + ("  killed by the first stage" if whole else ""))
     counts = Counter[str]()
-    for folder, tally in tallies.items():
+    for folder in folders:
+        tally = tallies[folder]
         counts.update(drawn=tally.drawn, beside=tally.beside, later=tally.later)
         _line(folder, tally.drawn, tally.beside, tally.later, whole)
     _line("all", counts["drawn"], counts["beside"], counts["later"], whole)
+    print()
+    for kind in KINDS:
+        _line(kind, tallies[kind].drawn, tallies[kind].beside, tallies[kind].later, whole)
     print("\nsurvivors:")
-    for tally in tallies.values():
-        for mutant in tally.survivors:
+    for folder in folders:
+        for mutant in tallies[folder].survivors:
             print(f"  {mutant}")
 
 
 def _line(name: str, count: int, beside: int, later: int, whole: bool) -> None:
     share = f"{beside:5} {beside / max(count, 1):7.0%}"
     print(
-        f"{name:22} {count:5}  {share}"
+        f"{name:26} {count:5}  {share}"
         + (f"  {beside + later:10} {(beside + later) / max(count, 1):7.0%}" if whole else "")
     )
 
