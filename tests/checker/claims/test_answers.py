@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flint import ctx
+from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
@@ -479,3 +479,14 @@ def test_a_direction_of_a_fixed_state_is_that_state_alone_at_the_end():
     for direction, time in (([0.0], 2.0), ([1.0], 1.9), ([1.0], 0.0)):
         with pytest.raises(Broken, match="fixed final state"):
             bounds.fixed_limit(case, np.array(direction), time)
+
+
+def test_the_effort_is_looked_for_where_deviations_go(monkeypatch):
+    """How far every entry goes, from the middle of its set, is handed on."""
+    told = []
+    monkeypatch.setattr("sparserob_core.checker.claims.answers.at_most", lambda *given: told.append(given) or 1)
+    answers_of(case_of(cost="worst", disturbance=Box([-0.1], [0.3])))._effort(arb(9.0))
+    a, A, _, reach, limit, _ = told[0]
+    assert reach == pytest.approx([0.2, 0.2]) and float(limit) == 9.0
+    assert [float(x.mid()) for x in a] == pytest.approx([0.3, -0.2])
+    assert [[float(x.mid()) for x in row] for row in A] == [pytest.approx([0.0, 0.0]), pytest.approx([-0.5, 0.0])]
