@@ -3,6 +3,7 @@ what a cell adds to its chord is what its curvature owes, in balls."""
 
 from __future__ import annotations
 
+from fractions import Fraction
 from functools import cache, partial
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
-from sparserob_core.checker.sets.polynomials import Enclosed
+from sparserob_core.checker.sets.polynomials import Enclosed, rounding
 from sparserob_core.checker.sets.sides import Curved, Sides
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid
@@ -341,3 +342,23 @@ def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_z
         found = VaryingLoop.pushed(SimpleNamespace(_flow=flow), entries)
         assert found.pattern.tolist() == seen.tolist()
         assert (found.states, found.entries) == (seen.any(axis=1).sum(), seen.any(axis=0).sum())
+
+
+def test_the_error_of_a_chord_holds_all_that_is_lost_in_rational_numbers(monkeypatch):
+    """Heights, their radii and what a chord may miss are told; the sum is to be no less than the exact one."""
+    rng = np.random.default_rng(11)
+    ends = {time: Enclosed(rng.normal(size=200), 1e-3 * rng.uniform(size=200)) for time in (0.25, 0.5)}
+    missed = 1e-2 * rng.uniform(size=200)
+    monkeypatch.setattr(LoopTube, "_height", lambda self, piece, time, z: ends[time])
+    tube = LoopTube(SimpleNamespace(bent=lambda *given: missed), np.eye(2), np.zeros((2, 0)))
+    found = tube.cells(0, 0.25, 0.5, np.zeros((200, 2)))
+    for i, poly in enumerate(found):
+        radius = max(Fraction(part.rad[i]) for part in ends.values())
+        unit = Fraction(rounding(2))
+        lost = radius + Fraction(missed[i]) + unit * sum(Fraction(abs(part.mid[i])) for part in ends.values())
+        assert lost <= Fraction(poly.error) <= lost * (1 + Fraction(1, 10**9))
+        assert poly.expansion == missed[i]
+        assert poly.coefficients[0, 0] == ends[0.25].mid[i]
+        assert poly.coefficients[:, 0].sum() == pytest.approx(ends[0.5].mid[i], rel=1e-14)
+    (still,) = tube.cells(0, 0.25, 0.25, np.zeros((200, 2)))[:1]
+    assert still.expansion == 0.0 and still.coefficients.shape[0] == 1

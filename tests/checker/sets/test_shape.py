@@ -518,3 +518,10 @@ def test_a_product_is_bounded_and_holds_points_part_by_part():
         assert all(shape.contains(point) for point in inside)
         for place in range(5):  # one coordinate too far, whatever the others are
             assert not shape.contains(source.middle() + 3.0 * np.eye(5)[place])
+
+
+def test_opposite_normals_share_a_row_of_the_basis_whatever_the_sign_of_their_zeros():
+    rows = np.array([[1.0, -0.0], [-1.0, 0.0], [-0.0, 2.0], [0.0, -2.0], [1.0, 1.0]])
+    basis, z = known(Polytope(rows, np.ones(5))).basis
+    assert basis.shape == (3, 2) and (z @ basis == rows).all()
+    assert sorted(np.abs(z).sum(axis=1).tolist()) == [1.0] * 5
