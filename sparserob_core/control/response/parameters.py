@@ -108,7 +108,7 @@ class ParameterIndex:
         """A tensor lattice ``(v, nu)`` over the box (ends and middle included), clamped onto the set, and its shape."""
         if self.set is None:
             return np.zeros((1, 0)), ()
-        per_axis = next(n for n in (9, 7, 5, 3, 2, 1) if n**self.count <= (125 if n > 3 else LATTICE) or n == 1)
+        per_axis = next(n for n in (9, 5, 3, 2, 1) if n**self.count <= (125 if n > 3 else LATTICE) or n == 1)
         box = self.box
         axes = [np.linspace(low, high, per_axis) for low, high in zip(box.lower, box.upper, strict=True)]
         return self.clamp(np.array(list(product(*axes)))), (per_axis,) * self.count

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.parameters import LATTICE, ParameterIndex
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box, ConvexSet
 
@@ -107,3 +107,12 @@ def test_a_cell_that_does_not_touch_has_no_point_of_the_set_and_cuts_keep_every_
             # every cut crosses the cell: one of its corners is beyond it
             assert (np.abs(cuts.slopes).sum(axis=1) > cuts.slack).all()
     assert name in ("box", "segment") or (told_apart and cut)
+
+
+@pytest.mark.parametrize(("count", "per_axis"), [(1, 9), (2, 9), (3, 5), (4, 3), (5, 3), (6, 3), (8, 2), (20, 1)])
+def test_the_lattice_is_as_fine_as_its_points_may_be_many(count, per_axis):
+    """Of 9, 7 and 5 on every axis no more than 125 points, of fewer no more than are kept."""
+    assert (per_axis <= 3 or per_axis**count <= 125) and per_axis**count <= LATTICE
+    points, shape = ParameterIndex(Box(-np.ones(count), np.ones(count))).lattice()
+    assert shape == (per_axis,) * count and points.shape == (per_axis**count, count)
+    assert points.min() == -1.0 and (per_axis == 1 or points.max() == 1.0)
