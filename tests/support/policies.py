@@ -15,6 +15,7 @@ from typing import Any
 
 import clarabel
 import numpy as np
+from scipy.linalg import expm
 from scipy.optimize import linprog
 from scipy.sparse import coo_array, csc_matrix, csr_array
 
@@ -36,10 +37,14 @@ from tests.support.instances import (
     sample,
 )
 
+FURTHER = 6 * TOGETHER  # numbers of policies with one of `KINDS` among their features
+KINDS = ("worst", "fixed", "repeat", "measurable", "curved")
+SPARE = 1.01  # times the measurable disturbance: what the trapezoidal rule may leave out between its nodes, and more
 ROUND = 5 * TOGETHER  # numbers of policies among whose sets of deviations there are ellipsoids
 LARGER = 2.0  # times the disturbance that open loops are tested with
 PER_PIECE = 8
 AT_ONCE = 80  # rows that are imposed where they are violated
+MOST_ANSWERED = 7  # deviations that are answered, of which all corners are looked at
 MET = 1e-9  # a row that is violated by less is met
 
 
@@ -59,7 +64,8 @@ class Outputs:
 @dataclass(frozen=True)
 class Answered:
     """A problem, its units, what its policy is charged, for how many pieces it answers (0: for ever), and its outputs
-    with what one of each is in the user's units, where these are not the state."""
+    with what one of each is in the user's units, where these are not the state. ``repeat``: it begins again at the
+    horizon; ``measurable``: the disturbance is any function of time."""
 
     problem: Instance
     units: Units
@@ -67,6 +73,8 @@ class Answered:
     lag: int
     outputs: Outputs | None = None
     scale: np.ndarray | None = None
+    repeat: bool = False
+    measurable: bool = False
 
     def config(self) -> dict[str, Any]:
         """In the user's units."""
@@ -74,6 +82,10 @@ class Answered:
         policy = {"name": "affine", "cost": self.cost, "causal_signals": 4}
         memory = {"memory": self.lag * step} if self.lag else {}
         stated = {**config(self.problem, self.units), "policy": {**policy, **memory}}
+        if self.repeat:
+            stated["problem"]["repeat"] = True
+        if self.measurable:
+            stated["problem"]["disturbance_class"] = "measurable"
         if self.outputs is not None:
             assert self.scale is not None
             seen: dict[str, Any] = {"C": (self.scale[:, None] * self.outputs.C / self.units.states).tolist()}
@@ -87,7 +99,7 @@ def answered(number: int) -> Answered:
     """The instance of a number: a known system between flat sets under a box of disturbances, equal pieces; from
     `TOGETHER` on with all features that a policy may have, each or not (`together`)."""
     if number >= TOGETHER:
-        return together(number)
+        return further(number) if number >= FURTHER else together(number)
     rng = np.random.default_rng([number, 39])
     while True:
         problem = drawn(rng)
@@ -140,6 +152,74 @@ def together(number: int) -> Answered:
     elif has[5] and equal and problem.dictionary == "piecewise_constant":
         lag = int(rng.integers(1, 4))
     return Answered(problem, units, cost, lag, outputs, scale)
+
+
+def _fits(problem: Instance, kind: str) -> bool:
+    """Whether an instance can have a feature of `KINDS`, and a truth of a size that is solved in seconds."""
+    K, d = len(problem.edges) - 1, len(problem.A)
+    if problem.dictionary != "piecewise_constant" or problem.slopes or d > 3:
+        return False
+    flat = all(isinstance(one, Flat) for one in [*problem.terminal, *(one for one, _, _ in problem.path)])
+    if kind == "curved":
+        disc = all(one.p == 2.0 for one, _, _ in problem.path if isinstance(one, Curved))
+        return K <= 8 and d <= 2 and not flat and disc and problem.ends_at is None and bool(problem.path)
+    if kind == "fixed":
+        return K <= 8 and flat and problem.ends_at is not None
+    small = {"worst": K <= 5, "repeat": K <= 8, "measurable": K <= 5 and d <= 2}[kind]
+    return small and flat and problem.ends_at is None and bool(problem.terminal)
+
+
+def _fuller(rng: np.random.Generator, problem: Instance, kind: str, has: np.ndarray) -> Instance:
+    """With what `richer` and `in_time` draw, as far as it stands beside a feature of `KINDS`."""
+    if has[1]:
+        fuller = richer(rng, problem)
+        curved = isinstance(fuller.step, Curved) and kind == "measurable"  # refused by name
+        problem = problem if curved or (kind == "repeat" and fuller.step is not None) else fuller
+    if has[2] and kind != "measurable":
+        timed = in_time(rng, problem)
+        early = problem.step is not None or kind == "repeat"  # of a plan that repeats steps go on across the seam
+        problem = replace(timed, late=0, before=None) if early else timed
+    return problem
+
+
+def further(number: int) -> Answered:
+    """One of `KINDS` in turn: a cost of the largest effort, fixed final states, a plan that begins again, measurable
+    disturbances, curved sets on the path; beside it what `together` draws, as far as the truth is a program."""
+    rng, kind = np.random.default_rng([number, 42]), KINDS[number % len(KINDS)]
+    problem = drawn(rng)
+    while not _fits(problem, kind):
+        problem = drawn(rng)
+    (d, m), has = problem.B.shape, rng.random(6) < 0.5
+    if kind == "measurable" and isinstance(problem.control, Curved):  # refused by name
+        problem = replace(problem, control=Flat.box(problem.control.support(np.eye(m))))
+    if kind == "worst":
+        problem = replace(problem, E=problem.E[:, :1])
+    if kind == "fixed":
+        problem = replace(problem, disturbance=None)  # it would reach what is fixed
+    else:
+        width = LARGER * rng.uniform(0.002, 0.05, problem.E.shape[1]) * (0.5 if kind == "repeat" else 1.0)
+        problem = replace(problem, disturbance=Flat.box(width))
+    if kind == "repeat":
+        wide, more = Flat.box(rng.uniform(0.1, 0.6, d)), rng.uniform(1.0, 4.0)
+        problem = replace(
+            problem,
+            initial_state=0.1 * problem.initial_state,
+            initial_set=wide,
+            terminal=[one.scaled(more) for one in problem.terminal],
+            path=[(one.scaled(more), start, stop) for one, start, stop in problem.path],
+        )
+    elif has[0] or kind == "fixed":
+        problem = replace(problem, initial_set=Flat.box(rng.uniform(0.002, 0.05, d)))
+    problem = _fuller(rng, problem, kind, has)
+    cost = "worst" if kind == "worst" else str(rng.choice(["nominal", "peak"]))
+    if has[3]:
+        problem = replace(problem, charge=replace(charge(rng, d, m), grouped=False))
+    units, outputs, scale = drawn_units(rng, problem), None, None
+    if has[4] and kind not in ("worst", "measurable"):
+        p = int(rng.integers(1, d + 1))
+        noise = rng.uniform(0.001, 0.02, p) * (rng.random() < 0.5 and kind != "fixed")
+        outputs, scale = Outputs(rng.normal(size=(p, d)), noise, 0.0), 10.0 ** rng.uniform(-6, 6, p)
+    return Answered(problem, units, cost, 0, outputs, scale, kind == "repeat", kind == "measurable")
 
 
 def rounder(number: int, problem: Instance) -> Instance:
@@ -262,7 +342,7 @@ def truth_answered(one: Answered) -> tuple[float, float]:
 
 
 def _sampled(one: Answered, some: Sampled, tight: bool) -> float:
-    policy = _Policy(one, some)
+    policy = _Policy(one, _measured(one.problem, some, tight) if one.measurable else some)
     always = [*_control_rows(one.problem, tight, policy.still), *policy.charged(one.cost)]
     sought = list[_Row]()
     for shape, start, stop in one.problem.path:
@@ -273,9 +353,34 @@ def _sampled(one: Answered, some: Sampled, tight: bool) -> float:
         sought += _state_rows(policy, shape, inside, room, tight, one.problem.reference)
     for shape in one.problem.terminal:
         always += _state_rows(policy, shape, np.array([len(some.times) - 1]), 0.0 * some.sag, tight, None)
+    if one.repeat:
+        assert one.problem.initial_set is not None
+        begun = np.append(0.0, one.problem.initial_state)[None]
+        always += _state_rows(
+            policy, one.problem.initial_set, np.array([len(some.times) - 1]), 0.0 * some.sag, tight, begun
+        )
+    if one.problem.ends_at is not None:
+        policy.fix(one.problem.ends_at)
     if one.problem.mixed is not None:
         sought += _mixed_rows(policy, one.problem, some.sag if tight else 0.0 * some.sag)
     return policy.least(always, sought)
+
+
+def _measured(problem: Instance, some: Sampled, tight: bool) -> Sampled:
+    """With every step of the fine grid in place of the pieces of the disturbance: constant on each, which is one of the
+    measurable ones; or with room, the trapezoidal rule of the absolute kernel, which its chords are above but for the
+    kernel's curvature."""
+    (d, q), steps, noise = problem.E.shape, np.diff(some.times), list[np.ndarray]()
+    for s, h in enumerate(steps):
+        big = expm(h * np.block([[problem.A, problem.E], [np.zeros((q, d + q))]]))
+        inside = big[:d, d:]
+        pushes = [SPARE * h / 2 * big[:d, :d] @ problem.E, SPARE * h / 2 * problem.E] if tight else [inside]
+        for push in pushes:
+            column = np.zeros((len(some.times), d, q))
+            for j in range(s + 1, len(some.times)):
+                column[j] = expm((some.times[j] - some.times[s + 1]) * problem.A) @ push
+            noise.append(column)
+    return replace(some, noise=np.stack(noise, axis=-1))
 
 
 def _state_rows(
@@ -330,17 +435,17 @@ class _Policy:
     def __init__(self, one: Answered, some: Sampled) -> None:
         problem = self.problem = one.problem
         self.some, self.program = some, _Program()
-        m, (d, q), K = len(problem.weights), problem.E.shape, len(problem.edges) - 1
-        assert problem.disturbance is not None
+        m, (d, q), K, S = len(problem.weights), problem.E.shape, len(problem.edges) - 1, some.noise.shape[3]
+        pushed = np.zeros(q) if problem.disturbance is None else problem.disturbance.support(np.eye(q))
         seen = Outputs(np.eye(d), np.zeros(d), 0.0) if one.outputs is None else one.outputs
         p = len(seen.C)
         begun = np.zeros(d) if problem.initial_set is None else problem.initial_set.support(np.eye(d))
         noisy = np.tile(seen.noise, K)
-        self.radii = np.concatenate([np.repeat(problem.disturbance.support(np.eye(q)), K), begun, noisy])
+        self.radii = np.concatenate([np.repeat(pushed, S), begun, noisy])
         self.still = np.zeros(self.radii.size)
         self.blocks = [(np.array([z]), np.eye(1) * self.radii[z]) for z in np.flatnonzero(self.radii)]
-        places = [*(np.arange(piece, q * K, K) for piece in range(K)), q * K + np.arange(d)]
-        for block, shape in zip(places, [*[problem.disturbance] * K, problem.initial_set], strict=True):
+        places = [*(np.arange(piece, q * S, S) for piece in range(S)), q * S + np.arange(d)]
+        for block, shape in zip(places, [*[problem.disturbance] * S, problem.initial_set], strict=True):
             if isinstance(shape, Curved):
                 assert shape.axes is not None
                 self.blocks = [one for one in self.blocks if one[0][0] not in block]
@@ -351,9 +456,9 @@ class _Policy:
         purified = np.zeros((K, p, self.radii.size))
         for j in range(K):
             at = j * PER_PIECE
-            purified[j, :, : q * K] = seen.C @ some.noise[at].reshape(d, q * K)
-            purified[j, :, q * K : q * K + d] = seen.C @ some.flow[at]
-            purified[j, :, q * K + d + j * p : q * K + d + (j + 1) * p] = np.eye(p)
+            purified[j, :, : q * S] = seen.C @ some.noise[at].reshape(d, q * S)
+            purified[j, :, q * S : q * S + d] = seen.C @ some.flow[at]
+            purified[j, :, q * S + d + j * p : q * S + d + (j + 1) * p] = np.eye(p)
         entries = list[tuple[int, int, float]]()  # of the control, of the deviation, how much; one list for each gain
         gains = list[list[tuple[int, int, float]]]()
         for k, i in product(range(K), range(m)):
@@ -381,6 +486,35 @@ class _Policy:
         found[: pushed.size] = pushed
         found[pushed.size : pushed.size + c.size] = c @ self.some.flow[j]
         return found
+
+    def fix(self, ends: np.ndarray) -> None:
+        """The final state where it is a number, whatever deviates."""
+        last = len(self.some.times) - 1
+        for i in np.flatnonzero(np.isfinite(ends)):
+            on_v, own = self.some.response[last, i], self.own(np.eye(ends.size)[i], last)
+            needed = [(self.v, on_v, float(ends[i] - self.some.free[last, i]))]
+            needed += [(self.gains, on_v @ self.answers[z], float(-own[z])) for z in np.flatnonzero(self.radii)]
+            for places, values, level in needed:
+                for sign in (1.0, -1.0):
+                    self.program.row(places[values != 0.0], sign * values[values != 0.0], sign * level)
+
+    def _worst(self) -> None:
+        """The largest effort, by every corner of what is answered."""
+        answered = [z for z in np.flatnonzero(self.radii) if self.answers[z].nnz]
+        assert len(answered) <= MOST_ANSWERED
+        (top,) = self.program.variables(1, 1.0, 0.0)
+        for signs in product((1.0, -1.0), repeat=len(answered)):
+            corner = sum(
+                (sign * self.radii[z] * self.answers[z] for sign, z in zip(signs, answered, strict=True)),
+                0.0 * self.answers[0],
+            ).toarray()
+            efforts = self.program.variables(self.v.size, low=0.0)
+            for i, effort in enumerate(efforts):
+                used = np.flatnonzero(corner[i])
+                for sign in (1.0, -1.0):
+                    places = np.array([self.v[i], *self.gains[used], effort])
+                    self.program.row(places, np.array([sign, *(sign * corner[i, used]), -1.0]), 0.0)
+            self.program.row(np.append(efforts, top), np.append(self.problem.price, -1.0), 0.0)
 
     def impose(self, row: _Row) -> None:
         where = np.flatnonzero(row.on_v)
@@ -419,6 +553,9 @@ class _Policy:
                     self.program.prices[top] = float(problem.price[k])
                     self.program.norms.append((self.v[k::K], int(top)))
                 return found
+        if cost == "worst":
+            self._worst()
+            return found
         tops = self.program.variables(self.v.size, low=0.0)
         for i, (price, top) in enumerate(zip(problem.price, tops, strict=True)):
             self.program.prices[top] = float(price)

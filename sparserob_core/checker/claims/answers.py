@@ -316,7 +316,8 @@ class Answers:
             rows = [(d * (k + 1), most) for k in range(len(members))]
             ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
             columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
-            self._inverses[members] = Seen(stacked(table), pattern, rows, columns).inverse(), blocks
+            reach = np.array([float(chord.mid()) for block in blocks for chord in self._chords[block].values()])
+            self._inverses[members] = Seen(stacked(table), pattern, rows, columns, reach).inverse(), blocks
         return self._inverses[members]
 
     def _pushed(self, loop: ClosedLoop, block: int) -> Pushed:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 EVENED = 20  # steps in which rows and columns become of one size; the first few do most, twice as many change nothing
 
+TOLD = 2.0**20  # times its radius a row is to be: six digits of it, of which what is inverted may lose some
+
 Pattern = npt.NDArray[np.bool_]
 
 
@@ -83,12 +85,13 @@ def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
 class Seen:
     """What some innovations see of some blocks: ``matrix``, and which of its entries may be other than 0, ``pattern``.
     ``rows``: of every group of rows, one for each innovation, where it ends and how many of it are independent at most;
-    ``columns``: the same for each block."""
+    ``columns``: the same for each block. ``reach``: how far every column deviates, all alike unless given."""
 
     matrix: arb_mat
     pattern: Pattern
     rows: Sequence[tuple[int, int]]
     columns: Sequence[tuple[int, int]]
+    reach: Array | None = None
 
     @cached_property
     def most(self) -> int:
@@ -115,18 +118,26 @@ class Seen:
         return int(room[inside[starts] & ~inside[ends]].sum())
 
     def inverse(self) -> arb_mat:
-        """A matrix that takes what is seen of any deviations to deviations that are seen alike; raises `Unchecked`
-        where balls do not show as many independent rows as there can be."""
+        """A matrix that takes what is seen of any deviations to deviations that are seen alike, of all such the least
+        beside how far they reach; raises `Unchecked` where balls do not show as many independent rows as there can
+        be."""
         from scipy.linalg import qr
 
-        D, rows, columns = _evened(self.matrix)
-        r, c, rank = D.nrows(), D.ncols(), self.most
+        r, c, rank = self.matrix.nrows(), self.matrix.ncols(), self.most
+        D, rows, columns = (
+            _evened(self.matrix) if rank == c or self.reach is None else _reaching(self.matrix, self.reach)
+        )
+        every = D.tolist()
+        told = [i for i, row in enumerate(every) if _is_told(row)]
         try:
+            if len(told) < rank:
+                raise ZeroDivisionError
             if rank == c:
-                found = (D.transpose() * D).inv() * D.transpose()
+                some = stacked([every[i] for i in told])
+                found = _spread((some.transpose() * some).inv() * some.transpose(), told, r)
             else:
-                chosen = list(range(r)) if rank == r else qr(middles(D).T, mode="r", pivoting=True)[1][:rank].tolist()
-                every = D.tolist()
+                order = qr(middles(D)[told].T, mode="r", pivoting=True)[1] if rank < len(told) else range(rank)
+                chosen = [told[i] for i in order][:rank]
                 some = stacked([every[i] for i in chosen])
                 found = _spread(some.transpose() * (some * some.transpose()).inv(), chosen, r)
         except ZeroDivisionError:
@@ -148,6 +159,21 @@ def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
         given = dict(zip(places, row, strict=True))
         found.append([given.get(i, zero) for i in range(count)])
     return stacked(found)
+
+
+def _is_told(row: Sequence[arb]) -> bool:
+    """Whether a row is more than the rounding of what cancels in it, as what an observer leaves of what was seen
+    before: beside rows of one size it would make a matrix that no balls invert."""
+    return max(float(abs(x.mid())) for x in row) > TOLD * max(float(x.rad()) for x in row)
+
+
+def _reaching(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
+    """A matrix with its columns multiplied by powers of two near how far they reach, so that short deviations are those
+    that use little of it, and its rows so that the largest entry of each is about 1; and these powers."""
+    columns = np.exp2(np.round(np.log2(reach)))
+    most = (np.abs(middles(D)) * columns).max(axis=1)
+    rows = np.exp2(-np.round(np.log2(np.where(most > 0.0, most, 1.0))))
+    return scaled(D, rows, columns), rows, columns
 
 
 def _evened(D: arb_mat) -> tuple[arb_mat, Array, Array]:

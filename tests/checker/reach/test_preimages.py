@@ -147,3 +147,29 @@ def test_what_systems_that_take_turns_bring_to_a_state_counts_wherever_any_of_th
     assert together.states == 3 and together.entries == 1 and together.pattern.all()
     elsewhere = Pushed.of([(lead[0], entry), (lead[0], arb_mat([[0], [0], [1]]))], [0])
     assert elsewhere.states == 3 and elsewhere.entries == 1
+
+
+def test_rows_that_are_nothing_but_rounding_do_not_hide_the_others() -> None:
+    """What an observer leaves of what was seen before: entries of 1e-17 and 1e-32 that balls know to 1e-29."""
+    told, left = [[3.0, -8.0], [-1e-5, -2e-5]], [[-9e-16, -9e-15], [-6e-32, -7e-31]]
+    with ctx.workprec(96):
+        table = [[arb(v) for v in row] for row in told] + [[arb(v, 1e-28) for v in row] for row in left]
+        seen = Seen(arb_mat(table), np.ones((4, 2), dtype=bool), [(2, 2), (4, 2)], [(2, 2)])
+        X = seen.inverse()
+        assert np.abs(floats(X * seen.matrix) - np.eye(2)).max() < 1e-9
+        assert not any(x != 0 for x in [row[3] for row in X.tolist()])
+        assert max(float(x.rad()) for x in (X * seen.matrix).entries()) < 1e-9
+        with pytest.raises(Unchecked):
+            Seen(arb_mat(table[2:]), np.ones((2, 2), dtype=bool), [(2, 2)], [(2, 2)]).inverse()
+
+
+def test_of_deviations_that_are_seen_alike_those_are_taken_that_reach_farthest() -> None:
+    """One number is seen of three deviations: the third is seen a thousandfold and can hardly deviate."""
+    one = [(1, 1)]
+    with ctx.workprec(96):
+        for reach in ([1.0, 1.0, 1e-9], [1e-9, 1.0, 1e-12], [1.0, 2.0, 1e-3]):
+            X = Seen(arb_mat([[1.0, 1.0, 1e3]]), np.ones((1, 3), dtype=bool), one, [(3, 3)], np.array(reach)).inverse()
+            share = np.abs(floats(X)[:, 0]) / reach
+            best = np.array([1.0, 1.0, 1e3]) * reach
+            assert floats(X)[:, 0] @ [1.0, 1.0, 1e3] == pytest.approx(1.0, abs=1e-12)
+            assert share.max() < 8.0 / best.max()  # powers of two near the reach
