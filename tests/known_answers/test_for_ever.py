@@ -294,6 +294,34 @@ def test_what_does_not_repeat_is_refused_in_one_sentence(keys, sentence) -> None
         sr.run(_integrator(**keys))
 
 
+@pytest.mark.slow
+def test_that_an_unstable_plant_cannot_be_kept_from_its_outputs_is_verified(tmp_path) -> None:
+    """What gains can lower is told by how far their control can go, over deviations of very different sizes: noise,
+    disturbance and initial states. A checker that told them by least squares regardless of these proved -10.5."""
+    config = _config(
+        11,
+        cost="nominal",
+        system={
+            "A": [[0.469, 0.326, -0.577], [0.643, 0.421, 0.423], [0.447, 0.663, 1.346]],
+            "B": [[-0.611], [0.047], [1.754]],
+            "E": [[-0.937], [0.228], [-0.482]],
+        },
+        horizon=3.193,
+        control={"box": 3.0},
+        disturbance={"box": 0.0446},
+        measurements={
+            "C": [[0.475, -1.931, -0.992], [-1.405, -0.231, -0.689]],
+            "noise": {"box": 0.024},
+            "latency": 0.58,
+        },
+        path=[{"box": [1.5, 1.5, 1.5]}],
+        initial_state={"centre": [0.0, 0.0, 0.0], "box": [0.3, 0.3, 0.3]},
+    )
+    outcome = _run(tmp_path / "run", config)
+    assert outcome.status == "infeasible"
+    assert _verdicts(tmp_path / "run")["infeasibility"] == "holds"
+
+
 def test_a_flat_set_that_is_no_box_is_refused() -> None:
     flat = {"centre": [0, 0], "polytope": {"H": [[1, 1], [-1, -1], [1, 0], [-1, 0]], "h": [0, 0, 1, 1]}}
     with pytest.raises(sr.InputError, match="expected a set of initial states with an interior, or a box"):

@@ -105,6 +105,15 @@ def test_no_rank_is_above_the_bound_whatever_the_numbers_are() -> None:
         assert np.linalg.matrix_rank(D, tol=1e-9) <= seen.most <= min(most_r.sum(), most_c.sum(), r.sum(), c.sum())
 
 
+def test_of_all_deviations_that_are_seen_alike_those_of_least_squares_are_told() -> None:
+    """Whatever the sizes of the columns: how far each reaches is its unit."""
+    for sizes in ([1.0, 1000.0], [1.0, 1.0], [0.01, 3.0]):
+        D = np.array([sizes])
+        seen = Seen(arb_mat(D.tolist()), np.ones((1, 2), dtype=bool), [(1, 1)], [(1, 1), (2, 1)], np.ones(2))
+        found = np.array([[float(x.mid()) for x in row] for row in seen.inverse().tolist()])
+        np.testing.assert_allclose(found, np.linalg.pinv(D), rtol=1e-12)
+
+
 def test_what_balls_cannot_tell_is_not_inverted() -> None:
     """A period of an oscillator leaves next to nothing of a constant push: with few bits it may be 0."""
     A = np.array([[0.0, 2.0 * np.pi], [-2.0 * np.pi, 0.0]])
