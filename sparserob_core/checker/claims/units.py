@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 MOST_TIMES = 64  # at which a window is looked at
+# States from which transitions are made of floats, which is what units need: of 348 states one in balls takes as long
+# as the rest of a check; of few states that is nothing, and what grows by many digits has them right.
+COARSE = 16
+TERMS = 18  # of the series of such a transition, at a norm of at most a half: more are below rounding
 MOST_HELD = 16_000_000  # numbers that tell what inputs do on every piece, at once
 # So many times as far as a control goes it is taken to go in the numbers that are added up, where its range is larger.
 # With a tenth of it, runs would be refused that were honest in the units of their whole range; with ten times as much,
@@ -227,9 +231,12 @@ class _Steps:
         if key not in self._known:
             parts = self._flows[leg].parts
             both = stacked([b + e for b, e in zip(parts["B"][0].tolist(), parts["E"][0].tolist(), strict=True)])
-            Phi, Gamma = held(parts["A"][0], both, arb(stop - start))
-            table = _floats(Gamma)
-            self._known[key] = (_floats(Phi), table[:, : self.controls], table[:, self.controls :])
+            if both.nrows() >= COARSE:
+                flow, table = _held(_floats(parts["A"][0]), _floats(both), stop - start)
+            else:
+                Phi, Gamma = held(parts["A"][0], both, arb(stop - start))
+                flow, table = _floats(Phi), _floats(Gamma)
+            self._known[key] = (flow, table[:, : self.controls], table[:, self.controls :])
         return self._known[key]
 
     @cached_property
@@ -239,3 +246,19 @@ class _Steps:
 
 def _floats(matrix: arb_mat) -> Array:
     return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
+
+
+def _held(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
+    """``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats: the series over a short time, and what that makes
+    of twice the time, again and again."""
+    d, size = A.shape[0], float(np.abs(A).sum(axis=1).max(initial=0.0)) * time
+    halvings = max(0, int(np.ceil(np.log2(2.0 * size)))) if 0.0 < size < np.inf else 0
+    short = time / 2.0**halvings
+    flow, driven, term = np.eye(d), np.eye(d) * short, np.eye(d)
+    for order in range(1, TERMS + 1):
+        term = term @ A * (short / order)
+        flow, driven = flow + term, driven + term * (short / (order + 1))
+    driven = driven @ inputs
+    for _ in range(halvings):
+        flow, driven = flow @ flow, driven + flow @ driven
+    return flow, driven

@@ -21,31 +21,77 @@ from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.flow import OwnUnits, middles, stacked
 from sparserob_core.checker.reach.measurable import Side, swept
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 ORDER = 13  # of the polynomials
-SHORT = 0.5  # growth times length of a step, at most: what is left of them is then 1e-15 of a row's largest term
+REST = 2e-15  # of a row's largest term is left of them over a step, at most: more is felt, less takes shorter steps
+SERIES = 128  # terms of what is left that are added up one by one: steps are so short that the last of them is nothing
+LONGEST = 16.0  # size of a system over a step, at most: the terms of its series are then below 1e6, and cancel little
 BENDING = 7  # terms of the bounds of second derivatives
 MOST_STEPS = 2**17
 BLOCK = 64  # rows in one ball matrix, a power of two: fewer take more calls, more make more that are not needed
+# Steps between rows that are products of ball matrices, a power of two; those between are one product of floats more,
+# which is off as the terms of polynomials are. With half of it the rows of many states take twice as long, and with
+# twice as much the transitions between take the time of the rows.
+APART = 16
 MOST = 2**27  # numbers that the rows of all steps take
 AT_ONCE = 2**22  # numbers of rows that are worked on at once
 
 
 @final
 @dataclass(frozen=True, eq=False)
+class Powers:
+    """How large the powers of a matrix are, which is often far less than the power of its ``size``: ``norms (p,)`` of
+    the first of them, after division by that power. The norm is the largest sum of absolute values in a row."""
+
+    size: float
+    norms: Array
+
+    @staticmethod
+    def of(matrix: arb_mat, clock: Clock) -> Powers:
+        """Those of a matrix of balls."""
+        from flint import arb
+
+        size = max((float(sum((abs(x) for x in row), arb(0)).upper()) for row in matrix.tolist()), default=0.0)
+        if not size < 2.0**1000:
+            raise Unchecked("the system is too fast for its horizon to be followed")
+        size = 2.0 ** ceil(log2(max(size * OUTWARD, 2.0**-1000)))  # a power of two divides exactly
+        small, found = matrix * (1 / arb(size)), list[float]()
+        power = small
+        for order in range(ORDER):
+            clock.check()
+            power = power * small if order else small
+            entries = Enclosed.of(power)
+            found.append(min(1.0, float((np.abs(entries.mid) + entries.rad).sum(axis=1).max()) * OUTWARD))
+        return Powers(size, np.array(found))
+
+    def left(self, step: float, order: int) -> float:
+        """A bound of what the exponential series of the matrix times a ``step`` adds after the terms up to an
+        ``order``, which is one of the norms."""
+        short, norms = self.size * step, [1.0, *self.norms.tolist()]
+        while len(norms) <= SERIES:  # of a product the norm is at most the product of the norms
+            norms.append(min(a * b for a, b in zip(norms[1 : ORDER + 1], norms[: -ORDER - 1 : -1], strict=True)))
+        sizes = [1.0]
+        for j in range(1, SERIES + 2):
+            sizes.append(sizes[-1] * short / j)
+        total = sum(a * b for a, b in zip(norms[order + 1 :], sizes[order + 1 : -1], strict=True))
+        return float((total + sizes[-1] * exp(short)) * OUTWARD + TINY)
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Motion:
     """What all rows of a system ``x' = A x + F u`` share: steps of a length, in which a row moves little in the states'
-    own ``units``; ``growth`` bounds how fast. The length is a power of two, so that places within a step are exact."""
+    own ``units``; ``powers`` bound how fast. The length is a power of two, so that places within a step are exact."""
 
     A: arb_mat
     F: arb_mat
     units: Array
-    growth: float
+    powers: Powers
     step: float
     count: int
     clock: Clock
@@ -53,16 +99,15 @@ class Motion:
     @staticmethod
     def of(A: arb_mat, F: arb_mat, horizon: float, clock: Clock) -> Motion:
         """That of rows with inputs through ``F (d, q)`` up to the ``horizon``."""
-        from flint import arb
-
         own = OwnUnits.of(A, horizon, np.abs(middles(F)).sum(axis=1))
-        inside = own.rows(own.states(own.matrix)).tolist()
-        growth = max(float(sum((abs(x) for x in row), arb(0)).upper()) for row in inside) * OUTWARD
-        step = 2.0 ** floor(log2(min(horizon / 64.0, SHORT / max(growth, 1e-300))))
+        powers = Powers.of(own.rows(own.states(own.matrix)), clock)
+        step = 2.0 ** floor(log2(min(horizon / 64.0, LONGEST / max(powers.size, 1e-300))))
+        while powers.left(step, ORDER) > REST:
+            step /= 2.0
         count = ceil(horizon / step)
         if not (count <= MOST_STEPS and count * A.nrows() <= MOST):
             raise Unchecked("the system is too fast for its horizon to be followed")
-        return Motion(A, F, own.units, growth, step, count, clock)
+        return Motion(A, F, own.units, powers, step, count, clock)
 
     @cached_property
     def _powers(self) -> list[arb_mat]:
@@ -77,6 +122,18 @@ class Motion:
             self.clock.check()
             self._powers.append(self._powers[-1] * self._powers[-1])
         return self._powers[place]
+
+    @cached_property
+    def between(self) -> list[Enclosed]:
+        """The transitions over 1, 2, ... steps, fewer than `APART`, ``(1, d, d)`` each."""
+        found: list[arb_mat] = []
+        shape = (1, self.A.nrows(), self.A.nrows())
+        for j in range(1, APART):
+            self.clock.check()
+            place = floor(log2(j))
+            power = self.over(place)
+            found.append(power if j == 2**place else found[j - 2**place - 1] * power)
+        return [Enclosed.all([one], shape) for one in found]
 
     def _expanded(self, first: arb_mat) -> Enclosed:
         """The terms ``(p + 1, d, n)`` of ``e^{A r}`` times a matrix ``(d, n)``, in the share of a step that ``r``
@@ -125,24 +182,31 @@ class Adjoint:
 
     motion: Motion
     nodes: Enclosed
+    opposite: Adjoint | None = None  # that of ``-c``, which is as large everywhere
 
     @staticmethod
     def of(motion: Motion, c: Array) -> Adjoint:
         """That of the row ``c (d,)``, an exact one."""
         from flint import arb
 
-        found, place = [[arb(float(v)) for v in c]], 0
+        found, place, count = [[arb(float(v)) for v in c]], floor(log2(APART)), motion.count // APART + 1
         while len(found) < BLOCK:
             found += (stacked(found) * motion.over(place)).tolist()
             place += 1
         blocks = [stacked(found)]
-        while len(blocks) * BLOCK <= motion.count:
+        while len(blocks) * BLOCK < count:
             motion.clock.check()
             power, place = motion.over(place), place + 1
-            blocks += [block * power for block in blocks[: -(-(motion.count + 1) // BLOCK) - len(blocks)]]
+            blocks += [block * power for block in blocks[: -(-count // BLOCK) - len(blocks)]]
         parts = [Enclosed.of(block) for block in blocks]
-        every = zip(*((part.mid, part.rad) for part in parts), strict=True)
-        return Adjoint(motion, Enclosed(*(np.concatenate(one)[: motion.count + 1] for one in every)))
+        mid, rad = (np.concatenate(one)[:count] for one in zip(*((p.mid, p.rad) for p in parts), strict=True))
+        nodes = [np.empty((count, APART, c.size)) for _ in range(2)]
+        nodes[0][:, 0], nodes[1][:, 0] = mid, rad
+        for j in range(1, APART):
+            motion.clock.check()
+            for node, product in zip(nodes, _product(Enclosed(mid, rad), motion.between[j - 1]), strict=True):
+                node[:, j] = product[:, 0]
+        return Adjoint(motion, Enclosed(*(node.reshape(-1, c.size)[: motion.count + 1] for node in nodes)))
 
     @property
     def step(self) -> float:
@@ -151,7 +215,7 @@ class Adjoint:
 
     def reversed(self) -> Adjoint:
         """That of ``-c``."""
-        return replace(self, nodes=Enclosed(-self.nodes.mid, self.nodes.rad))
+        return replace(self, nodes=Enclosed(-self.nodes.mid, self.nodes.rad), opposite=self)
 
     @property
     def count(self) -> int:
@@ -166,8 +230,7 @@ class Adjoint:
     @cached_property
     def left(self) -> Array:
         """What is left of the expansion of ``l``, in the same sums, ``(N,)``."""
-        short = self.motion.growth * self.step
-        return np.asarray(self.sizes[:-1] * (short ** (ORDER + 1) / factorial(ORDER + 1) * exp(short)) * OUTWARD)
+        return np.asarray(self.sizes[:-1] * self.motion.powers.left(self.step, ORDER) * OUTWARD)
 
     @cached_property
     def pushes(self) -> Array:
@@ -214,18 +277,17 @@ class Adjoint:
         mid, rad = np.empty((times.size, self.motion.units.size)), np.empty((times.size, self.motion.units.size))
         whole = shares == 0.0
         mid[whole], rad[whole] = self.nodes.mid[steps[whole]], self.nodes.rad[steps[whole]]
-        used, which = np.unique(steps[~whole], return_inverse=True)
         others = np.flatnonzero(~whole)
+        others = others[np.argsort(steps[others], kind="stable")]
         several = max(1, AT_ONCE // self.motion.rows.mid[:, 0].size)
-        for start in range(0, used.size, several):
-            part = used[start : start + several]
-            terms, off = _product(Enclosed(self.nodes.mid[part], self.nodes.rad[part]), self.motion.rows)
-            mine = (which >= start) & (which < start + several)
-            here, place = others[mine], which[mine] - start
+        for start in range(0, others.size, several):
+            here = others[start : start + several]
+            used, which = np.unique(steps[here], return_inverse=True)
+            terms, off = _product(Enclosed(self.nodes.mid[used], self.nodes.rad[used]), self.motion.rows)
             powers = shares[here][:, None] ** np.arange(ORDER + 1)
-            chosen = terms[place]
+            chosen = terms[which]
             mid[here] = np.einsum("kjd,kj->kd", chosen, powers)
-            lost = np.einsum("kjd,kj->kd", off[place] + rounding(3 * ORDER) * np.abs(chosen), powers)
+            lost = np.einsum("kjd,kj->kd", off[which] + rounding(3 * ORDER) * np.abs(chosen), powers)
             rad[here] = (lost + self.left[steps[here]][:, None] / self.motion.units) * OUTWARD
         return Enclosed(mid, rad)
 
@@ -259,16 +321,19 @@ class Adjoint:
     @cached_property
     def bends(self) -> tuple[Array, Array, Array]:
         """On every step bounds of ``|l''|``, ``(N, d)``, of ``|l'AF|`` and of ``|l'A^2 F|``, ``(N, q)``."""
+        if self.opposite is not None:
+            return self.opposite.bends
         motion = self.motion
         d, q, first = motion.A.nrows(), motion.F.ncols(), motion.bending[0]
-        short = motion.growth * self.step
-        rest = short ** (BENDING + 1) / factorial(BENDING + 1) * exp(short)
+        rest = motion.powers.left(self.step, BENDING)
         heights = ((np.abs(first.mid[0]) + first.rad[0]) / motion.units[:, None]).max(axis=0)
         found = self.sizes[:-1, None] * rest * heights
-        nodes = Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1])
-        for term in motion.bending:
-            mid, rad = _product(nodes, term)
-            found += np.abs(mid[:, 0]) + rad[:, 0]
+        several = max(1, AT_ONCE // (d + 2 * q))
+        for start in range(0, self.count, several):
+            steps = slice(start, min(start + several, self.count))
+            for term in motion.bending:
+                mid, rad = _product(Enclosed(self.nodes.mid[steps], self.nodes.rad[steps]), term)
+                found[steps] += np.abs(mid[:, 0]) + rad[:, 0]
         found *= OUTWARD
         return found[:, :d], found[:, d : d + q], found[:, d + q :]
 
@@ -468,7 +533,9 @@ class Worst:
         """Upper bounds ``(k,)`` on ``[start, stop]``, each between two `cuts`; ``beside (2, k)``: what is added at both
         ends, linear in between."""
         ends, which = np.unique(np.concatenate([start, stop]), return_inverse=True)
-        tops = self.most(ends)[0][which]
+        several = max(1, AT_ONCE // self.adjoint.motion.units.size)  # numbers of every state at every end are many
+        parts = [self.most(ends[k : k + several])[0] for k in range(0, ends.size, several)]
+        tops = np.concatenate(parts)[which]
         left, right = (np.clip((t / self.adjoint.step).astype(int), 0, self.adjoint.count - 1) for t in (start, stop))
         bent = np.maximum(self._bent[left], self._bent[right])
         width = (stop - start) * OUTWARD

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, ctx
+from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.claims import cells, claims, constraints, multipliers, replay, units
@@ -17,6 +17,7 @@ from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Duality, Row
 from sparserob_core.checker.outcome import Broken
+from sparserob_core.checker.reach.flow import held
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Box
 from tests.support.worst_cases import (
@@ -163,6 +164,31 @@ def test_a_wall_is_no_nearer_where_rows_are_followed(which: str, monkeypatch: py
         else:
             with pytest.raises(Broken, match="exceeded"):
                 constraints.bounded(case, case.windows[0])
+
+
+@pytest.mark.parametrize("which", ["fixed", "moving", "mixed"])
+def test_a_violation_along_rows_is_the_one_of_the_tube(which: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = replace(kind("known"), begun=Box([-0.1, -0.05], [0.15, 0.1]))
+    wall, _, heights = walls("known", which, made)
+    case = made.case(path=[wall(heights.max(axis=0))])
+    for time in (0.5, 1.3):
+        said = {"constraint": case.windows[0].name, "time": time, "violation": 0.0}
+        for begun in (None, np.array(START) + np.array([0.1, -0.05])):
+            found = list[list[float]]()
+            for followed in (100, 1):
+                monkeypatch.setattr(constraints, "FOLLOWED", followed)
+                over, slack = replay.exceeded(case, said, begun)
+                found.append(over)
+                assert slack < 1e-7
+            assert found[1] == pytest.approx(found[0], abs=1e-12)
+
+
+@pytest.mark.parametrize("time", [0.0, 1e-3, 0.7, 30.0])
+def test_a_transition_in_floats_is_that_in_balls(time: float) -> None:
+    A, inputs = np.diag([-0.5, -3.0, 0.1]) + np.diag([4.0, -7.0], 1), np.array([[0.0], [1.0], [0.5]])
+    exact = [units._floats(part) for part in held(arb_mat(A.tolist()), arb_mat(inputs.tolist()), arb(time))]
+    for mine, its in zip(units._held(A, inputs, time), exact, strict=True):
+        assert mine == pytest.approx(its, rel=1e-12, abs=1e-12 * max(1.0, np.abs(its).max()))
 
 
 def test_a_quadratic_cost_of_a_system_in_time_is_an_integral_by_hand() -> None:

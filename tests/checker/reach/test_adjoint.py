@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from math import factorial
 from types import SimpleNamespace
 from typing import cast
 
@@ -14,7 +15,7 @@ from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.outcome import Clock, Unchecked
 from sparserob_core.checker.reach import adjoint as module
-from sparserob_core.checker.reach.adjoint import Adjoint, Motion, Worst
+from sparserob_core.checker.reach.adjoint import Adjoint, Motion, Powers, Worst
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Box, Polytope
 
@@ -110,6 +111,24 @@ def test_the_measurable_worst_is_that_of_ever_shorter_pieces() -> None:
 def test_a_system_that_is_too_fast_is_not_followed() -> None:
     with pytest.raises(Unchecked):
         Motion.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), 1.0, Clock())
+
+
+def test_what_is_left_of_an_exponential_series_is_bounded_closely_however_large_the_matrix_is() -> None:
+    """``[[-1, 40], [0, -2]]`` has powers that are far smaller than those of its norm."""
+    matrix = [[-1.0, 40.0], [0.0, -2.0]]
+    powers = Powers.of(arb_mat(matrix), Clock())
+    for step, order in ((0.01, 13), (0.1, 13), (0.25, 7), (0.01, 7)):
+        with ctx.workprec(400):
+            term, whole = arb_mat([[1, 0], [0, 1]]), (arb_mat(matrix) * arb(step)).exp()
+            for j in range(order + 1):
+                whole, term = whole - term, term * arb_mat(matrix) * (arb(step) / (j + 1))
+            exact = max(float(sum((abs(x) for x in row), arb(0)).mid()) for row in whole.tolist())
+        found = powers.left(step, order)
+        assert exact <= found <= 40.0 * exact
+        short = 41.0 * step
+        assert found < 0.1 * short ** (order + 1) / factorial(order + 1)
+    none = Powers.of(arb_mat([[0.0]]), Clock())
+    assert none.left(1.0, 13) < 1e-200
 
 
 def test_what_is_left_of_an_expansion_is_in_what_inputs_add() -> None:
@@ -271,4 +290,4 @@ def test_what_is_left_of_the_expansion_of_a_bend_is_in_its_bound(rate: float, mo
     rows, once, twice = (part[:, 0] for part in known.bends)
     for bound, power in ((rows, 2), (once, 1), (twice, 2)):
         assert (rate**power * ends <= bound).all()
-        assert (bound <= rate**power * ends * (1.0 + known.motion.growth * known.step)).all()
+        assert (bound <= rate**power * ends * (1.0 + 1e-9)).all()
