@@ -130,6 +130,21 @@ def test_rounding_is_at_rest_and_what_still_falls_is_not():
     assert not _at_rest([1.0] * 11 + [1e-6] * 8)
 
 
+def test_a_proof_ends_where_what_is_left_at_the_ends_of_a_cell_is_rounding() -> None:
+    """A peak of 0 at 0.5, of which 2e-9 are not known however short a cell is."""
+
+    def enclosure(x, lower, upper):
+        near = np.minimum(np.abs(lower[:, 0] - 0.5), np.abs(upper[:, 0] - 0.5))
+        bend = (upper - lower)[:, 0] ** 2
+        return Enclosure(bend - near**2 / 4.0 + rounded, np.zeros(near.size, dtype=int), bend)
+
+    for rounded, verdict, most in ((2e-9, "undecided", 200), (1e-10, "proven", 4000), (-1e-12, "proven", 4000)):
+        made = replace(family(lambda a, b: a), enclosure=enclosure, worst=None, index_set=sr.Box([0.0], [1.0]))
+        made = replace(made, rows=lambda t: (np.zeros((len(t), 1, 1)), (t - 0.5) ** 2 / 4.0))
+        found = prove_family(made, np.zeros(1))
+        assert found.verdict == verdict and found.cells <= most, (rounded, found)
+
+
 def test_halves_cover_their_cell_and_cells_without_a_middle_have_none():
     lower, upper = np.array([[0.0, 0.0], [1.0, 5.0]]), np.array([[2.0, 1.0], [3.0, 9.0]])
     low, high = _halved(lower, upper, np.array([0, 1]))
