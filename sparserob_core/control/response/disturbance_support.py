@@ -80,8 +80,8 @@ class DisturbanceSupport:
         bent, once, twice, norms, squared = self._bending
         sizes = self._gathered(start, self._reaches, bent, plain=True, kept="bent").sum(axis=2)
         pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
-        moved = comparison.over(start - grid.breakpoints[pieces]).flow
-        reach = comparison.over(widths)
+        moved = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
+        reach = comparison.over(widths, cells=True)
         young = moved.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
         old = moved.on(self._gains[pieces])
         square = (widths**2 / 8)[:, None]

@@ -101,8 +101,8 @@ class InitialSupport:
         lifted, grid = self.lifted, self.lifted.grid
         comparison, starts = lifted.comparison, lifted.starts
         pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
-        moved = comparison.over(start - grid.breakpoints[pieces]).flow
-        old, reach = moved.on(self._gains[pieces]), comparison.over(widths)
+        moved = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
+        old, reach = moved.on(self._gains[pieces]), comparison.over(widths, cells=True)
         bent = self._lifted_rows(start) @ lifted.row_matrix @ lifted.row_matrix
         sizes = self._reaches(self._parts(bent)).sum(axis=2)
         square = (widths**2 / 8)[:, None]
