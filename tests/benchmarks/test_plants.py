@@ -25,8 +25,13 @@ LARGEST: dict[str, tuple[float, float]] = {  # seconds of the processor and MB, 
     "pde": (6.0, 300.0),
     "heat": (20.0, 600.0),
     "iss": (40.0, 1500.0),
+    "beam": (40.0, 1500.0),
 }
-CHECKED: dict[str, tuple[float, float]] = {"building": (8.0, 400.0), "iss": (120.0, 1500.0)}
+CHECKED: dict[str, tuple[float, float]] = {
+    "building": (8.0, 400.0),
+    "iss": (120.0, 1500.0),
+    "beam": (120.0, 1500.0),
+}
 PUSHED = np.array([[0.8, 0.9], [1.0, 1.0]])  # ISSF01's inputs u2 and u3, any functions of time
 
 pytestmark = [
@@ -51,14 +56,18 @@ def stated(plant: str) -> dict[str, Any]:
             "start": 0.0,
         }
     d, B = known["A"].shape[0], known["B"][:, 0]
-    horizon, start, wall = {"building": (20.0, 1.0, 1.5e-3), "heat": (20.0, 2.0, 0.02488), "pde": (0.05, 0.01, 0.2)}[
-        plant
-    ]
+    horizon, start, wall = {
+        "building": (20.0, 1.0, 1.5e-3),
+        "heat": (20.0, 2.0, 0.02488),
+        "pde": (0.05, 0.01, 0.2),
+        "beam": (20.0, 2.0, 26.07),
+    }[plant]
     if plant == "building":  # BLDF01's initial states, and all others a little off
         centre, radius, output = np.zeros(d), np.full(d, 1e-5), np.eye(d)[24]
         centre[:10], radius[:10], radius[24] = 2.25e-4, 2.5e-5, 1e-4
     else:  # about where a constant input leads to
-        centre, output = -0.4 * np.linalg.solve(known["A"], B), known["C"][0]
+        share = 0.1 if plant == "beam" else 0.4
+        centre, output = -share * np.linalg.solve(known["A"], B), known["C"][0]
         centre = np.round(centre, 3) + 0.005 if plant == "heat" else centre
         radius = np.full(d, 1e-3 * np.abs(centre).max()) if plant == "heat" else 1e-3 * np.abs(centre)
     return {
