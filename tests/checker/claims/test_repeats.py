@@ -11,7 +11,7 @@ import pytest
 from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.claims import claims
+from sparserob_core.checker.claims import claims, multipliers
 from sparserob_core.checker.claims.answers import Named, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.claims import ASIDE
@@ -104,3 +104,28 @@ def test_the_next_periods_deviation_is_one_of_the_initial_states() -> None:
             answers.following(now, {"following": wrong}, "return")
     alone = answers_of(replace(case_of(), policy=sr.AffinePolicy()))
     assert alone.following(Named(alone.case, alone.loop_at_rest, []), {}, "return").z == []
+
+
+def test_a_step_across_the_seam_is_the_first_control_of_the_next_period_less_the_last_one() -> None:
+    """``u_0 + M e`` of the next deviation, less ``u_1``; an open loop sees no deviations."""
+    gains = np.zeros((2, 2, 1, 1))
+    gains[0, 0] = -0.5
+    given = {**begun(0.25), "control_step": Box([-0.4], [0.7])}
+    case = replace(case_of({"gains": gains.tolist()}, **given), policy=sr.AffinePolicy())
+    said = {"constraint": "control_step", "time": 2.0, "direction": [1.0], "parameter": [], "multiplier": 2.0}
+    entry = {**said, "deviation": [0.1], "following": [-0.2]}
+    last, first = multipliers.rows_of(case, entry)
+    assert (last[0], first[0]) == (2.0, 2.0)
+    for (_, row), piece, sign in ((last, 1, -1.0), (first, 0, 1.0)):
+        slopes = [[float(x.mid()) for x in one] for one in row.slope]
+        assert slopes == [[sign if k == piece else 0.0] for k in (0, 1)]
+    assert float(last[1].constant.mid()) == pytest.approx(-0.7) and float(first[1].constant.mid()) == 0.0
+    inside = multipliers.rows_of(case, {**entry, "time": 1.0})
+    ((_, row),) = inside
+    assert [[float(x.mid()) for x in one] for one in row.slope] == [[-1.0], [1.0]]
+    alone = case_of(control_step=Box([-0.4], [0.7]))
+    ((_, row),) = multipliers.rows_of(alone, said)
+    assert [[float(x.mid()) for x in one] for one in row.slope] == [[1.0], [-1.0]]
+    for wrong in ({**entry, "time": 0.5}, {**entry, "following": [0.3]}):
+        with pytest.raises(Broken):
+            multipliers.rows_of(case, wrong)
