@@ -183,3 +183,28 @@ def test_what_counts_alike_is_rounded_up_to_whole_pieces_and_what_does_not_is_a_
     for share in (-0.5, 0.0, 0.3, 0.9):
         found = activity._whole(apart, arb(share * most))
         assert max(0.0, share) - 1e-12 <= found <= max(0.0, share)
+
+
+def test_the_share_of_time_that_a_control_acts_is_what_the_leaves_prove_and_no_more_than_one_does() -> None:
+    down = {"terminal": [Box([-9.0], [-0.5])]}
+
+    def fewest(status: str = "verified", last: float = -0.75, **said: Any) -> str:
+        told = {"lower": 1.0, "upper": 1.0, **said}
+        more = {"fewest_active": told, "decision": [[-0.75, last]], "status": status, "multipliers": None}
+        return claims._fewest(case_of(Box([-1.0], [1.0]), written([SPLIT, NOT_ONE, BOTH], **more), **down), status)
+
+    assert fewest() == "every admissible control acts at least 100.0% of the time"
+    assert "at least 50.0%" in fewest(lower=0.5)
+    assert "at least 100.0%" in fewest("refuted", upper=None)
+    wrongs: list[tuple[dict[str, Any], str]] = [
+        ({"lower": 1.0 + 1e-6}, "lower is 1.000001, the leaves prove 1.0"),
+        ({"lower": -0.1}, "lower is -0.1"),
+        ({"upper": None}, "upper is None where the status is verified"),
+        ({"upper": 0.5}, "upper is 0.5, the control acts for a share of 1.0"),
+        ({"last": 0.0, "upper": 0.5}, "lower is 1.0"),  # that one acts less than is proven
+    ]
+    for wrong, sentence in wrongs:
+        with pytest.raises(Broken, match=sentence):
+            fewest(**wrong)
+    with pytest.raises(Broken, match=r"upper is 1\.0 where the status is refuted"):
+        fewest("refuted")
