@@ -3,8 +3,8 @@
 A kind of mutant is a rule from a node of the syntax tree to pieces of text that replace it. Beside what every mutation
 tool does (comparisons, signs, extrema, constants, connectives) there are the kinds that unsound enclosures are made of:
 an outward rounding that is left out, a part of a remainder that is halved, a maximum over fewer corners, a tolerance
-that is ten times larger, a refusal that is passed over. What no test can be asked to notice has no site: annotations,
-decorators, assertions, sentences of errors, indices of axes.
+that is ten times larger, a refusal that is passed over, an absolute value that is none. What no test can be asked to
+notice has no site: annotations, decorators, assertions, sentences of errors, indices of axes.
 """
 
 from __future__ import annotations
@@ -190,6 +190,13 @@ def _refusal(source: Source, node: ast.AST) -> Changes:
         yield source.span(node), "pass"
 
 
+def _modulus(source: Source, node: ast.AST) -> Changes:
+    if isinstance(node, ast.Call) and len(node.args) == 1 and not node.keywords:
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        if name in ("abs", "absolute"):
+            yield source.span(node), f"({source.text(source.span(node.args[0]))})"
+
+
 KINDS: dict[str, Callable[[Source, ast.AST], Changes]] = {
     "comparison flipped": _comparison,
     "plus for minus": _sign,
@@ -201,6 +208,7 @@ KINDS: dict[str, Callable[[Source, ast.AST], Changes]] = {
     "tolerance loosened": _tolerance,
     "connective changed": _connective,
     "refusal passed over": _refusal,
+    "absolute value removed": _modulus,
 }
 
 

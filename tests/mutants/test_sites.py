@@ -16,7 +16,7 @@ def bound(x: Shape[2], lost, tolerance):
         raise Broken(f"{x:.3g} is larger than {1 + 1}")
     h = max(x.max(axis=1), (lost
                             + 0.5 * OUTWARD))
-    return h ** 2 / 8 if all(c > tolerance for c in product((-1, 1), repeat=2)) else x[1]
+    return abs(h) / 8 if all(c > tolerance for c in product((-1, 1), repeat=2)) else x[1]
 '''
 
 
@@ -36,8 +36,9 @@ def test_every_kind_makes_its_own_change_and_what_it_makes_can_be_parsed():
         ("refusal passed over", "pass", "        pass"),
         ("plus for minus", "-", "                            - 0.5 * OUTWARD))"),
         ("outward rounding removed", "1.0", "                            + 0.5 * 1.0))"),
-        ("remainder halved", "(8 * 2)", "    return h ** 2 / (8 * 2) if all("),
+        ("remainder halved", "(8 * 2)", "    return abs(h) / (8 * 2) if all("),
         ("remainder halved", "(lost / 2)", "    h = max(x.max(axis=1), ((lost / 2)"),
+        ("absolute value removed", "(h)", "    return (h) / 8 if all("),
         ("constant halved", "2", "LIMIT: int = 2  # twice é"),
         ("fewer corners", "x.take(0, axis=1)", "    h = max(x.take(0, axis=1), (lost"),
         ("tolerance loosened", "(10 * tolerance)", "if all(c > (10 * tolerance) for c"),
