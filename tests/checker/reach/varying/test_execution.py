@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("flint")
-from flint import arb, ctx
+from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
 import sparserob_core.checker.reach.varying.flow as varying
@@ -182,3 +182,16 @@ def test_what_enters_by_the_last_columns_bends_as_it_does() -> None:
             assert above <= said * (1 + 1e-9) + 1e-13
             ratios.append(above / max(said, 1e-12))
     assert max(ratios) > 0.1
+
+
+def test_sizes_are_those_of_absolute_values_and_what_shares_are_off_by_counts_for_either_sign() -> None:
+    law = VaryingFlow(VaryingSystem.of([["0*t"]], [["1", "1"]], 2.0), 2.0)
+    pieces = [arb_mat([[arb(-1.5, 1e-3)], [arb(0.5, 1e-3)]]), arb_mat([[arb(2.0, 1e-3)], [arb(-4.0, 1e-3)]])]
+    shares, off = np.array([0.1, 0.25]), np.array([1e-4, 1e-5])
+    found = VaryingExecution(law, shares, np.array([0.0, 1.0, 2.0]), pieces, off=off).sizes
+    values = np.array([[1.5, 0.5], [2.0, 4.0]])
+    assert found.mid == pytest.approx(shares * values, rel=1e-14)
+    exact = shares * 1e-3 + off * (values + 1e-3)
+    assert (exact <= found.rad).all() and found.rad == pytest.approx(exact, rel=1e-8)
+    plain = VaryingExecution(law, shares, np.array([0.0, 1.0, 2.0]), pieces).sizes
+    assert plain.rad == pytest.approx(np.broadcast_to(shares * 1e-3, (2, 2)), rel=1e-8)
