@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cache
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import clarabel
@@ -175,6 +175,29 @@ def _even(matrix: np.ndarray) -> list[list[float]]:
 
 
 @dataclass(frozen=True)
+class Source:
+    """A further disturbance ``E w``, ``w`` in a set, constant between every two of some ``edges`` of the control, which
+    are told by their numbers; ``units``: how many of the user's one of each entry is."""
+
+    E: np.ndarray
+    shape: Flat
+    edges: np.ndarray
+    units: np.ndarray
+
+
+@dataclass(frozen=True)
+class Totals:
+    """``lower <= int H x + G u dt <= upper`` from one edge to another, which are told by their numbers."""
+
+    H: np.ndarray
+    G: np.ndarray
+    first: int
+    last: int
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+@dataclass(frozen=True)
 class Instance:
     """``x' = (A + sum_k p_k slopes_k) x + B u + E w`` with ``|p_k| <= 1``, all sets about 0, the control and the
     disturbance constant between ``edges``; ``x(0)`` anywhere in ``initial_state`` plus ``initial_set``.
@@ -183,7 +206,10 @@ class Instance:
     of that number on, ``second`` gives other ``A``, ``B`` and drift.
 
     ``reference (q, 1 + d)``: where the set of the path is about, with kinks at edges. ``mixed``: ``H x + G u <= h`` in
-    a window from and to the middle of a piece. ``step``: the set of every ``u_{k+1} - u_k``, and of ``u_0`` itself."""
+    a window from and to the middle of a piece. ``step``: the set of every ``u_{k+1} - u_k``, and of ``u_0`` itself.
+
+    ``prices (m, K)``: the weights on every piece, where they change. ``waves``: ``A`` is ``A + W sin(r t)``.
+    ``repeat``: it begins again at the horizon: final states are initial ones, and ``u_0`` follows the last control."""
 
     A: np.ndarray
     B: np.ndarray
@@ -207,6 +233,11 @@ class Instance:
     reference: np.ndarray | None = None
     mixed: tuple[np.ndarray, np.ndarray, np.ndarray, float, float] | None = None
     step: Shape | None = None
+    prices: np.ndarray | None = None
+    sources: tuple[Source, ...] = ()
+    totals: Totals | None = None
+    waves: tuple[np.ndarray, float] | None = None
+    repeat: bool = False
 
     def mode(self, piece: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """``A``, ``B`` and the drift on a piece."""
@@ -218,7 +249,8 @@ class Instance:
     def price(self) -> np.ndarray:
         """The price ``(m K,)`` of ``|u|`` on every piece."""
         factor = 1.0 if self.charge is None else self.charge.l1
-        return factor * np.outer(self.weights, np.diff(self.edges)).ravel()
+        weights = self.weights[:, None] if self.prices is None else self.prices
+        return factor * (weights * np.diff(self.edges)).ravel()
 
     @property
     def largest(self) -> float:
@@ -245,7 +277,8 @@ class Instance:
 class Sampled:
     """At the fine times ``(J,)``, for one parameter: the state without control ``(J, d)``, its response to the pieces
     ``(J, d, m K)`` and to the disturbance ``(J, d, q, K)``, what becomes of an initial state ``(J, d, d)``, and how far
-    a state may leave its chords ``(d,)``."""
+    a state may leave its chords ``(d,)``. ``more``: the noise of every source. ``totals``: the integrals at the end, as
+    free motion, response, noise, noise of every source and flow."""
 
     times: np.ndarray
     free: np.ndarray
@@ -253,24 +286,36 @@ class Sampled:
     noise: np.ndarray
     flow: np.ndarray
     sag: np.ndarray
+    more: tuple[np.ndarray, ...] = ()
+    totals: tuple[np.ndarray, ...] = ()
+
+
+MAGNUS = 4  # parts of a step of the fine grid, where `A` changes with time
 
 
 def sample(problem: Instance, per_piece: int, parameter: np.ndarray) -> Sampled:
     """Step through the fine grid with the exact discretisation of one step."""
     varied = sum((p * slope for p, slope in zip(parameter, problem.slopes, strict=True)), np.zeros_like(problem.A))
-    (d, m), q, K = problem.B.shape, problem.E.shape[1], len(problem.edges) - 1
+    (d, m), K = problem.B.shape, len(problem.edges) - 1
+    every = np.hstack([problem.E, *(source.E for source in problem.sources)])
+    q, r = every.shape[1], 0 if problem.totals is None else len(problem.totals.H)
+    D = d + r  # integrals are further states
     steps = np.repeat(np.diff(problem.edges) / per_piece, per_piece)
     count = K * per_piece + 1
-    free, response, noise = np.zeros((count, d)), np.zeros((count, d, m, K)), np.zeros((count, d, q, K))
-    free[0], flow = problem.initial_state, np.broadcast_to(np.eye(d), (count, d, d)).copy()
+    free, response, noise = np.zeros((count, D)), np.zeros((count, D, m, K)), np.zeros((count, D, q, K))
+    free[0, :d], flow = problem.initial_state, np.broadcast_to(np.eye(D), (count, D, D)).copy()
+    size, now = D + m + q + 1, 0.0
     for j in range(count - 1):
         piece = j // per_piece
-        if j % per_piece == 0:
+        if j % per_piece == 0 or problem.waves is not None:
             A, B, c = problem.mode(piece)
-            size = d + m + q + 1
-            block = np.hstack([A + varied, B, problem.E, c[:, None]])
-            big = expm(steps[j] * np.vstack([block, np.zeros((size - d, size))]))
-            Ad, Bd, Ed, cd = big[:d, :d], big[:d, d : d + m], big[:d, d + m : -1], big[:d, -1]
+            block = np.zeros((size, size))
+            block[:d] = np.hstack([A + varied, np.zeros((d, r)), B, every, c[:, None]])
+            if problem.totals is not None and problem.totals.first <= piece < problem.totals.last:
+                block[d:D, :d] = problem.totals.H
+            big = expm(steps[j] * block) if problem.waves is None else _waved(block, problem.waves, now, steps[j])
+            Ad, Bd, Ed, cd = big[:D, :D], big[:D, D : D + m], big[:D, D + m : -1], big[:D, -1]
+        now += steps[j]
         free[j + 1], flow[j + 1] = Ad @ free[j] + cd, Ad @ flow[j]
         response[j + 1] = np.einsum("ij,jmk->imk", Ad, response[j])
         if piece >= problem.late:
@@ -281,10 +326,20 @@ def sample(problem: Instance, per_piece: int, parameter: np.ndarray) -> Sampled:
         noise[j + 1, :, :, j // per_piece] += Ed
     times = np.concatenate([[0.0], np.cumsum(steps)])
     times[per_piece::per_piece] = problem.edges[1:]
-    sampled = Sampled(times, free, response.reshape(count, d, m * K), noise, flow, np.zeros(d))
-    w = np.zeros(q)
+    response = response.reshape(count, D, m * K)
+    ends = np.cumsum([0, problem.E.shape[1], *(source.E.shape[1] for source in problem.sources)])
+    own, *more = (noise[:, :, first:last] for first, last in pairwise(ends))
+    more = [np.add.reduceat(n, source.edges[:-1], axis=3) for n, source in zip(more, problem.sources, strict=True)]
+    last = (free[-1, d:], response[-1, d:], own[-1, d:], *(n[-1, d:] for n in more), flow[-1, d:, :d])
+    free, response, own, flow = free[:, :d], response[:, :d], own[:, :d], flow[:, :d, :d]
+    sampled = Sampled(times, free, response, own, flow, np.zeros(d), tuple(n[:, :d] for n in more), last if r else ())
+    w = np.zeros(problem.E.shape[1])
     if problem.disturbance is not None:
-        w = np.maximum(problem.disturbance.support(np.eye(q)), problem.disturbance.support(-np.eye(q)))
+        eye = np.eye(w.size)
+        w = np.maximum(problem.disturbance.support(eye), problem.disturbance.support(-eye))
+    pushed = np.abs(problem.E) @ w
+    for source in problem.sources:
+        pushed = pushed + np.abs(source.E) @ source.shape.support(np.eye(source.E.shape[1]))
     both = deviations(problem, sampled, np.vstack([np.eye(d), -np.eye(d)]))
     deviation = np.maximum(both[:, :d], both[:, d:])
     farthest = np.abs(free) + np.abs(sampled.response) @ problem.bounds + deviation
@@ -292,9 +347,27 @@ def sample(problem: Instance, per_piece: int, parameter: np.ndarray) -> Sampled:
     largest = largest if problem.before is None else np.maximum(largest, np.abs(problem.before))
     curvature = np.zeros(d)
     for A, B, c in (problem.mode(0), problem.mode(K - 1)):
-        inputs, here = np.abs(B) @ largest + np.abs(problem.E) @ w + np.abs(c), A + varied
-        curvature = np.maximum(curvature, np.abs(here @ here) @ farthest.max(axis=0) + np.abs(here) @ inputs)
+        inputs, here = np.abs(B) @ largest + pushed + np.abs(c), A + varied
+        twice, once, far = np.abs(here @ here), np.abs(here), farthest.max(axis=0)
+        if problem.waves is not None:
+            W, rate = problem.waves
+            once = once + np.abs(W)
+            twice = once @ once + rate * np.abs(W)
+        curvature = np.maximum(curvature, twice @ far + once @ inputs)
     return replace(sampled, sag=curvature * steps.max() ** 2 / 8)
+
+
+def _waved(block: np.ndarray, waves: tuple[np.ndarray, float], now: float, step: float) -> np.ndarray:
+    """What a step does where ``A`` changes with time: Magnus' series of order four on parts of it."""
+    (W, rate), d, done, h = waves, len(waves[0]), np.eye(len(block)), step / MAGNUS
+    for part in range(MAGNUS):
+        middle = now + (part + 0.5) * h
+        early, late = block.copy(), block.copy()
+        for one, sign in ((early, -1.0), (late, 1.0)):
+            one[:d, :d] += W * np.sin(rate * (middle + sign * h / np.sqrt(12.0)))
+        turned = np.sqrt(3.0) / 12.0 * h**2 * (late @ early - early @ late)
+        done = expm(h / 2 * (early + late) + turned) @ done
+    return done
 
 
 def deviations(problem: Instance, sampled: Sampled, normals: np.ndarray) -> np.ndarray:
@@ -302,9 +375,34 @@ def deviations(problem: Instance, sampled: Sampled, normals: np.ndarray) -> np.n
     begun = np.zeros((len(sampled.times), len(normals)))
     if problem.initial_set is not None:
         begun = problem.initial_set.support(np.einsum("rd,jde->jre", normals, sampled.flow))
+    for source, noise in zip(problem.sources, sampled.more, strict=True):
+        begun = begun + source.shape.support(np.einsum("rd,jdqk->jrkq", normals, noise)).sum(axis=-1)
     if problem.disturbance is None:
         return begun
     return begun + problem.disturbance.support(np.einsum("rd,jdqk->jrkq", normals, sampled.noise)).sum(axis=-1)
+
+
+def total_rows(problem: Instance, sampled: Sampled, spare: float) -> list[Rows]:
+    """Rows of the bounds of integrals."""
+    if problem.totals is None:
+        return []
+    totals, K = problem.totals, len(problem.edges) - 1
+    free, response, own, *more, flow = sampled.totals
+    inside = (np.arange(K) >= totals.first) & (np.arange(K) < totals.last)
+    response = response + np.stack([np.kron(row, inside * np.diff(problem.edges)) for row in totals.G])
+    found = []
+    for sign, limit in ((1.0, totals.upper), (-1.0, -totals.lower)):
+        some = np.isfinite(limit)
+        room = limit - spare * np.where(some, np.abs(limit), 0.0) - sign * free
+        pairs: list[tuple[Shape | None, np.ndarray]] = [(problem.disturbance, own)]
+        pairs += [(source.shape, noise) for source, noise in zip(problem.sources, more, strict=True)]
+        for shape, noise in pairs:
+            if shape is not None:
+                room = room - shape.support(sign * np.swapaxes(noise, 1, 2)).sum(axis=-1)
+        if problem.initial_set is not None:
+            room = room - problem.initial_set.support(sign * flow)
+        found.append((sign * response[some], room[some]))
+    return found
 
 
 Rows = tuple[np.ndarray, np.ndarray]
@@ -337,6 +435,10 @@ def path_rows(problem: Instance, sampled: Sampled, tight: bool, spare: float) ->
         path += mixed_rows(problem, sampled, sampled.sag if tight else 0 * sampled.sag, spare)
     last = np.array([len(times) - 1])
     end += [rows(shape, last, 0 * sampled.sag) for shape in problem.terminal]
+    if problem.repeat and problem.initial_set is not None:
+        G, room = rows(problem.initial_set, last, 0 * sampled.sag)
+        end.append((G, room + problem.initial_set.rows()[0] @ problem.initial_state))
+    end += total_rows(problem, sampled, spare)
     return tuple(tuple(np.concatenate(part) for part in zip(*some, strict=True)) for some in (path, end))  # type: ignore[return-value]
 
 
@@ -367,6 +469,7 @@ def control_rows(problem: Instance, tight: bool) -> Rows:
         return rows, limits
     H, h, inside = problem.step.rows()
     steps = np.eye(K) - np.eye(K, k=-1)  # the first is from 0
+    steps[0, -1] -= float(problem.repeat)
     rows = np.vstack([rows, *(np.kron(H, steps[k]) for k in range(K))])
     return rows, np.append(limits, np.tile(h * (inside if tight else 1.0), K))
 
@@ -386,6 +489,7 @@ def quadratic(problem: Instance) -> tuple[np.ndarray, np.ndarray, float]:
     charge = problem.charge
     assert charge is not None
     fastest = max(float(np.linalg.norm(problem.mode(k)[0], 2)) for k in (0, len(problem.edges) - 2))
+    fastest += 0.0 if problem.waves is None else float(np.linalg.norm(problem.waves[0], 2)) + problem.waves[1]
     steps = 4 * max(6, int(np.ceil(5 * fastest * np.diff(problem.edges).max())))
     some = sample(replace(problem, slopes=[]), steps, np.zeros(0))
     free = some.free + np.einsum("aidk,d->ai", some.noise, nominal(problem.disturbance, problem.E.shape[1]))
@@ -575,7 +679,7 @@ def _system(problem: Instance, units: Units, mode: tuple[np.ndarray, np.ndarray,
     X, to, d = units.states[:, None], 1.0 / units.time, len(problem.A)
     A = to * X * mode[0] / units.states
     system: dict[str, Any] = {"A": A.tolist(), "B": (to * X * mode[1] / units.controls).tolist()}
-    if problem.disturbance is not None:
+    if problem.disturbance is not None and not problem.sources:
         system["E"] = (to * X * problem.E / units.disturbances).tolist()
     if mode[2].any():
         system["c"] = (to * units.states * mode[2]).tolist()
@@ -589,13 +693,19 @@ def _system(problem: Instance, units: Units, mode: tuple[np.ndarray, np.ndarray,
             ]
             for i in range(d)
         ]
+    if problem.waves is not None:
+        W, rate = to * X * problem.waves[0] / units.states, to * problem.waves[1]
+        system["A"] = [
+            [f"{float(A[i, j])!r} + ({float(W[i, j])!r})*sin({float(rate)!r}*t)" for j in range(d)] for i in range(d)
+        ]
     return system
 
 
 def control_config(problem: Instance, units: Units) -> dict[str, Any]:
     """What is said of the control beside its set, in the user's units."""
     if problem.step is not None:
-        return {"control_step": problem.step.config(units.controls, None), "initial_control": 0.0}
+        step = {"control_step": problem.step.config(units.controls, None)}
+        return step if problem.repeat else {**step, "initial_control": 0.0}
     return {} if problem.before is None else {"initial_control": (problem.before * units.controls).tolist()}
 
 
@@ -654,8 +764,43 @@ def config(problem: Instance, units: Units) -> dict[str, Any]:
     stated |= control_config(problem, units)
     if problem.disturbance is not None:
         stated["disturbance"] = problem.disturbance.config(units.disturbances, units.rows)
+    stated |= _further(problem, units, stated)
     control = pieces if problem.dictionary == "piecewise_constant" else {**pieces, "name": problem.dictionary}
     return {"problem": stated, "dictionaries": {"control": control, "disturbance": pieces}, "observers": []}
+
+
+def _further(problem: Instance, units: Units, stated: dict[str, Any]) -> dict[str, Any]:
+    """Keys of prices by piece, a list of disturbances, integrals, and a plan that begins again."""
+    found: dict[str, Any] = {"repeat": True} if problem.repeat else {}
+    times, to = problem.edges * units.time, units.states[:, None] / units.time
+    times[-1] = stated["horizon"]
+    if problem.prices is not None:
+        prices = problem.prices.T * units.cost / units.controls
+        found["weights"] = np.column_stack([times[:-1], prices]).tolist()
+    if problem.sources:
+        own = [] if problem.disturbance is None else [(problem.E, problem.disturbance, units.disturbances, None)]
+        own += [(one.E, one.shape, one.units, times[one.edges].tolist()) for one in problem.sources]
+        found["disturbance"] = [
+            {
+                "set": shape.config(scale, units.rows),
+                "E": (to * E / scale).tolist(),
+                **({} if edges is None else {"breakpoints": edges}),
+            }
+            for E, shape, scale, edges in own
+        ]
+    if problem.totals is not None:
+        one, scale = problem.totals, units.time
+        found["integral"] = [
+            {
+                "H": (one.H / units.states / scale).tolist(),
+                "G": (one.G / units.controls / scale).tolist(),
+                "from": float(times[one.first]),
+                "to": float(times[one.last]),
+                "lower": [float(v) if np.isfinite(v) else None for v in one.lower],
+                "upper": [float(v) if np.isfinite(v) else None for v in one.upper],
+            }
+        ]
+    return found
 
 
 def drawn_units(rng: np.random.Generator, problem: Instance) -> Units:
@@ -798,12 +943,71 @@ def together(seed: int) -> tuple[Instance, Units]:
     return problem, units
 
 
+FURTHER = 6 * TOGETHER  # numbers of instances with what `further` draws besides
+
+
+def further(seed: int) -> tuple[Instance, Units]:
+    """What `together` draws, with prices by piece, disturbances on pieces of their own, bounds of integrals, entries in
+    ``t``, and a plan that begins again, each or not."""
+    problem, units = together(seed)
+    rng = np.random.default_rng([seed, 6])
+    (d, m), K, has = problem.B.shape, len(problem.edges) - 1, rng.random(5) < 0.5
+    if has[0] and not (problem.charge is not None and problem.charge.grouped):
+        problem = replace(problem, prices=rng.uniform(0.5, 2, (m, K)) * problem.weights[:, None])
+    if has[1] and problem.ends_at is None:
+        problem = replace(problem, sources=tuple(_source(rng, d, K) for _ in range(int(rng.integers(1, 3)))))
+    if has[2] and not problem.slopes:
+        problem = replace(problem, waves=(0.2 * rng.normal(size=(d, d)), float(rng.uniform(0.5, 4))))
+    if has[3] and problem.ends_at is None and problem.reference is None:
+        problem = _again(rng, problem)
+    if has[4]:
+        problem = replace(problem, totals=_totals(rng, problem))
+    return problem, units
+
+
+def _source(rng: np.random.Generator, d: int, K: int) -> Source:
+    q = int(rng.integers(1, d + 1))
+    edges = np.unique(np.concatenate([[0, K], rng.integers(0, K + 1, 3)]))
+    shape = Flat.box(rng.uniform(0.002, 0.05, q))
+    return Source(rng.normal(size=(d, q)), shape, edges, 10.0 ** rng.uniform(-6, 6, q))
+
+
+def _again(rng: np.random.Generator, problem: Instance) -> Instance:
+    """A plan that begins again, near rest, from a set that a period may bring back."""
+    more, d = rng.uniform(1.0, 4.0), len(problem.A)
+    return replace(
+        problem,
+        repeat=True,
+        initial_state=0.1 * problem.initial_state,
+        initial_set=Flat.box(rng.uniform(0.1, 0.6, d)),
+        late=0,
+        before=None,
+        terminal=[one.scaled(more) for one in problem.terminal],
+        path=[(one.scaled(more), start, stop) for one, start, stop in problem.path],
+    )
+
+
+def _totals(rng: np.random.Generator, problem: Instance) -> Totals:
+    """Bounds about what the integrals of no control are, which half of the controls keep or so."""
+    (d, m), K, r = problem.B.shape, len(problem.edges) - 1, int(rng.integers(1, 3))
+    first, last = np.sort(rng.choice(K + 1, 2, replace=False))
+    H, G, free = rng.normal(size=(r, d)), rng.normal(size=(r, m)) * rng.choice([0.0, 1.0]), np.full(r, np.inf)
+    bare = Totals(H, G, int(first), int(last), -free, free)
+    found = sample(replace(problem, totals=bare), 1, np.zeros(len(problem.slopes)))
+    middle, reach = found.totals[0], np.abs(found.totals[1]) @ problem.bounds
+    wide = rng.uniform(0.1, 0.7) * reach
+    for noise in found.totals[2:-1]:
+        wide = wide + 0.05 * np.abs(noise).sum(axis=(1, 2))
+    wide = wide + 0.6 * np.abs(found.totals[-1]).sum(axis=1) * (problem.initial_set is not None)
+    return replace(bare, lower=middle - np.where(rng.random(r) < 0.5, np.inf, wide), upper=middle + wide)
+
+
 def instance(seed: int) -> tuple[Instance, Units]:
     """Number ``seed``: from `TOGETHER` on what `together` draws. Before, every tenth one on the boundary, feasible or
     infeasible by 1e-6; every third of the others from a set of initial states, every fourth with another cost than the
     L1 norm, and of the others every sixth with what `in_time` draws."""
     if seed >= TOGETHER:
-        return together(seed)
+        return further(seed) if seed >= FURTHER else together(seed)
     rng = np.random.default_rng(seed)
     problem = on_the_boundary(rng, 1e-6 if seed % 20 else -1e-6) if seed % 10 == 0 else None
     problem = problem if problem is not None else drawn(rng)

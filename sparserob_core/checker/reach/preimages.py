@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
 EVENED = 20  # steps in which rows and columns become of one size; the first few do most, twice as many change nothing
 
-TOLD = 2.0**20  # times its radius a row is to be: six digits of it, of which what is inverted may lose some
+# Bits that a row may have lost to what cancels in it. An observer's numbers have 53, so that of what it leaves of what
+# was seen before so many are lost; other rows lose a few. Where those do not suffice, of which six digits are known do.
+OBSERVED, FEWEST = 40, 20
 
 Pattern = npt.NDArray[np.bool_]
 
@@ -121,6 +123,7 @@ class Seen:
         """A matrix that takes what is seen of any deviations to deviations that are seen alike, of all such the least
         beside how far they reach; raises `Unchecked` where balls do not show as many independent rows as there can
         be."""
+        from flint import ctx
         from scipy.linalg import qr
 
         r, c, rank = self.matrix.nrows(), self.matrix.ncols(), self.most
@@ -128,21 +131,21 @@ class Seen:
             _evened(self.matrix) if rank == c or self.reach is None else _reaching(self.matrix, self.reach)
         )
         every = D.tolist()
-        told = [i for i, row in enumerate(every) if _is_told(row)]
-        try:
+        for bits in (ctx.prec - OBSERVED, FEWEST):
+            told = [i for i, row in enumerate(every) if _is_told(row, bits)]
             if len(told) < rank:
-                raise ZeroDivisionError
-            if rank == c:
-                some = stacked([every[i] for i in told])
-                found = _spread((some.transpose() * some).inv() * some.transpose(), told, r)
-            else:
-                order = qr(middles(D)[told].T, mode="r", pivoting=True)[1] if rank < len(told) else range(rank)
-                chosen = [told[i] for i in order][:rank]
-                some = stacked([every[i] for i in chosen])
-                found = _spread(some.transpose() * (some * some.transpose()).inv(), chosen, r)
-        except ZeroDivisionError:
-            raise Unchecked("the checker cannot tell in which directions the disturbance pushes the state") from None
-        return scaled(found, columns, rows)
+                continue
+            chosen = told
+            if rank < min(c, len(told)):
+                chosen = [told[i] for i in qr(middles(D)[told].T, mode="r", pivoting=True)[1][:rank]]
+            some = stacked([every[i] for i in chosen])
+            turned = some.transpose()
+            try:
+                inverse = (turned * some).inv() * turned if rank == c else turned * (some * turned).inv()
+            except ZeroDivisionError:
+                continue
+            return scaled(_spread(inverse, chosen, r), columns, rows)
+        raise Unchecked("the checker cannot tell in which directions the disturbance pushes the state")
 
 
 def _groups(groups: Sequence[tuple[int, int]], count: int) -> list[int]:
@@ -161,10 +164,10 @@ def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
     return stacked(found)
 
 
-def _is_told(row: Sequence[arb]) -> bool:
-    """Whether a row is more than the rounding of what cancels in it, as what an observer leaves of what was seen
-    before: beside rows of one size it would make a matrix that no balls invert."""
-    return max(float(abs(x.mid())) for x in row) > TOLD * max(float(x.rad()) for x in row)
+def _is_told(row: Sequence[arb], bits: int) -> bool:
+    """Whether so many bits of a row are known. Beside rows of one size, one of which little is known would make a
+    matrix that no balls invert, or an inverse of which little is known."""
+    return max(float(abs(x.mid())) for x in row) > 2.0**bits * max(float(x.rad()) for x in row)
 
 
 def _reaching(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
