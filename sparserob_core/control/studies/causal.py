@@ -104,7 +104,13 @@ class Limits:
 
     def begin(self, tree: Tree) -> None:
         """The signals that are at hand do not count."""
-        self._beside, self.ended = len(tree.signals), "settled"
+        self._beside = len(tree.signals)
+
+    def again(self) -> None:
+        """Another tree: signals and work count anew, time that is over is over."""
+        self._beside = 0
+        if self.ended != "seconds":
+            self.ended = "settled"
 
     def room(self, tree: Tree) -> int:
         """How many signals may be added to the tree; before the search begins: as many as there are."""
@@ -166,6 +172,7 @@ class CausalSearch:
     def _planted(self, knowledge: Knowledge, known: list[Array], limits: Limits, highest: float | None) -> Tree:
         problem, feedback = self.model.problem, self.model.feedback
         assert feedback is not None
+        limits.again()
         prices = problem.prices(self.model.control.breakpoints)
         tree = Tree(self.sampled, knowledge, problem.control, prices, feedback.charge.cost, highest)
         tree.seconds = lambda: limits.seconds
