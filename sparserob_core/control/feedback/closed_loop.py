@@ -21,7 +21,7 @@ from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.control.response.varying_motion import VaryingMotion
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.sip.finite import Spread, UncertainRows
+from sparserob_core.sip.finite import Spread, UncertainRows, table_of
 
 if TYPE_CHECKING:
     from sparserob_core.control.response.response import Steps, TimeGrid
@@ -344,8 +344,6 @@ class ClosedLoop:
         """The rows ``H x(t) <= h`` at one time, beside the control on the pieces ``acting (r,)`` where that is given,
         as `UncertainRows`: row ``r`` is ``factor_r`` times the direction of its ``part_r``, the first row with which it
         shares it."""
-        from scipy.sparse import csr_array
-
         count = H.shape[0]
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
         free, weights, on_noise = self.functionals.response.weights(np.full(count, time), H, np.zeros((count, 0)))
@@ -361,10 +359,9 @@ class ClosedLoop:
         for first in firsts:
             data = on_control[first].reshape(m, K)[channel, piece] * value
             kept = data != 0.0
-            place = (entry[kept], self.nominal_size + which[kept])
-            parts.append(csr_array((data[kept], place), shape=(Q, self.variables)))
-        g = np.zeros((count, self.variables))
-        g[:, : self.nominal_size] = on_control
+            parts.append(table_of(entry[kept], self.nominal_size + which[kept], data[kept], (Q, self.variables)))
+        rows, columns = np.nonzero(on_control)
+        g = table_of(rows, columns, on_control[rows, columns], (count, self.variables))
         d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
         if self.measurable is not None:
             pieces = self.seen_from(np.full(count, time), acting)
@@ -372,7 +369,7 @@ class ClosedLoop:
             for piece in np.unique(pieces):
                 rows = pieces == piece
                 offset[rows] += self.measurable.within(np.array([time]), H[rows], np.array([piece]))[0]
-        return UncertainRows(csr_array(g), h - offset, part, factor, tuple(parts), d)
+        return UncertainRows(g, h - offset, part, factor, tuple(parts), d)
 
     def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray, following: bool = False) -> UncertainRows:
         """The rows with ``G u_k`` added on the left, ``G (r, m)``, of the piece ``k`` of each, ``(r,)``; rows of one
@@ -395,8 +392,6 @@ class ClosedLoop:
 
     def control_rows(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
         """The rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
-        from scipy.sparse import csr_array
-
         part, factor = shared(H, self.spread)
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
         at, which, value = self.of_piece(piece)
@@ -406,12 +401,14 @@ class ClosedLoop:
         for first in firsts:
             data = H[first][channel] * value
             kept = data != 0.0
-            place = (entry[kept], self.nominal_size + which[kept])
-            parts.append(csr_array((data[kept], place), shape=(Q, self.variables)))
+            parts.append(table_of(entry[kept], self.nominal_size + which[kept], data[kept], (Q, self.variables)))
         rows, channels = np.nonzero(H)
-        g = csr_array((H[rows, channels], (rows, channels * K + piece)), shape=(H.shape[0], self.variables))
+        columns, values = channels * K + piece, H[rows, channels]
         if extra is not None:
-            g = csr_array(g + csr_array(extra))
+            more = np.nonzero(extra)
+            rows, columns = np.concatenate([rows, more[0]]), np.concatenate([columns, more[1]])
+            values = np.concatenate([values, extra[more]])
+        g = table_of(rows, columns, values, (H.shape[0], self.variables))
         return UncertainRows(g, h, part, factor, tuple(parts), np.zeros((len(firsts), Q)))
 
     def controls(self, x: Array) -> Array:

@@ -23,7 +23,7 @@ import numpy as np
 
 from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows, entries_of, gathered
 from sparserob_core.sip.inner.duality import Terms, without_norms
 from sparserob_core.sip.inner.simplex.interruptible import run
 from sparserob_core.sip.inner.simplex.silence import silent
@@ -115,7 +115,7 @@ class Counterpart:
     _margin: float = 0.0
 
     def __post_init__(self) -> None:
-        self._linear = Growing(self.asked)
+        self._linear, self._x = Growing(self.asked), np.zeros(self.program.n)
         program, n = self.program, self.program.n
         low, high = program.lower, program.upper
         priced = not (self.elastic or self.scales)
@@ -158,8 +158,8 @@ class Counterpart:
             self._imposed.append((at, rhs, []))
             return
         parts = [self._part(C, d) for C, d in zip(block.C, block.d, strict=True)]
-        g, count, limits = block.g.tocoo(), block.h.size, block.h.copy()
-        entries = [_both(g.row, g.col, g.data, self.program.n)]
+        count, limits = block.h.size, block.h.copy()
+        entries = [_both(*entries_of(block.g), self.program.n)]
         for p, part in enumerate(parts):
             mine = np.flatnonzero(block.part == p)
             scale = np.abs(block.factor[mine])
@@ -188,12 +188,15 @@ class Counterpart:
         count = entries.size
         free, nothing = np.full(count, np.inf), np.zeros(count)
         pairs = [self._linear.variables(nothing, free, nothing) for _ in range(2)]
-        inner, rows, ones = C[entries].tocoo(), np.arange(count), np.ones(count)
-        split = [_both(inner.row, inner.col, inner.data, n), (rows, pairs[0], -ones), (rows, pairs[1], ones)]
+        rows, ones = np.arange(count), np.ones(count)
+        inner = _both(np.repeat(rows, counts[entries]), C.indices, C.data, n)
+        split = [inner, (rows, pairs[0], -ones), (rows, pairs[1], ones)]
         if self.scales:
             split.append((rows, np.full(count, 2 * n), d[entries]))
         rest = nothing if self.scales else -d[entries]
         at = self._linear.rows(split, rest, rest)
+        if not self.scales:  # begin where the last solution leaves nothing of these equations
+            self._linear.enter(np.where((C @ self._x + d)[entries] >= 0.0, *pairs), at)
         return _Part(np.concatenate(pairs), np.tile(radii[entries], 2), constant, entries, at)
 
     def _pointed(self, C: csr_array, d: Array) -> _Part:
@@ -279,7 +282,7 @@ class Counterpart:
                 break  # the last ones are not sharpened: their multipliers are those of the rows that were solved with
             self._tangents.sharpen(decided, roots)
         n, mu = self.program.n, rows[self._fixed]
-        x = columns[:n] - columns[n : 2 * n]
+        x = self._x = columns[:n] - columns[n : 2 * n]
         at = None if self._tangents is None else self._tangents.touching(x, rows)
         y, deviations = self._multipliers(rows, mu, at)
         slack = float(columns[2 * n]) if self.elastic or self.scales else 0.0
@@ -293,7 +296,10 @@ class Counterpart:
         first = 0
         for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
             mine = y[first : first + block.h.size]
-            terms.append(weighted(mine, block.g) if parts else weighted(even[where], block.equations[0]))
+            if not parts:
+                terms.append(weighted(even[where], block.equations[0]))
+            elif mine.any():
+                terms.append(weighted(mine, block.g))
             for p, part in enumerate(parts):
                 rows = np.flatnonzero(block.part == p)
                 total = float(mine[rows] @ np.abs(block.factor[rows]))
@@ -389,6 +395,7 @@ class Growing:
             self.highs: Any = highspy.Highs()
         self.columns = self.count = 0
         self.refused = False
+        self._entering = list[tuple[np.ndarray, np.ndarray]]()
         self.work = 0.0  # of the last solution: entries times steps
         for name, value in {
             "output_flag": False,
@@ -409,15 +416,36 @@ class Growing:
     def rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], lower: Array, upper: Array) -> np.ndarray:
         """New rows, by number; ``entries`` are rows counted from 0, columns and values."""
         import highspy
-        from scipy.sparse import csr_array
 
         row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
-        table = csr_array((value, (row, column)), shape=(upper.size, self.columns))
-        starts, places = table.indptr[:-1].astype(np.int32), table.indices.astype(np.int32)
-        said = self.highs.addRows(upper.size, lower, upper, table.nnz, starts, places, table.data)
+        starts, places, values = gathered(row, column, value, (upper.size, self.columns))
+        said = self.highs.addRows(upper.size, lower, upper, values.size, starts[:-1], places, values)
         self.refused |= said == highspy.HighsStatus.kError  # an entry that is too large
         self.count += upper.size
         return np.arange(self.count - upper.size, self.count)
+
+    def enter(self, columns: np.ndarray, rows: np.ndarray) -> None:
+        """Begin with ``columns``, which cost nothing, in the basis in place of as many ``rows``, equations that were
+        added since: no reduced cost changes, and no step is needed for each of them."""
+        self._entering.append((columns, rows))
+
+    def _begin(self) -> None:
+        """Put what is to enter into the last basis."""
+        import highspy
+
+        if not self._entering:
+            return
+        columns, rows = (np.concatenate(part).tolist() for part in zip(*self._entering, strict=True))
+        self._entering, status = [], highspy.HighsBasisStatus
+        basis = self.highs.getBasis()
+        if not basis.valid:  # the first solution: presolve takes out these equations, and begins in a better place
+            return
+        within, without = basis.col_status, basis.row_status
+        for column, row in zip(columns, rows, strict=True):
+            if without[row] == status.kBasic and within[column] != status.kBasic:
+                within[column], without[row] = status.kBasic, status.kLower
+        basis.col_status, basis.row_status = within, without
+        self.highs.setBasis(basis)
 
     def limit(self, rows: np.ndarray, upper: Array) -> None:
         """Other limits of rows."""
@@ -438,6 +466,7 @@ class Growing:
                 self.by = self.asked.name
                 return answer
             why = answer
+        self._begin()
         if np.isfinite(seconds):
             self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))
         self.highs.setOptionValue("simplex_iteration_limit", STALLED * (self.columns + self.count))

@@ -13,9 +13,9 @@ from scipy.sparse import csc_array, csr_array
 
 from sparserob_core.control.sets.sets import NormBall
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows, entries_of, table_of
 from sparserob_core.sip.inner.simplex import counterpart as simplex
-from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart, Growing, RobustAnswer, robust_bound
 
 N, Q = 4, 3
 BOX = Spread(((1, Box(np.array([-0.5, -1.0]), np.array([0.5, 1.0]))), (1, Box(np.array([-0.25]), np.array([0.25])))))
@@ -151,6 +151,25 @@ def test_a_block_that_comes_late_and_another_margin_are_imposed_like_those_befor
             assert answer.solved == (truth is not None)
             if truth is not None:
                 assert base.objective(answer.x) == pytest.approx(truth.value, abs=1e-8)
+
+
+def test_what_comes_late_begins_with_its_equations_met(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Less than half of the steps of the simplex method, and the same optimum as where they begin slack."""
+    steps, costs = {"met": 0, "slack": 0}, []
+    for kind in steps:
+        if kind == "slack":
+            monkeypatch.setattr(Growing, "enter", lambda *_: None)
+        for seed in range(2):
+            rng = np.random.default_rng(seed)
+            base, blocks = program(rng), [rows(rng, "several") for _ in range(4)]
+            counterpart = Counterpart(base, BOX)
+            solved(counterpart, blocks[:1])
+            for block in blocks[1:]:
+                answer = solved(counterpart, [block])
+                steps[kind] += counterpart._linear.highs.getInfo().simplex_iteration_count
+            costs.append(base.objective(answer.x))
+    assert costs[:2] == pytest.approx(costs[2:], abs=1e-9)
+    assert 2 * steps["met"] < steps["slack"]
 
 
 @pytest.mark.parametrize(("seed", "name", "kind"), CASES)
@@ -315,3 +334,15 @@ def test_exact_rows_hold_at_every_deviation(scales: bool) -> None:
         assert proven == pytest.approx(base.objective(answer.x), abs=1e-8)
         assert (answer.y >= 0.0).all()
         assert all(BOX.holds(one) for one in answer.deviations)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_entries_in_any_order_are_the_sparse_table_that_scipy_makes_of_them(seed: int) -> None:
+    rng, shape = np.random.default_rng(seed), (seed, 5)
+    count = 4 * seed
+    row, column, value = rng.integers(0, max(seed, 1), count), rng.integers(0, 5, count), rng.standard_normal(count)
+    table, theirs = table_of(row, column, value, shape), csr_array((value, (row, column)), shape=shape)
+    for name in ("indptr", "indices", "data"):
+        mine, known = getattr(table, name), getattr(theirs, name)
+        assert mine == pytest.approx(known, abs=1e-15)
+    assert [one.tolist() for one in entries_of(table)[:2]] == [one.tolist() for one in theirs.tocoo().coords]
