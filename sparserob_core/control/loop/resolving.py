@@ -6,7 +6,7 @@ import time as clock
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import final
 
 import numpy as np
@@ -16,6 +16,7 @@ from sparserob_core.control.loop.remaining import refuse_remaining, remaining
 from sparserob_core.control.loop.retuning import Retuning, retuned
 from sparserob_core.control.loop.tracking import Tracking, trackable
 from sparserob_core.control.problem.units import Units
+from sparserob_core.control.response.response import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
 from sparserob_core.errors import SparseRobError
@@ -24,7 +25,7 @@ from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Deadline, OutOfTime, Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.own_units import solve_in_own_units
+from sparserob_core.sip.methods.own_units import answered_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.working.ledger import Violated, prover_of
@@ -166,11 +167,11 @@ class Solved:
 class Resolving:
     """Solves what is left of the horizon by the exchange method, at most for ``seconds`` a step (`None`: no limit).
 
-    A control that is fixed beforehand begins with the constraints that mattered at the last step, and keeps what does
-    not depend on the state for the next loop. Under feedback the nominal control is chosen anew for the same gains,
-    which has no lower bound of its own, and then, where that is expected to end in time, the whole program. With a
-    limit everything that does not depend on the state is made by `prepare`, and nothing is begun that is expected to
-    take longer than the limit. Raises `InputError` for a problem of which nothing can be left.
+    Every program begins with the constraints that mattered at the last step, and a control that is fixed beforehand
+    keeps what does not depend on the state for the next loop. Under feedback the nominal control is chosen anew for the
+    same gains, which has no lower bound of its own, and then, where that is expected to end in time, the whole program.
+    With a limit everything that does not depend on the state is made by `prepare`, and nothing is begun that is
+    expected to take longer than the limit. Raises `InputError` for a problem of which nothing can be left.
     """
 
     def __init__(self, model: Transcription, tools: Tools, tolerance: float, seconds: float | None = None) -> None:
@@ -247,7 +248,8 @@ class Resolving:
         began, whole = clock.perf_counter(), Solved(None)
         with suppress(SparseRobError, OutOfTime):
             model = remaining(self._model, piece, state, before)
-            result = solve_in_own_units(self._method, model.program, tools)
+            gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
+            result = answered_in_own_units(partial(self._begun, plan.cuts, gap), model.program, tools)
             known = plan.cost_left(piece - plan.first, innovations)
             whole = self._judged(model, result, piece, result.decision, result.cost, result.lower_bound, known)
         self._took, self._pieces = clock.perf_counter() - began, pieces
@@ -256,6 +258,10 @@ class Resolving:
         if tuned.plan is None or (whole.plan is not None and whole.cost <= tuned.cost):
             return whole
         return replace(tuned, lower=whole.lower)
+
+    def _begun(self, cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        """The exchange of a program in its own units that begins ``gap`` later than where these ``cuts`` mattered."""
+        return self._method.close(program, tools, prover_of(program, tools), shifted(cuts, gap, program))
 
     def _tuned(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved:
         """The same gains with the best nominal control for them, where `Retuning` knows such problems."""
@@ -392,20 +398,28 @@ def is_cheaper(cost: float, known: float) -> bool:
 
 def shifted(cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram) -> Violated:
     """Cuts in the user's units as rows of a program in its own that begins ``gap`` later; those of the past, and of
-    constraints that are over, are left out."""
+    constraints that are over, are left out. Where a program holds for every deviation they are times, with all rows."""
     families = {family.name: family for family in program.families}
     found = []
     for cut in cuts:
         family = families.get(cut.family)
-        if family is None or cut.formulation != family.formulation or cut.index.size != family.index_set.dimension:
+        if family is None:
             continue
-        index = cut.index.copy()
+        size, units, box = family.index_set.dimension, family.index_units, family.index_set
+        if family.uncertain is None and (cut.formulation != family.formulation or cut.index.size != size):
+            continue
+        index = cut.index[:size].copy()
         index[0] -= gap
-        index = index / index_units(program, cut)
-        box = family.index_set
-        if box.lower[0] <= index[0] <= box.upper[0]:
+        index = index if units is None else index / units
+        begun = family.uncertain is not None and family.start is not None and _holds(family.start, index, box.upper[0])
+        if box.lower[0] <= index[0] <= box.upper[0] and not begun:
             found.append((index[None], np.array([cut.row]), cut.family))
     return found
+
+
+def _holds(start: Array, index: Array, last: float) -> bool:
+    """Whether an index is among those that a method begins with, but for the rounding of times up to ``last``."""
+    return bool((np.abs(start - index).max(axis=1) <= SAME_TIME * abs(last)).any())
 
 
 def index_units(program: SemiInfiniteProgram, cut: Cut) -> Array:

@@ -8,7 +8,7 @@ twin to a method and brings everything that comes back, result and events, into 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import final
 
@@ -43,17 +43,24 @@ ORDER: Sequence[Status] = ("certified", "infeasible", "verified", "refuted", "un
 
 def solve_in_own_units(method: Method, program: SemiInfiniteProgram, tools: Tools) -> Result:
     """What the method makes of the program, solved in the program's own units and told in the user's."""
+    return answered_in_own_units(method.solve, program, tools)
+
+
+def answered_in_own_units(
+    solve: Callable[[SemiInfiniteProgram, Tools], Result], program: SemiInfiniteProgram, tools: Tools
+) -> Result:
+    """What ``solve`` makes of the program in the program's own units, told in the user's."""
     own = program.own_units
     if own is None:
-        return method.solve(program, tools)
+        return solve(program, tools)
     units, heard = UsersUnits(own), tools.notify
     notify: Notify = ignore if heard is ignore else lambda event: heard(units.event(event))
-    result = units.result(method.solve(own.program, replace(tools, notify=notify)))
+    result = units.result(solve(own.program, replace(tools, notify=notify)))
     if own.wider is None or result.status in ("certified", "infeasible") or result.stopped:
         return result
     # The units are for small decisions, and that was not the answer: those of all that the bounds allow may do better.
     units = UsersUnits(own.wider())
-    second = units.result(method.solve(units.program, replace(tools, notify=notify)))
+    second = units.result(solve(units.program, replace(tools, notify=notify)))
     return second if ORDER.index(second.status) < ORDER.index(result.status) else result
 
 

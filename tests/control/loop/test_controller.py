@@ -10,6 +10,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.control.loop import resolving, retuning
 from sparserob_core.control.loop.remaining import remaining
+from sparserob_core.control.loop.resolving import shifted
 from sparserob_core.control.studies.adversary import find_adversary
 from sparserob_core.control.transcription.transcribe import in_own_units
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -209,6 +210,21 @@ def test_a_plan_that_was_solved_anew_offers_its_program_from_the_measured_state(
     assert plan.model is plan.model
     assert all(proof.verdict == "proven" for proof in prove(plan.model.program, plan.decision))
     assert plan.model.program.cost(plan.decision) == pytest.approx(controller.steps[-1].cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["nominal", "peak"])
+def test_under_feedback_what_is_left_begins_with_the_times_that_mattered(plans, name) -> None:
+    plan = sr.controller(plans[name]).plan
+    gap = float(plan.known.control.breakpoints[2])
+    program = remaining(plan.known, 2, np.array([-0.5, 0.5]), None).program.own_units.program
+    times = np.array([cut.index[0] for cut in plan.cuts if cut.family == "path"])
+    found = shifted(plan.cuts, gap, program)
+    assert found or (times < gap).all()
+    for indices, _, family in found:
+        one = program.family(family)
+        assert family == "path"  # the control has all its rows from the beginning
+        assert np.abs(times - indices[0, 0] * one.index_units[0] - gap).min() <= 1e-12
+        assert np.abs(one.start - indices).min() > 1e-9  # what it begins with anyway is not imposed twice
 
 
 def test_what_is_left_at_the_beginning_is_the_problem_itself(plans) -> None:
