@@ -75,10 +75,12 @@ class RobustRows(Working):
         central, asked = Interior(program.finite, program.spread), ledger.relaxed.counted
         working = RobustRows(program, counterpart=central, close=close, tolerance=ledger.tolerance)
         working.asked = None if asked.instead is None else asked
+        if working.asked is not None or program.guide is not None or not central.many:
+            working.by_simplex()
         for family in program.families:
             assert family.start is not None
             working.add(family, family.start)
-        if working.asked is not None or program.guide is not None or not central.fits():
+        if not (isinstance(working.counterpart, Interior) and central.fits()):
             working.by_simplex()
         ledger.improve(working.at_rest)
         return working
@@ -403,13 +405,24 @@ class RobustRows(Working):
             x = np.clip(solved.x, second.finite.lower, second.finite.upper)
             x = x if second.settle is None else second.settle(x)
             violated = [above(*one) for one in separate(second, x, tools, ALLOWED, number)]
-            if not (working.impose(violated) or counterpart.sharpen(x)):
+            if not (working.impose([*violated, *self._violated(second, x)]) or counterpart.sharpen(x)):
                 break
         self.calls += working.calls
         self._count(ledger)
         if any(rows.size for _, rows, _ in violated):
             return None
         return x[:shared] if program.settle is None else program.settle(x[:shared])
+
+    def _violated(self, second: SemiInfiniteProgram, x: Array) -> Violated:
+        """Of the times that are imposed here, those that a decision of the ``second`` program violates."""
+        found = []
+        for family in second.families:
+            held = {cut.index.tobytes(): cut.index for cut in self.cuts if cut.family == family.name}
+            if held:
+                indices = np.array(list(held.values()))
+                over = family.violations(x, indices).max(axis=1) > ALLOWED
+                found.append((indices[over], np.zeros(int(over.sum()), dtype=int), family.name))
+        return found
 
 
 def left(tools: Tools) -> float:

@@ -9,7 +9,8 @@ a block with few rows costs ``k n`` instead of ``n^2`` operations for a part, an
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, final
+from functools import cache
+from typing import Any, Protocol, final
 
 import numpy as np
 
@@ -103,8 +104,7 @@ class Whole:
         return self._solved(r - parts[block.mixed] @ self.rows)
 
     def _solved(self, r: Array) -> Array:
-        from scipy.linalg import lapack
-
+        lapack = _lapack()
         one, _ = lapack.dtrtrs(self.factor, r, lower=1)
         u, _ = lapack.dtrtrs(self.factor, one, lower=1, trans=1)
         return np.asarray(u)
@@ -131,8 +131,7 @@ class Lean:
 
     def forward(self, r: Array) -> tuple[State, Array]:
         """A right-hand side among the pivots, and what it makes of the parts."""
-        from scipy.linalg import lapack
-
+        lapack = _lapack()
         block, u = self.block, self.inverse * r
         parts = np.zeros(self.Q.shape[1])
         parts[block.columns] = self.single * u[block.of]
@@ -150,8 +149,7 @@ class Lean:
 
     def back(self, state: State, parts: Array) -> Array:
         """The variables."""
-        from scipy.linalg import lapack
-
+        lapack = _lapack()
         block = self.block
         r = state[0] - np.bincount(block.of, self.single * parts[block.columns], self.inverse.size)
         if not block.at.size:
@@ -175,8 +173,7 @@ def eliminate(block: Block, D: Array, weight: Array, lean: Array, left: Left) ->
 
 
 def _whole(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Whole:
-    from scipy.linalg import lapack
-
+    lapack = _lapack()
     n, A = D.size, block.A
     scaled = A * np.sqrt(weight[block.at])[:, None]
     M = scaled.T @ scaled
@@ -201,8 +198,7 @@ def _lean(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Lea
     row of great weight, of which the diagonal would leave a small difference of large numbers, takes a small right-hand
     side of its own instead (``m^2 / w`` is what is left then); of the other rows ``m`` is ``kept``.
     """
-    from scipy.linalg import lapack
-
+    lapack = _lapack()
     A, w, m = block.A, weight[block.at], lean[block.at]
     k, n = A.shape
     others = np.flatnonzero(~block.alone | (SAFE * (w @ (A * A)) > D))
@@ -245,10 +241,17 @@ def _lean(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Lea
     return Lean(block, inverse, single, kept, others, T, Q, Z, H, R)
 
 
-def cholesky(M: Array) -> Array:
-    """The lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
+@cache
+def _lapack() -> Any:
+    """The routines, imported once: blocks ask for them ten thousand times in a step."""
     from scipy.linalg import lapack
 
+    return lapack
+
+
+def cholesky(M: Array) -> Array:
+    """The lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
+    lapack = _lapack()
     diagonal, grown = M.reshape(-1)[:: M.shape[0] + 1], GREATER
     while grown < 1e-6:
         diagonal *= 1.0 + grown

@@ -77,6 +77,11 @@ class Interior:
         """Whether an answer can be as accurate as is asked for."""
         return True
 
+    @property
+    def many(self) -> bool:
+        """Whether there may be so many variables that it is worth it."""
+        return self._layout.many
+
     def fits(self) -> bool:
         """Whether cost and rows are of the kind that this knows, and so many variables that it is worth it."""
         plain = self.spread.is_box and not any(block.exact for block in self.blocks)

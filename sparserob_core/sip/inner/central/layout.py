@@ -202,10 +202,15 @@ class Layout:
             block.alone = np.bincount(block.of, minlength=block.last - block.first) <= 1
         self.groups.append(Group(tuple(blocks), parts))
 
+    @property
+    def many(self) -> bool:
+        """Whether there are so many variables in all."""
+        return self.program.n >= WORTH
+
     def fits(self) -> bool:
         """Whether there are many variables, in small blocks, and nothing beside them that is not known here."""
         program = self.program
-        if not self.count or program.n < WORTH or program.b.size or program.P is not None or program.S is not None:
+        if not self.count or not self.many or program.b.size or program.P is not None or program.S is not None:
             return False
         if program.G.shape[0] or not (program.lower < program.upper).all():
             return False
