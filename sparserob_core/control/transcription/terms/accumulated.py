@@ -8,8 +8,6 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.policies.measurements import Measurements
-from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.disturbances import SHORTEST, legs
 from sparserob_core.control.problem.names import Names, measured_in
 from sparserob_core.control.problem.problem import (
@@ -20,7 +18,8 @@ from sparserob_core.control.problem.problem import (
     PathConstraint,
 )
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
-from sparserob_core.control.sets.sets import Equality, Polytope, cylinder, product
+from sparserob_core.control.sets.sets import Equality, Polytope, cylinder
+from sparserob_core.control.transcription.terms.larger import columns, larger
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
@@ -57,18 +56,14 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
     if not problem.system.switches and all(one.start == 0.0 for one in running):
         running = [replace(one, stop=problem.horizon) for one in running]
     k = len(running)
-    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
-    return replace(
+    return larger(
         problem,
+        k,
         system=_system(problem.system, running, problem.horizon),
-        initial_state=np.append(np.asarray(problem.initial_state), np.zeros(k)),
-        initial_set=None if begun is None else product([begun, Box(np.zeros(k), np.zeros(k))]),
         path=[_widened(entry, d + k) for entry in (*problem.windows, *ends)],
         terminal=[_ended(end, d + k) for end in problem.terminal],
         integral=(),
-        cost=_cost(problem.cost, k),
         names=_names(problem.names, d, running),
-        measurements=replace(measured, C=np.hstack([np.asarray(measured.C), np.zeros((measured.outputs, k))])),
     )
 
 
@@ -122,12 +117,8 @@ def _system(system: System, running: list[Running], horizon: float) -> System:
 def _widened(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint | MixedConstraint:
     """A window that leaves the states beyond its own free, ``size`` in all."""
     if isinstance(entry, MixedConstraint):
-        H = np.asarray(entry.H)
-        return replace(entry, H=np.hstack([H, np.zeros((len(H), size - H.shape[1]))]))
-    moved = entry.relative_to
-    if moved is not None:
-        rows = np.asarray(moved)
-        moved = np.hstack([rows, np.zeros((len(rows), 1 + size - rows.shape[1]))])
+        return replace(entry, H=columns(entry.H, size))
+    moved = None if entry.relative_to is None else columns(entry.relative_to, 1 + size)
     return replace(entry, set=cylinder(entry.set, size), relative_to=moved)
 
 
@@ -135,16 +126,6 @@ def _ended(end: ConvexSet | Equality, size: int) -> ConvexSet | Equality:
     if isinstance(end, Equality):
         return Equality(np.append(end.values, np.full(size - end.dimension, np.nan)))
     return cylinder(end, size)
-
-
-def _cost(cost: Cost, more: int) -> Cost:
-    """The same cost, which the states beyond are no part of."""
-
-    def widened(term: Quadratic | None) -> Quadratic | None:
-        return None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
-
-    state, _, final = cost.terms
-    return replace(cost, state=widened(state), final=widened(final))
 
 
 def _names(names: Names, states: int, running: list[Running]) -> Names:

@@ -10,8 +10,6 @@ from itertools import product as every_choice
 import numpy as np
 
 from sparserob_core.control.enclosures.dependence import PARTS, Dependence, Superposed
-from sparserob_core.control.policies.measurements import Measurements
-from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import (
     IntegralConstraint,
@@ -20,7 +18,8 @@ from sparserob_core.control.problem.problem import (
     PathConstraint,
 )
 from sparserob_core.control.problem.system import TIME, LinearSystem, VaryingSystem
-from sparserob_core.control.sets.sets import Box, Equality, Polytope, product
+from sparserob_core.control.sets.sets import Box, Equality, Polytope
+from sparserob_core.control.transcription.terms.larger import columns, larger
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -36,20 +35,15 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
         return problem
     depends = system.dependence
     corners = _corners(system.parameters, depends)
-    d, size = system.states, depends.states
-    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
     rows = [depends.rows(corner) for corner in corners]
-    return replace(
+    return larger(
         problem,
+        depends.states - system.states,
         system=_known(system, depends),
-        initial_state=np.append(np.asarray(problem.initial_state), np.zeros(size - d)),
-        initial_set=None if begun is None else product([begun, Box(np.zeros(size - d), np.zeros(size - d))]),
-        path=[_window(entry, rows) for entry in problem.path],
+        path=[_window(entry, rows) for entry in problem.windows],
         terminal=[_everywhere(end, rows) for end in problem.terminal],
         integral=[_integral(entry, rows) for entry in problem.integral],
-        cost=_cost(problem.cost, size - d),
         names=_names(problem.names, system, depends),
-        measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, size - d)))),
     )
 
 
@@ -86,18 +80,14 @@ def _known(system: VaryingSystem, depends: Dependence) -> VaryingSystem:
     return VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:]))
 
 
-def _window(
-    entry: PathConstraint | MixedConstraint | ConvexSet, rows: list[Array]
-) -> PathConstraint | MixedConstraint | ConvexSet:
-    assert not isinstance(entry, ConvexSet)  # a problem has made constraints of its sets
-    more = rows[0].shape[1] - rows[0].shape[0]
+def _window(entry: PathConstraint | MixedConstraint, rows: list[Array]) -> PathConstraint | MixedConstraint:
     if isinstance(entry, MixedConstraint):
         H, G, h = (np.asarray(part) for part in (entry.H, entry.G, entry.h))
         both, limits = _apart(
             np.vstack([np.hstack([H @ one, G]) for one in rows]), np.tile(np.broadcast_to(h, len(H)), len(rows))
         )
         return replace(entry, H=both[:, : rows[0].shape[1]], G=both[:, rows[0].shape[1] :], h=limits)
-    moved = None if entry.relative_to is None else np.pad(np.asarray(entry.relative_to), ((0, 0), (0, more)))
+    moved = None if entry.relative_to is None else columns(entry.relative_to, 1 + rows[0].shape[1])
     return replace(entry, set=_everywhere(entry.set, rows), relative_to=moved)
 
 
@@ -123,16 +113,6 @@ def _integral(entry: IntegralConstraint, rows: list[Array]) -> IntegralConstrain
     _, first = np.unique(every, axis=0, return_index=True)
     every, size = every[np.sort(first)], rows[0].shape[1]
     return replace(entry, H=every[:, :size], G=every[:, size:-2], lower=every[:, -2], upper=every[:, -1])
-
-
-def _cost(cost: Cost, more: int) -> Cost:
-    """The same cost, of the nominal trajectory: that in the middle of the box."""
-
-    def widened(term: Quadratic | None) -> Quadratic | None:
-        return None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
-
-    state, _, final = cost.terms
-    return replace(cost, state=widened(state), final=widened(final))
 
 
 def _names(names: Names, system: VaryingSystem, depends: Dependence) -> Names:

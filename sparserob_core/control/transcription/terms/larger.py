@@ -1,0 +1,38 @@
+"""A problem of which there are more states: they follow its own, begin at 0, are not measured, and cost nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.control.policies.measurements import Measurements
+from sparserob_core.control.problem.cost import Quadratic
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.sets.sets import product
+from sparserob_core.sip.convex_set import Array, Box
+
+
+def larger(problem: OptimalControlProblem, more: int, **told: Any) -> OptimalControlProblem:
+    """The problem with so many ``more`` states; its system, constraints and names are ``told``."""
+    d, zeros, begun = problem.system.states, np.zeros(more), problem.initial_set
+    measured, (state, _, final) = problem.measurements or Measurements(np.eye(d)), problem.cost.terms
+    return replace(
+        problem,
+        initial_state=np.append(np.asarray(problem.initial_state), zeros),
+        initial_set=None if begun is None else product([begun, Box(zeros, zeros)]),
+        cost=replace(problem.cost, state=_costing(state, more), final=_costing(final, more)),
+        measurements=replace(measured, C=columns(measured.C, d + more)),
+        **told,
+    )
+
+
+def columns(rows: Any, count: int) -> Array:
+    """Rows of numbers with so many columns, zeros after their own."""
+    given = np.asarray(rows)
+    return np.pad(given, ((0, 0), (0, count - given.shape[1])))
+
+
+def _costing(term: Quadratic | None, more: int) -> Quadratic | None:
+    return None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
