@@ -105,14 +105,15 @@ def test_what_is_left_of_an_expansion_is_in_every_entry_of_what_an_interval_make
 
 
 def test_a_chord_of_a_loop_is_missed_by_its_powers_and_twice_what_is_left_of_them() -> None:
-    """``2 s^2`` and ``3 s^3`` of a nominal state of 1, a rest of 0.5, and half of all of it for a deviation of 4."""
+    """``2 s^2`` and ``-3 s^3`` of a nominal state of 1, a rest from -0.5 to -0.1, and half of all of it for a deviation
+    of 4."""
     told = SimpleNamespace(
-        _flow=SimpleNamespace(within=lambda *_: ([stacked([[arb(x), arb(0)]]) for x in (1, 5, 2, 3)], told_rest)),
+        _flow=SimpleNamespace(within=lambda *_: ([stacked([[arb(x), arb(0)]]) for x in (1, 5, 2, -3)], told_rest)),
         state=lambda *_: stacked([[arb(1), arb(0.5)]]),
         drives=[stacked([[arb(7), arb(7)]])],
         radii=np.array([4.0]),
     )
-    told_rest = stacked([[arb(0, 0.5), arb(0)]])
+    told_rest = stacked([[arb(-0.3, 0.2), arb(0)]])
     with ctx.workprec(BITS):
         bound = VaryingLoop.bent(told, 0, 0.0, 1.0, np.array([[1.0]]))
     share = np.linspace(0.0, 1.0, 10001)
