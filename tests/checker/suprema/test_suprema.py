@@ -143,6 +143,8 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "empty": (lambda row: row.update(lower=row["upper"] + 1.0), "is empty"),
     "wall": (lambda row: row.update(wall=row["wall"] + 1e-6), "a wall at"),
     "margin": (lambda row: row.update(margin=row["margin"] + 1e-6), "a margin of"),
+    "less margin": (lambda row: row.update(margin=row["margin"] - 1e-6), "a margin of"),
+    "wall on the other side": (lambda row: row.update(wall=row["wall"] - 1e-6), "a wall at"),
     "margin without a bound": (
         lambda row: row.update({"upper" if row["sense"] == "sup" else "lower": None}),
         "a margin is written without a bound",
