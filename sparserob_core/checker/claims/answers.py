@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 PEAK, WORST = "peak", "worst"
 FIGURES = 1e-11  # of an effort: how closely it is known
+SQUARES = 1e-14  # of the terms that squares are added up from, some forty roundings
 
 
 @final
@@ -184,8 +185,10 @@ class Answers:
         squares = case.price.squares(case.pieces)
         if case.charge == WORST:
             written = arb(number(case.certificate, "cost"))
-            self._effort(written - squares + FIGURES * abs(written))
-            return written
+            terms = max(case.price.added(case.pieces, arb(0)), case.price.terms(case.pieces))
+            rounded = arb(SQUARES) * arb(terms if case.price.is_quadratic else 0.0)
+            self._effort(written - squares + (FIGURES * abs(written)).max(rounded))
+            return written.max(squares)  # an effort is never less than 0
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
                 u, row = arb(float(case.theta[i, k])), self.loop.effects[k][i]
