@@ -1002,6 +1002,7 @@ def _totals(rng: np.random.Generator, problem: Instance) -> Totals:
     (d, m), K, r = problem.B.shape, len(problem.edges) - 1, int(rng.integers(1, 3))
     first, last = np.sort(rng.choice(K + 1, 2, replace=False))
     H, G, free = rng.normal(size=(r, d)), rng.normal(size=(r, m)) * rng.choice([0.0, 1.0]), np.full(r, np.inf)
+    G = 0.0 * G if problem.late else G  # what is commanded late never acts
     bare = Totals(H, G, int(first), int(last), -free, free)
     found = sample(replace(problem, totals=bare), 1, np.zeros(len(problem.slopes)))
     middle, reach = found.totals[0], np.abs(found.totals[1]) @ problem.bounds
