@@ -188,6 +188,14 @@ def test_no_causal_policy_is_there_where_the_noise_hides_more_than_may_be_left(t
     assert sr.check(outcome.directory).status == "verified"
 
 
+@pytest.mark.slow
+def test_the_factor_above_which_no_causal_policy_exists_knows_what_the_noise_hides(tmp_path: Path) -> None:
+    """``0.2 + w <= 1.5``: affine policies do as much as any."""
+    outcome = hidden("nominal", 1.5, tmp_path / "run")
+    found = sr.margin(str(outcome.directory), of="disturbance", tolerance=1e-4)
+    assert 1.3 - 1e-4 <= found.lower <= 1.3 <= found.causal_upper <= 1.3 + 2e-4
+
+
 @pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("noise", "C", "more"),

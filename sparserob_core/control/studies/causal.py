@@ -34,7 +34,7 @@ WORK, EACH, PER = 1e7, 2e6, 3e3  # that a search may do anyway; for each of a ru
 CELLS = 2e7  # numbers of one kind about all signals of a tree: 160 MB
 INSIDE = 1  # times sampled within every piece, beside its ends and the times that the policy's bound rests on
 AGAIN = 4  # times that a noise hides its share of a smaller factor, each of which gains less than the one before
-NARROWER = 1e-3  # of a factor, by which it must have come down for that
+NARROWER = 1e-4  # of a factor, by which it must have come down for that
 NEARLY = 1e-6  # of a factor, by which the first one that is excluded lies above the largest one that is not
 
 
@@ -227,9 +227,11 @@ class CausalSearch:
             assert found is not None
             tree = self.hiding(limits, found, found[1].value * (1.0 + NARROWER))
             better = None if tree is None else self._largest_factor(tree, limits)
-            if better is None or better[1].value > found[1].value * (1.0 - NARROWER):
+            if better is None or better[1].value >= found[1].value:
                 break
-            found = better
+            narrower, found = better[1].value < found[1].value * (1.0 - NARROWER), better
+            if not narrower:
+                break
         return found
 
     def _largest_factor(self, tree: Tree, limits: Limits) -> tuple[Tree, Grown] | None:
