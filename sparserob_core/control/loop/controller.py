@@ -66,8 +66,10 @@ class Controller:
 
     def __init__(self, plan: Plan, resolving: Resolving | None = None) -> None:
         self._planned, self._resolving = plan, resolving
+        began = clock.perf_counter()
         if resolving is not None:
             resolving.prepare(plan)
+        self._prepared = clock.perf_counter() - began if resolving is not None else 0.0
         self.reset()
 
     def __repr__(self) -> str:
@@ -81,6 +83,12 @@ class Controller:
         """When the pieces of the control begin, and the horizon at the end, ``(K + 1,)``, in the time of the
         problem."""
         return np.array(self._planned.model.control.breakpoints)
+
+    @property
+    def prepared(self) -> float:
+        """How many seconds were spent before the first step, on what no step with a limit waits for; 0 without a
+        re-solve. A limit is one of every step, the first one too: make the controller before the system runs."""
+        return self._prepared
 
     @property
     def covered(self) -> bool:

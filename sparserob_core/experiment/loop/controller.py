@@ -33,7 +33,8 @@ def controller(
 
     ``resolve``: what is left of the horizon is solved anew at every step, for about ``seconds`` a step at most (no
     limit unless given), and the last proven plan goes on where that does not give a better one. Under feedback, where
-    that is too little for a whole program, its nominal control alone is solved anew, for the same gains. ``plugins``:
+    that is too little for a whole program, its nominal control alone is solved anew, for the same gains. What does not
+    depend on the state is then made here, which ``prepared`` tells the seconds of, not in the steps. ``plugins``:
     files that offer what a run was made with. Raises `InputError` where there is no proven control, or where nothing
     can be solved anew: with a delay, or a dictionary whose functions are no indicators.
     """

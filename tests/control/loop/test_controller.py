@@ -255,6 +255,8 @@ def test_a_state_that_no_disturbance_leads_to_is_told_and_solved_anew(plans) -> 
 
 def test_without_time_the_plan_goes_on(plans) -> None:
     controller = sr.controller(plans["nominal"], True, seconds=1e-9)
+    assert 0.0 < controller.prepared < 60.0
+    assert sr.controller(plans["nominal"]).prepared == 0.0
     worst, applied = Plant(plans["nominal"]).loop(controller, lambda k, x, c: np.zeros(2))
     assert worst <= EXACT
     assert not any(one.resolved for one in controller.steps)
