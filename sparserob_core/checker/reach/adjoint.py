@@ -34,10 +34,13 @@ LONGEST = 16.0  # size of a system over a step, at most: the terms of its series
 BENDING = 7  # terms of the bounds of second derivatives
 MOST_STEPS = 2**17
 BLOCK = 64  # rows in one ball matrix, a power of two: fewer take more calls, more make more that are not needed
-# Steps between rows that are products of ball matrices, a power of two; those between are one product of floats more,
-# which is off as the terms of polynomials are. With half of it the rows of many states take twice as long, and with
-# twice as much the transitions between take the time of the rows.
+# Steps between rows that are products of ball matrices, a power of two, where all of them would be dear; those between
+# are one product of floats more, which is off as the terms of polynomials are. With half of it the rows of many states
+# take twice as long, and with twice as much the transitions between take the time of the rows.
 APART = 16
+# Multiplications of balls for all rows, from which only every `APART`-th is made of them: some six seconds. With a tenth
+# of it bounds that are told to the last digit are wider than what a run wrote, of plants whose rows take no time.
+DEAR = 2**29
 MOST = 2**27  # numbers that the rows of all steps take
 AT_ONCE = 2**22  # numbers of rows that are worked on at once
 
@@ -116,6 +119,11 @@ class Motion:
 
         return [(self.A * arb(self.step)).exp()]
 
+    @property
+    def apart(self) -> int:
+        """How many steps are between rows that are products of ball matrices."""
+        return APART if self.count * self.A.nrows() ** 2 > DEAR else 1
+
     def over(self, place: int) -> arb_mat:
         """The transition over ``2^place`` steps."""
         while len(self._powers) <= place:
@@ -125,10 +133,10 @@ class Motion:
 
     @cached_property
     def between(self) -> list[Enclosed]:
-        """The transitions over 1, 2, ... steps, fewer than `APART`, ``(1, d, d)`` each."""
+        """The transitions over 1, 2, ... steps, fewer than `apart`, ``(1, d, d)`` each."""
         found: list[arb_mat] = []
         shape = (1, self.A.nrows(), self.A.nrows())
-        for j in range(1, APART):
+        for j in range(1, self.apart):
             self.clock.check()
             place = floor(log2(j))
             power = self.over(place)
@@ -189,7 +197,7 @@ class Adjoint:
         """That of the row ``c (d,)``, an exact one."""
         from flint import arb
 
-        found, place, count = [[arb(float(v)) for v in c]], floor(log2(APART)), motion.count // APART + 1
+        found, place, count = [[arb(float(v)) for v in c]], floor(log2(motion.apart)), motion.count // motion.apart + 1
         while len(found) < BLOCK:
             found += (stacked(found) * motion.over(place)).tolist()
             place += 1
@@ -200,9 +208,9 @@ class Adjoint:
             blocks += [block * power for block in blocks[: -(-count // BLOCK) - len(blocks)]]
         parts = [Enclosed.of(block) for block in blocks]
         mid, rad = (np.concatenate(one)[:count] for one in zip(*((p.mid, p.rad) for p in parts), strict=True))
-        nodes = [np.empty((count, APART, c.size)) for _ in range(2)]
+        nodes = [np.empty((count, motion.apart, c.size)) for _ in range(2)]
         nodes[0][:, 0], nodes[1][:, 0] = mid, rad
-        for j in range(1, APART):
+        for j in range(1, motion.apart):
             motion.clock.check()
             for node, product in zip(nodes, _product(Enclosed(mid, rad), motion.between[j - 1]), strict=True):
                 node[:, j] = product[:, 0]

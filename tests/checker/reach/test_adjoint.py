@@ -15,7 +15,7 @@ from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.outcome import Clock, Unchecked
 from sparserob_core.checker.reach import adjoint as module
-from sparserob_core.checker.reach.adjoint import Adjoint, Motion, Powers, Worst
+from sparserob_core.checker.reach.adjoint import DEAR, Adjoint, Motion, Powers, Worst
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Box, Polytope
 
@@ -45,8 +45,12 @@ def exact(t: float) -> tuple[list[float], list[float]]:
         return [float(x.mid()) for x in row.entries()[:3]], [float(x.mid()) for x in row.entries()[3:]]
 
 
-def test_rows_and_integrals_hold_the_truth_and_are_close() -> None:
+@pytest.mark.parametrize("dear", [0, DEAR])
+def test_rows_and_integrals_hold_the_truth_and_are_close(dear: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether all rows are made of balls, or those between of floats."""
+    monkeypatch.setattr("sparserob_core.checker.reach.adjoint.DEAR", dear)
     known = adjoint()
+    assert known.motion.apart == (1 if dear else 16)
     rows, (sums, rounded) = known.at(TIMES), known.integrals(TIMES)
     for i, t in enumerate(TIMES.tolist()):
         row, moved = exact(t)
