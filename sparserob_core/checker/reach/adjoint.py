@@ -38,8 +38,8 @@ BLOCK = 64  # rows in one ball matrix, a power of two: fewer take more calls, mo
 # are one product of floats more, which is off as the terms of polynomials are. With half of it the rows of many states
 # take twice as long, and with twice as much the transitions between take the time of the rows.
 APART = 16
-# Multiplications of balls for all rows, from which only every `APART`-th is made of them: some six seconds. With a tenth
-# of it bounds that are told to the last digit are wider than what a run wrote, of plants whose rows take no time.
+# Multiplications of balls for all rows, from which only every `APART`-th is made of them: some six seconds. With a
+# tenth of it bounds told to the last digit are wider than what a run wrote, of plants whose rows take no time.
 DEAR = 2**29
 MOST = 2**27  # numbers that the rows of all steps take
 AT_ONCE = 2**22  # numbers of rows that are worked on at once
