@@ -24,9 +24,9 @@ SAME_TIME = 1e-12
 a clock could tell what is taken for one."""
 
 
-def over(stop: float, begin: float, horizon: float) -> bool:
-    """Whether of what lasts until ``stop`` nothing but rounding is left from ``begin`` on, for as long as
-    ``horizon``."""
+def over(stop: float, begin: float, horizon: float = 0.0) -> bool:
+    """Whether of what lasts until ``stop`` nothing but rounding is left from ``begin`` on, where times go on for as
+    long as ``horizon``."""
     return stop <= begin + SAME_TIME * (begin + horizon)
 
 

@@ -82,7 +82,9 @@ class _Window(Term, ABC):
     lasting: ClassVar[bool] = False
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
-        if self.stop is not None and over(self.stop, begin, horizon):
+        end = begin + horizon
+        late = over(end, self.start) if self.lasting else not over(self.start, end)
+        if late or (self.stop is not None and over(self.stop, begin, horizon)):
             return None
         return super().remaining(begin, horizon, **given)
 
@@ -176,8 +178,8 @@ class IntegralConstraint(_Window):
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
         left = super().remaining(begin, horizon, **given)
-        if left is not None and self.start < begin:
-            raise InputError("an integral that has begun is known as a state only: see `accumulated`", path="integral")
+        if left is not None and (self.start < begin or not over(self.stop or 0.0, begin + horizon)):
+            raise InputError("a part of an integral is known as a state only: see `accumulated`", path="integral")
         return left
 
     @property

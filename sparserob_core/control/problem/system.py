@@ -473,7 +473,11 @@ class SwitchedSystem:
 
     def remaining(self, begin: float, horizon: float) -> LinearSystem | SwitchedSystem:
         """Those that still take their turn from the time ``begin`` on, for as long as ``horizon``."""
-        left = [(until - begin, one) for until, one in self.pieces if not over(until, begin, horizon)]
+        left = [
+            (until - begin, one)
+            for start, (until, one) in zip((0.0, *self.switches), self.pieces, strict=True)
+            if not over(until, begin, horizon) and not over(begin + horizon, start)
+        ]
         return SwitchedSystem([*left[:-1], (horizon, left[-1][1])], self.delay) if len(left) > 1 else left[-1][1]
 
     @property

@@ -18,9 +18,8 @@ import numpy as np
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.prices import weights_between
-from sparserob_core.control.problem.problem import SHORTEST, OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport, summed
@@ -80,7 +79,6 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
     """The problem with another, shorter ``horizon``: windows that lasted until the end do so still, those that would
     begin later are gone, as are the systems that would take their turn later. Raises `InputError` for a window that
     ends before the horizon of the problem."""
-    windows = []
     for i, entry in enumerate(problem.windows):
         if entry.stop is not None and entry.stop < problem.horizon:
             raise InputError(
@@ -89,31 +87,15 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
                 " are while the horizon varies",
                 got=f"one that ends at {entry.stop:g}",
             )
-        lasts = horizon - entry.start > SHORTEST * horizon
-        if lasts or (entry.start <= horizon and not entry.lasting):
-            windows.append(replace(entry, stop=None))
     if problem.disturbance_breakpoints is not None:
         expected = "disturbances on the pieces of their dictionary, which become shorter with the horizon"
         raise InputError(path="disturbance", expected=expected, got="breakpoints of their own")
-    weights = weights_between(problem.weights, 0.0, horizon)
-    system = _until(problem.system, horizon)
-    return replace(problem, horizon=horizon, path=windows, system=system, weights=weights)
-
-
-def _until(system: System, horizon: float) -> System:
-    if isinstance(system, LinearSystem):
-        return system
-    if isinstance(system, VaryingSystem):
+    if isinstance(problem.system, VaryingSystem):
         expected = "a system that stays the same with time: of another one no shorter horizon is looked at yet"
         raise InputError(path="system", expected=expected, got="one in t")
-    begins = (0.0, *system.switches)
-    kept = [
-        (min(until, horizon), one)
-        for begin, (until, one) in zip(begins, system.pieces, strict=True)
-        if horizon - begin > SHORTEST * horizon
-    ]
-    kept[-1] = (horizon, kept[-1][1])
-    return kept[0][1] if len(kept) == 1 else SwitchedSystem(kept, system.delay)
+    shorter = problem.remaining(0.0, horizon)
+    assert shorter is not None
+    return shorter
 
 
 def stretched(dictionary: Dictionary, horizon: float) -> Dictionary:

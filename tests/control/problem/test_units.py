@@ -208,6 +208,10 @@ def test_what_is_left_of_a_problem_in_two_steps_is_what_is_left_of_it_in_one():
             assert once.horizon == 2.0 and all(0.0 <= one.start <= one.stop <= 2.0 for one in once.windows)
     first, *_ = problems()
     assert [one.name for one in first.remaining(2.0, 1.0).windows] == ["wall"]  # the other one is over
+    wall, mixed = (one.remaining(0.0, 0.75) for one in first.windows)
+    assert wall.stop == 0.75 and mixed is None  # which has not begun
+    turns = sr.SwitchedSystem([(until, sr.LinearSystem([[until]], [[1.0]])) for until in (1.0, 2.0, 3.0)])
+    assert turns.remaining(0.5, 1.25).switches == (0.5,) and turns.remaining(1.0, 1.0).switches == ()
     assert first.windows[0].remaining(1.0, 2.0).relative_to.tolist() == [
         [0.0, 0.5 + 1 / 3, 0.25 + 1 / 6],
         [2.0, 1.5, 0.75],
@@ -218,8 +222,9 @@ def test_an_integral_that_has_begun_is_no_integral_any_more():
     entry = problems()[1].integral[0]
     assert (late := entry.remaining(0.25, 2.75)).start == 0.25 and late.stop == 2.25
     assert entry.remaining(2.5, 0.5) is None
-    with pytest.raises(sr.InputError, match="known as a state only"):
-        entry.remaining(0.75, 2.25)
+    for begin, horizon in ((0.75, 2.25), (0.0, 2.0)):
+        with pytest.raises(sr.InputError, match="part of an integral"):
+            entry.remaining(begin, horizon)
 
 
 def test_a_factor_on_a_constraint_is_one_on_its_bounds_about_their_middle():
