@@ -197,6 +197,33 @@ def test_every_number_of_every_record_of_a_problem_is_converted_or_has_no_unit()
     assert left <= {"disturbances", "repeat"}, left
 
 
+def quantities(problem: sr.OptimalControlProblem, x: np.ndarray, u: np.ndarray, time: float) -> dict[str, np.ndarray]:
+    """What a problem says of a state and a control that last for so long."""
+    state, control, final = problem.cost.terms
+    found = {"l1": time * (problem.weights @ np.abs(u))}
+    for name, term, v, lasting in (("state", state, x, time), ("control", control, u, time), ("final", final, x, 1.0)):
+        if term is not None:
+            found[name] = lasting * ((v - term.reference) @ term.Q @ (v - term.reference))
+    for entry in [*problem.windows, *problem.integral]:
+        if not isinstance(entry, sr.PathConstraint):
+            lasting = time if isinstance(entry, sr.IntegralConstraint) else 1.0
+            found[entry.name] = lasting * (entry.H @ x + entry.G @ u)
+    return found
+
+
+def test_costs_integrals_and_rows_of_state_and_control_are_the_same_in_other_units():
+    units = Units(2.0, np.array([8.0, 0.125]), np.array([32.0]), np.array([0.5]), np.zeros(0), 128.0)
+    x, u, met = np.array([1.25, -0.75]), np.array([1.5]), set[str]()
+    for problem in problems()[:2]:
+        mine = quantities(problem, x, u, 3.0)
+        its = quantities(units.of_problem(problem), x / units.states, u / units.controls, 3.0 / units.time)
+        for name, value in mine.items():
+            in_cost = name in ("l1", "state", "control", "final")
+            np.testing.assert_allclose(its[name], value / (units.cost if in_cost else 1.0), rtol=1e-14, err_msg=name)
+            met.add(name)
+    assert met == {"l1", "state", "control", "final", "mixed", "sum"}
+
+
 def test_what_is_left_of_a_problem_in_two_steps_is_what_is_left_of_it_in_one():
     for problem in problems():
         if not problem.integral:
