@@ -172,6 +172,18 @@ def test_entries_that_do_not_change_cost_what_the_system_without_the_time_does(a
 
 
 @pytest.mark.slow
+def test_parameters_of_which_one_value_is_possible_are_that_value(tmp_path: Path) -> None:
+    known = beside(B=[[0], ["exp(p) * (1 + 0.1*cos(t))"]], parameters={"p": [0.1, 0.1], "q": [0.05, 0.05]})
+    known["problem"]["initial_state"] = {"centre": [-0.5, 0.5], "box": [0.02, 0.02]}
+    plain = copy.deepcopy(known)
+    system = plain["problem"]["system"]
+    system.update(B=[[0], ["exp(0.1) * (1 + 0.1*cos(t))"]], E=[[0], [1.05]], c=[0, "0.005 * cos(2*t)"])
+    del system["parameters"]
+    costs = [solved(one, tmp_path / name).result.cost for name, one in (("known", known), ("plain", plain))]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-6)
+
+
+@pytest.mark.slow
 def test_a_parameter_of_a_that_multiplies_what_depends_on_none_is_proven(tmp_path: Path) -> None:
     """``x2`` is a known motion of its own; ``x1' = (1 + p) x2 + u``."""
     config = beside(

@@ -1,10 +1,10 @@
 """Parameters beside the time, as coordinates of a larger state: derived from the problem's records alone.
 
 Where every entry of ``[A B E c]`` is a sum ``f_0(t) + sum_j f_j(t) s_j``, ``s_j`` what parameter ``j`` deviates from a
-middle one by, the state is ``x = x_0 + sum_j s_j y_j``, if no entry of ``A`` that has an ``s_j`` meets a state that
-depends on a parameter: then ``y_j' = A_0 y_j + A_j x_0 + B_j u + E_j w + c_j``. After the ``d`` states of the problem
-come the coordinates of ``y_1`` that anything moves, then those of ``y_2``, and so on. Rows on ``x`` are affine in
-``s``, and hold on a box where they hold at its corners.
+middle one by as a share of a power of two, the state is ``x = x_0 + sum_j s_j y_j``, if no entry of ``A`` that has an
+``s_j`` meets a state that depends on a parameter: then ``y_j' = A_0 y_j + A_j x_0 + B_j u + E_j w + c_j``. After the
+``d`` states of the problem come the coordinates of ``y_1`` that anything moves, then those of ``y_2``, and so on. Rows
+on ``x`` are affine in ``s``, and hold on a box where they hold at its corners.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import product
-from math import inf, nextafter
+from math import frexp, inf, nextafter
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -146,13 +146,24 @@ class Parts:
     system: VaryingSystem
     middle: tuple[float, ...]
 
+    @cached_property
+    def scales(self) -> list[float]:
+        """The powers of two that parameters are counted in, next above what they deviate by; 0 where that is 0."""
+        box, found = self.system.parameters, []
+        if not isinstance(box, Box):
+            raise Unchecked("the checker knows boxes of parameters beside the time")
+        for low, high, middle in zip(box.lower.tolist(), box.upper.tolist(), self.middle, strict=True):
+            far = max(high - middle, middle - low)
+            found.append(2.0 ** frexp(far)[1] if far > 0.0 else 0.0)
+        return found
+
     def tables(self, entry: object, time: object) -> list[np.ndarray]:
         """``f_0, f_1, ..., f_nu`` of a matrix at a time; raises `Unchecked` where it is no such sum."""
         nothing: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
         p = np.empty(1 + len(self.middle), dtype=object)
         p[0] = Sum({FREE: time})
-        for j, value in enumerate(self.middle):
-            p[1 + j] = Sum({FREE: nothing + value, j: nothing + 1.0})
+        for j, (value, scale) in enumerate(zip(self.middle, self.scales, strict=True)):
+            p[1 + j] = Sum({FREE: nothing + value, **({j: nothing + scale} if scale else {})})
         with np.errstate(all="ignore"):
             whole = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
         found = [np.zeros(whole.shape, dtype=object) for _ in p]
@@ -206,18 +217,13 @@ class Parts:
         return found
 
     def corners(self) -> Iterator[tuple[float, ...]]:
-        """Those of a box that holds all deviations; of parameters that move nothing one suffices."""
+        """Those of a box that holds all shares; of parameters that move nothing one suffices."""
         box, ends = self.system.parameters, []
-        if not isinstance(box, Box):
-            raise Unchecked("the checker knows boxes of parameters beside the time")
-        for low, high, middle, places in zip(
-            box.lower.tolist(), box.upper.tolist(), self.middle, self.moved, strict=True
-        ):
-            least, most = (
-                _beyond(Fraction(low) - Fraction(middle), -inf),
-                _beyond(Fraction(high) - Fraction(middle), inf),
-            )
-            ends.append(([least] if least == most else [least, most]) if places else [0.0])
+        assert isinstance(box, Box)
+        every = zip(box.lower.tolist(), box.upper.tolist(), self.middle, self.scales, self.moved, strict=True)
+        for low, high, middle, scale, places in every:
+            least, most = (_beyond(Fraction(end) - Fraction(middle), side) for end, side in ((low, -inf), (high, inf)))
+            ends.append([end / scale for end in dict.fromkeys((least, most))] if places else [0.0])
         return product(*ends)
 
 
@@ -257,8 +263,8 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
         raise Unchecked("the checker knows no return, and no fixed final values, beside parameters and the time")
     called = list(problem.names.states or [f"x{i + 1}" for i in range(d)])
     units = list(problem.names.state_units)
-    for name, places in zip(system.names, parts.moved, strict=True):
-        called += [f"{called[i]} per {name}" for i in places]
+    for name, scale, places in zip(system.names, parts.scales, parts.moved, strict=True):
+        called += [f"{called[i]} per {scale:.3g} {name}" for i in places]
         units += [units[i] for i in places] if problem.names.state_units else []
     laws = [(begin, _law(parts, law, begin, until)) for begin, until, law in system.laws]
     costs = [None if q is None else Quadratic(np.pad(q.Q, (0, more)), np.pad(q.reference, (0, more)))
@@ -267,7 +273,7 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
         problem,
         system=VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:])),
         initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(more)]),
-        initial_set=None if begun is None else _begun(begun, more),
+        initial_set=_begun(begun, more) if begun is not None and more else begun,
         path=[_seen(entry, corners) for entry in problem.path],
         terminal=[_polytope(end, corners) for end in problem.terminal if not isinstance(end, Equality)],
         integral=[_sums(entry, corners) for entry in problem.integral],

@@ -1,9 +1,9 @@
 """How the state of a system that changes with time depends on its parameters: affinely, or not.
 
 Entries of ``B``, ``E`` and ``c`` in which parameters stand to the first power make the state an affine function of
-them, ``x(t; p) = x_0(t) + sum_j (p_j - centre_j) y_j(t)``: every part of it is a state that obeys a known system. So do
-entries of ``A``, where what they multiply depends on no parameter. What is linear in the parameters is largest at a
-corner of their box, whatever the times, controls and disturbances.
+them, ``x(t; p) = x_0(t) + sum_j (p_j - centre_j) / unit_j y_j(t)``: every part of it is a state that obeys a known
+system. So do entries of ``A``, where what they multiply depends on no parameter. What is linear in the parameters is
+largest at a corner of their box, whatever the times, controls and disturbances.
 """
 
 from __future__ import annotations
@@ -141,17 +141,18 @@ class Split:
     curved: list[tuple[int, int]]
 
     @staticmethod
-    def of(entry: object, time: Value, centre: Array) -> Split:
-        """That of an entry of a law, an array or a function of the time and of the parameters, about their
-        ``centre``."""
+    def of(entry: object, time: Value, centre: Array, units: Array) -> Split:
+        """That of an entry of a law, an array or a function of the time and of the parameters, about their ``centre``
+        and in ``units`` of theirs, 0 of a parameter that is known."""
         nu = centre.size
         known: tuple[Value | None, ...] = (None,) * nu
         p = np.empty(1 + nu, dtype=object)
         p[0] = Dependent(time, known)
         with np.errstate(all="ignore"):  # what is not finite is reported where the numbers are used
             nothing = 0.0 * time  # a number of the kind of the time, which counts what is rounded
-            for j, middle in enumerate(centre.tolist()):
-                p[1 + j] = Dependent(nothing + middle, tuple(nothing + 1.0 if i == j else None for i in range(nu)))
+            for j, (middle, unit) in enumerate(zip(centre.tolist(), units.tolist(), strict=True)):
+                slopes = tuple(nothing + unit if i == j and unit else None for i in range(nu))
+                p[1 + j] = Dependent(nothing + middle, slopes)
             table = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
         whole = np.zeros((1 + nu, *table.shape), dtype=object)
         curved = list[tuple[int, int]]()
@@ -174,10 +175,12 @@ class Split:
 @final
 @dataclass(frozen=True, eq=False)
 class Dependence:
-    """Which states ``y_j`` there are: those that parameter ``j`` reaches, ``reached (nu, d)``; ``centre (nu,)``."""
+    """Which states ``y_j`` there are: those that parameter ``j`` reaches, ``reached (nu, d)``, about the ``centre
+    (nu,)`` of the parameters and in ``units (nu,)`` of theirs."""
 
     reached: np.ndarray
     centre: Array
+    units: Array
 
     @property
     def states(self) -> int:
@@ -187,12 +190,12 @@ class Dependence:
     def rows(self, deviations: Array) -> Array:
         """``x`` as rows on all states, ``(d, states)``, where the parameters deviate from their centre by these."""
         nu, d = self.reached.shape
-        axes = np.eye(d)
-        return np.hstack([axes, *(deviations[j] * axes[:, self.reached[j]] for j in range(nu))])
+        axes, shares = np.eye(d), deviations / np.where(self.units > 0.0, self.units, 1.0)
+        return np.hstack([axes, *(shares[j] * axes[:, self.reached[j]] for j in range(nu))])
 
     def matrix(self, name: str, entry: object, time: Value) -> Table:
         """``A``, or one of ``B``, ``E``, ``c``, of the system of all states at a time."""
-        whole, (nu, d) = Split.of(entry, time, self.centre).whole, self.reached.shape
+        whole, (nu, d) = Split.of(entry, time, self.centre, self.units).whole, self.reached.shape
         if name != "A":
             return np.concatenate([whole[0], *(whole[1 + j][self.reached[j]] for j in range(nu))])
         below = []
@@ -221,16 +224,19 @@ class Superposed:
         return self.dependence.matrix(self.name, self.entry, p[0])
 
 
-def dependence(laws: Sequence[Sequence[object]], centre: Array) -> Dependence | tuple[int, str, int, int]:
-    """That of a system whose laws have these ``A``, ``B``, ``E`` and ``c`` (or ``None``); or the law, the matrix and
+def dependence(laws: Sequence[Sequence[object]], centre: Array, far: Array) -> Dependence | tuple[int, str, int, int]:
+    """That of a system whose laws have these ``A``, ``B``, ``E`` and ``c`` (or ``None``), and whose parameters are at
+    most ``far (nu,)`` from their ``centre``: a power of two above that is their unit, so that states are in no units
+    that are much larger or smaller than what they do. Or the law, the matrix and
     the entry of it that make the state no affine function of the parameters."""
+    units = np.where(far > 0.0, np.ldexp(1.0, np.frexp(far)[1]), 0.0)
     every: list[tuple[Split, list[Split]]] = []
     for number, entries in enumerate(laws):
         parts = []
         for name, entry in zip(PARTS, entries, strict=True):
             if entry is None:
                 continue
-            split = Split.of(entry, AnyNumber(), centre)
+            split = Split.of(entry, AnyNumber(), centre, units)
             if split.curved:
                 i, j = split.curved[0]
                 return number, name, i, j
@@ -248,4 +254,4 @@ def dependence(laws: Sequence[Sequence[object]], centre: Array) -> Dependence | 
         if twice.any():
             i, j = np.argwhere(twice)[0].tolist()
             return number, "A", i, j
-    return Dependence(reached, centre)
+    return Dependence(reached, centre, units)

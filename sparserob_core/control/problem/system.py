@@ -597,7 +597,8 @@ class VaryingSystem:
         """How the state depends on the parameters; raises `InputError` where that is not affinely."""
         centre = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
         entries = [[law.entry(name) for name in PARTS] for _, _, law in self.laws]
-        found = dependence(entries, centre)
+        ends = (centre, centre) if self.parameters is None else (self.parameters.lower, self.parameters.upper)
+        found = dependence(entries, centre, np.maximum(ends[1] - centre, centre - ends[0]))
         if isinstance(found, Dependence):
             return found
         number, name, i, j = found

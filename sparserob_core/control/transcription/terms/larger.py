@@ -21,7 +21,7 @@ def larger(problem: OptimalControlProblem, more: int, **told: Any) -> OptimalCon
     return replace(
         problem,
         initial_state=np.append(np.asarray(problem.initial_state), zeros),
-        initial_set=None if begun is None else product([begun, Box(zeros, zeros)]),
+        initial_set=begun if begun is None or not more else product([begun, Box(zeros, zeros)]),
         cost=replace(problem.cost, state=_costing(state, more), final=_costing(final, more)),
         measurements=replace(measured, C=columns(measured.C, d + more)),
         **told,

@@ -28,8 +28,9 @@ CORNERS = 64  # of a box of parameters: rows are as many times more, with ten ti
 
 def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same problem without parameters beside the time. The states of one in the middle of their box stay the first
-    ones, after which come what each parameter adds per unit of it; both obey known equations. A bound of the state
-    holds for all parameters where it holds at the corners. Differences to the middle are rounded outwards."""
+    ones, after which comes what each parameter adds, per about half of its interval; both obey known equations. A bound
+    of the state holds for all parameters where it holds at the corners. Differences to the middle are rounded
+    outwards."""
     system = problem.system
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return problem
