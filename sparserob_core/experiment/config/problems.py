@@ -126,8 +126,8 @@ class PieceOptions(Options):
 @final
 class SystemOptions(Options):
     """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)``, or ``pieces`` of such systems that take turns at
-    known times; entries are numbers, or arithmetic expressions in the parameters and in what ``define`` names. Of a
-    known system they may be expressions in the time ``t``."""
+    known times; entries are numbers, or arithmetic expressions in the parameters, in the time ``t`` and in what
+    ``define`` names."""
 
     A: Rows | None = None
     """Square matrix, row by row."""
