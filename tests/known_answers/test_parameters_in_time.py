@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.control.transcription.provable import unprovable
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -202,6 +203,12 @@ def test_a_certificate_whose_decision_serves_the_middle_alone_is_refuted(tmp_pat
     mine = tmp_path / "run" / "certificate.json"
     mine.write_text(json.dumps({**json.loads(mine.read_text()), "decision": theirs["decision"]}))
     assert {one.name: one.verdict for one in check(tmp_path / "run").claims}["terminal"] == "fails"
+
+
+def test_nothing_is_said_against_a_proof_beside_measurable_disturbances() -> None:
+    problem = assemble(load_config(beside(), {"problem.disturbance_class": "measurable"})).problem
+    assert isinstance(problem, sr.OptimalControlProblem)
+    assert unprovable(problem) is None
 
 
 @pytest.mark.parametrize(

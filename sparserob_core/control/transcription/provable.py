@@ -9,6 +9,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.errors import NotEnclosable
 
 SECONDS = 30.0  # that the search takes for a problem that cannot be proven, unless a limit is given: for a witness
@@ -22,6 +23,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
 
     Nothing is solved: this takes milliseconds.
     """
+    problem = superposed(problem)  # parameters beside the time are no obstacle
     if problem.measurable is not None:
         paths = [entry.set for entry in problem.windows]
         curved = [one for one in (*paths, *problem.terminal_sets) if one.halfspaces() is None]
