@@ -19,6 +19,7 @@ from sparserob_core.control.transcription.provable import unprovable
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
+from tests.support import tampering
 
 Config = dict[str, Any]
 
@@ -203,6 +204,30 @@ def test_a_certificate_whose_decision_serves_the_middle_alone_is_refuted(tmp_pat
     mine = tmp_path / "run" / "certificate.json"
     mine.write_text(json.dumps({**json.loads(mine.read_text()), "decision": theirs["decision"]}))
     assert {one.name: one.verdict for one in check(tmp_path / "run").claims}["terminal"] == "fails"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("finished") / "run"
+    solved(BASE, out)
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change",
+    [
+        tampering.system(parameters={"p": [-0.0501, 0.05], "q": [-0.2, 0.3]}),
+        tampering.system(parameters={"p": [-0.05, 0.05], "q": [-0.2, 0.3001]}),
+        tampering.system(B=[[0], ["(1 + 1.001*p) * (1 + 0.1*cos(t))"]]),
+        tampering.system(c=[0, "0.1001 * q * cos(2*t)"]),
+    ],
+    ids=["a longer interval", "another longer interval", "a slope", "a drift"],
+)
+def test_parameters_that_are_changed_afterwards_are_found(
+    change: tampering.Change, finished: Path, tmp_path: Path
+) -> None:
+    assert check(tampering.forged(finished, tmp_path / "copy", change, consistent=True)).status == "refuted"
 
 
 def test_nothing_is_said_against_a_proof_beside_measurable_disturbances() -> None:
