@@ -205,7 +205,7 @@ def _outputs(
             for a in range(measured.outputs):
                 given = [c * x for c, x in zip(carried[a], start, strict=True)] if start else []
                 for block, column, rest in zip(pushed[a], [balls(x) for x in w.T], centre, strict=True) if j else ():
-                    given += [c * (x - m) for c, x, m in zip(block, column, rest, strict=True)]
+                    given += [c * (x - m) for c, x, m in zip(block, column, rest, strict=True) if not c.is_zero()]
                 noise.append(sum((-x for x in given), about[a] + arb_of(outputs[j, a])))
             if not known(measured.noise).holds(noise):
                 raise Broken(f"causal: no noise is shown to make what is said to be measured at t = {time:.6g}")

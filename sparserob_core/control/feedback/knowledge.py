@@ -12,7 +12,7 @@ Rhodes 1971), signal by signal.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -187,7 +187,8 @@ class OfOutputs(Knowledge):
     """Reports are outputs ``(p,)``: ``C (J, p, Q)`` is what the deviations in ``spread`` give to each, and ``hidden``,
     half-spaces ``(H, h)``, holds what a ``noise``, both about its middle, can add to them; ``place``: that of the noise
     among all deviations. A signal is the deviations and then the outputs beside the nominal ones, ``(Q + J p,)``. No
-    more than ``limit`` of ``work`` is done: what is not known by then is not asked of anybody."""
+    more than ``limit`` of ``work`` is done, and nothing once its time has ``passed``: what is not known by then is not
+    asked of anybody."""
 
     N: Array
     C: Array
@@ -198,6 +199,7 @@ class OfOutputs(Knowledge):
     seen: np.ndarray
     begun: np.ndarray
     limit: float = np.inf
+    passed: Callable[[], bool] = lambda: False
     work: float = 0.0
     _held: dict[tuple[bytes, int], tuple[float, Array]] = field(default_factory=dict, repr=False)
 
@@ -321,7 +323,7 @@ class OfOutputs(Knowledge):
         if not reports:
             z = extreme(self.spread, direction)
             return float(direction @ z), z
-        if self.work > self.limit:
+        if self.work > self.limit or self.passed():
             return None
         history = self.history(signal, reports)
         if history != self._imposed:

@@ -90,11 +90,15 @@ class Limits:
         """That are left."""
         return max(0.0, self._until - time.perf_counter())
 
+    def passed(self) -> bool:
+        """Whether its time, or that of the run, is over."""
+        return not self.seconds or self._passed()
+
     def over(self, tree: Tree) -> bool:
         """Whether the search for a tree ends, and why."""
         s = tree.sampled
         most = CELLS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
-        if not self.seconds or self._passed():
+        if self.passed():
             self.ended = "seconds"
         elif tree.work + tree.knowledge.work > self.work or len(tree.signals) > most:
             self.ended = "work"
@@ -165,7 +169,7 @@ class CausalSearch:
         knowledge = OfOutputs.of(self.loop, s.N, s.time, points[:-1], seen, share)
         if knowledge is None:
             return None
-        knowledge.limit = limits.work
+        knowledge.limit, knowledge.passed = limits.work, limits.passed
         known = [beside[0].signals[one] for one in np.unique(beside[1].signals)] if beside is not None else []
         return self._planted(knowledge, known, limits, highest)
 
