@@ -123,8 +123,10 @@ def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any]) -> str:
     case.clock.check()
     worst = _followed(case, asked)
     value = _witnessed(case, asked, entry, worst)
+    if not value[1] >= low:
+        raise Broken(f"{reached_side!r} is written, its witness reaches {sign * value[1]!r}")
     if not value[0] >= low:
-        raise Broken(f"{reached_side!r} is written, its witness reaches {sign * value[0]!r}")
+        raise Unchecked(f"{reached_side!r} is written, and the witness is followed to {sign * value[0]!r} only")
     if high is None:
         raise Unchecked(f"{reached_side:.9g} is reached, and no bound is written on the other side")
     if value[0] > high:
