@@ -24,7 +24,7 @@ from sparserob_core.checker.reach.adjoint import Adjoint, Worst
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.loop_tube import LoopTube
-from sparserob_core.checker.reach.tube import MANY, Tube
+from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
@@ -45,6 +45,9 @@ TUBES_KEPT = 8
 # States from which the rows of a known system are followed: a ball matrix for every length of a cell, as the tube has
 # them, takes as long as all rows. Of few states the tube takes less; of 48 it takes minutes, and of 270 hours.
 FOLLOWED = 16
+# Pieces up to which they are: what a piece adds is summed at every end of a cell. With a tenth of it tubes of 48 states
+# on 1600 pieces end without a verdict; with ten times as many the sums take minutes.
+MOST_PIECES = 4000
 MOST_CELLS = 400_000  # of time, examined for one row
 PARTS = 8  # into which a cell is cut that is not bounded: a tenth of a chord's distance is left, and less
 HALVINGS = 16  # rounds of cuts: cells are then rounding
@@ -96,7 +99,7 @@ def follows(case: Case) -> bool:
     system = case.problem.system
     if not isinstance(system, LinearSystem) or system.parameter_count or system.states < FOLLOWED:
         return False
-    return not case.answering and case.alike and case.execution is None and len(case.grid) <= MANY
+    return not case.answering and case.alike and case.execution is None and len(case.grid) <= MOST_PIECES
 
 
 def _along_rows(case: Case, window: Window) -> Proven:
