@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
     from sparserob_core.checker.claims.window import Window
 
-# Of its row's unit, by how much the violation that a run tells of a plant of many states may be off: with 348, whose
-# modes are conditioned by 5e3, a run rounds 2e-9, for which its proof allows. A tenth of it calls such a run wrong; ten
-# times as much is seen in the seventh digit of what a wall allows.
-ROUNDED = 1e-8
+# Of its row's unit, for every state, by how much the violation that a run tells may be off where rows are followed:
+# sums of so many terms are rounded. Of 348 states, whose modes are conditioned by 5e3, a run rounds 1.6e-9, for which
+# its proof allows: a tenth of this calls such a run wrong, ten times as much is seen in the seventh digit of a wall.
+ROUNDED = 1e-11
 
 
 def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
@@ -177,7 +177,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     pieces = _pieces(case, time, jumps=window.is_mixed)
     if follows(case):
         over, slack = _along_rows(case, window, time, begun, pieces)
-        return over, slack + ROUNDED * float(case.units(window).rows.max(initial=0.0))
+        return over, slack + ROUNDED * case.problem.system.states * float(case.units(window).rows.max(initial=0.0))
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
     tube, beside = _tube(case, parameter, begun, basis, gains), case.beside(window, basis, gains)
     polynomials = list[Polynomial]()

@@ -71,25 +71,24 @@ def test_rows_of_a_tree_are_those_of_states_under_any_control_and_signal(name):
     case, loop = made(name)
     rng, times = np.random.default_rng(4), np.array([0.0, 0.3, 1.1, 2.0])
     constraints = [(H, rng.normal(size=4), times[1:]), (H[:0], np.zeros(0), times), (H[:1], np.ones(1), times[:2])]
-    starts = case.changes[:-1]
-    found = Sampled.of(loop, constraints, starts)
+    found = Sampled.of(loop, constraints)
     assert found.constraint.tolist() == [0] * 12 + [2] * 2 and found.side.tolist() == [0, 1, 2, 3] * 3 + [0, 0]
     assert found.time.tolist() == [0.3] * 4 + [1.1] * 4 + [2.0] * 4 + [0.0, 0.3]
-    assert found.begun.tolist() == [int((starts < time).sum()) for time in found.time]
     K = case.breakpoints.size - 1
     d, m = case.B.shape
-    v, Q = rng.normal(size=(m, K)), loop.noise.start
+    v, Q, begun = rng.normal(size=(m, K)), loop.noise.start, 0 if case.begun is None else d
     states = case.states(v, np.zeros((K, K, m, d)), times)[0]
-    z = rng.normal(size=Q)
-    reached = states[:, :, 0] + states[:, :, 1 : 1 + Q] @ z
+    z = rng.normal(size=Q + begun)
+    deviations = np.concatenate([states[:, :, 1 : 1 + Q], states[:, :, states.shape[2] - begun :]], axis=2)
+    reached = states[:, :, 0] + deviations @ z
     by_hand = []
     for number, side, time in zip(found.constraint, found.side, found.time, strict=True):
         c, h = constraints[number][0][side], constraints[number][1][side]
         by_hand.append(c @ reached[times == time][0] - h)
     told = np.einsum("rmk,mk->r", found.T, v) + found.N @ z - found.b
     assert told == pytest.approx(np.array(by_hand), abs=1e-10)
-    nothing = Sampled.of(loop, [(H[:0], np.zeros(0), times)], starts)
-    assert nothing.T.shape == (0, m, K) and nothing.N.shape == (0, Q) and nothing.begun.size == 0
+    nothing = Sampled.of(loop, [(H[:0], np.zeros(0), times)])
+    assert nothing.T.shape == (0, m, K) and nothing.N.shape == (0, z.size) and nothing.time.size == 0
 
 
 def test_an_observer_predicts_with_the_least_error():
