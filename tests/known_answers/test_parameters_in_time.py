@@ -19,6 +19,7 @@ from sparserob_core.control.transcription.provable import unprovable
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.figures.drawing import figure_data
 from tests.support import tampering
 
 Config = dict[str, Any]
@@ -83,6 +84,22 @@ def test_the_gain_of_an_integrator_is_paid_for_at_its_weakest(tmp_path: Path) ->
     outcome = solved(config, tmp_path / "run")
     assert outcome.result.status == "certified"
     assert outcome.result.cost == pytest.approx(cost, rel=1e-8)
+
+
+def test_tubes_and_figures_are_of_the_states_at_all_parameters() -> None:
+    """``x' = (1 + p) (2 - t) + 1/2``, with integrals after it: what the gain adds is in the tube, not below it."""
+    made = beside(A=[[0]], B=[["(1 + p) * (2 - t)"]], E=[[1]], c=["0.5"], parameters={"p": [-0.1, 0.2]})
+    made["problem"].update(
+        horizon=2.0, initial_state=[-1.0], disturbance=None, terminal=[{"box": [2.5]}], path=[],
+        integral=[{"H": [[1]], "G": [[0]], "from": 0, "to": 2, "upper": [5.0]}],
+    )  # fmt: skip
+    experiment = assemble(load_config(made))
+    data = figure_data(experiment, np.ones((1, 10)), None, (), None)
+    given = 2.0 * data.times - data.times**2 / 2
+    assert data.drawn_states == (0, 2, 3) and data.of_states == ""  # its integral at either corner
+    np.testing.assert_allclose(data.tube_lower[0], -1.0 + 0.9 * given + data.times / 2, atol=1e-9)
+    np.testing.assert_allclose(data.tube_upper[0], -1.0 + 1.2 * given + data.times / 2, atol=1e-9)
+    np.testing.assert_allclose(data.state[0], -1.0 + 1.05 * given + data.times / 2, atol=1e-9)
 
 
 def at_the_corners(config: Config) -> float:

@@ -16,6 +16,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.terms.superposed import at_corners
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.result import Result
@@ -54,7 +55,7 @@ class Signal:
 class Tube:
     """Where the states are at ``times (T,)``: the ``nominal`` ones, at the centre of every uncertainty set, and the
     least and largest values that any disturbance brings them to, ``lower`` and ``upper``, ``(d, T)`` each, at the
-    parameters of a lattice."""
+    parameters of a lattice; of parameters beside the time at all of them."""
 
     times: Array
     nominal: Array
@@ -166,15 +167,25 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
     lattice, _ = model.parameters.lattice()
     if len(lattice) > PARAMETERS:
         lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
-    count, found = len(lattice), np.empty((len(directions), times.size))
+    count, found = len(lattice), np.full((len(directions), times.size), -np.inf)
     size = max(1, INSTANTS // count)
     for start in range(0, times.size, size):
         part = slice(start, start + size)
         at, p = np.tile(times[part], count), np.repeat(lattice, times[part].size, axis=0)
         for row, direction in enumerate(directions):
-            values = model.functionals.values(theta, at, np.tile(direction, (at.size, 1)), p)
-            found[row, part] = values.reshape(count, -1).max(axis=0)
+            for corner in _everywhere(model, direction):
+                values = model.functionals.values(theta, at, np.tile(corner, (at.size, 1)), p)
+                found[row, part] = np.maximum(found[row, part], values.reshape(count, -1).max(axis=0))
     return found
+
+
+def _everywhere(model: Transcription, direction: Array) -> Array:
+    """A row ``(d,)`` of states at every corner of the parameters beside the time, ``(corners, d)``."""
+    rows = at_corners(model.stated) or [np.eye(model.stated.system.states)]
+    d, size = rows[0].shape
+    every = np.tile(direction, (len(rows), 1))
+    every[:, d:size] += [direction[:d] @ one[:, d:] for one in rows]
+    return np.unique(every, axis=0)
 
 
 def _times(time: npt.ArrayLike, horizon: float) -> Array:

@@ -37,11 +37,12 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
     disturbances = arrays["disturbances"]
     states, channels = len(data.drawn_states), disturbances.shape[1]
     figure, axes = panels(states + channels, 1.7, extra=0.35)
+    paths = [_path(*worst, data) for worst in zip(arrays["states"], arrays["directions"], strict=True)]
     for number, name in enumerate(arrays["names"].tolist()):
         pen = {"color": COLOURS[number % len(COLOURS)], "linestyle": DASHES[number // len(COLOURS) % len(DASHES)]}
         at = int(np.abs(arrays["state_times"] - arrays["times"][number]).argmin())
         for component, ax in zip(data.drawn_states, axes[:states], strict=True):
-            path = arrays["states"][number, component]
+            path = paths[number][component]
             ax.plot(
                 arrays["state_times"],
                 path,
@@ -72,7 +73,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
             )
     for component, ax in zip(data.drawn_states, axes[:states], strict=True):
         draw_tube(ax, data, component)
-        finish_panel(ax, data, component, tuple(arrays["states"][:, component]))
+        finish_panel(ax, data, component, tuple(path[component] for path in paths))
     for channel, ax in enumerate(axes[states:]):
         ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
         ax.set_ylabel(f"$w_{{{channel + 1}}}(t)$" if channels > 1 else "$w(t)$")
@@ -81,12 +82,23 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
     return figure
 
 
+def _path(states: Array, direction: Array, data: FigureData) -> Array:
+    """The states ``(d, T)`` of a worst case, at the corner of the parameters beside the time that its direction is
+    of."""
+    if not data.corners:
+        return states
+    d, size = data.corners[0].shape
+    corner = min(data.corners, key=lambda one: np.abs(direction[:d] @ one[:, d:] - direction[d:size]).sum())
+    return np.concatenate([corner @ states[:size], states[d:]])
+
+
 def _uncertain(arrays: Mapping[str, Array], data: FigureData) -> str:
     """What differs in a worst case from the nominal one, of what there is."""
-    begun = not np.allclose(arrays["initial_states"], data.state[:, 0], rtol=1e-9, atol=0.0)
+    known = ~np.isnan(data.state[:, 0])
+    begun = not np.allclose(arrays["initial_states"][:, known], data.state[known, 0], rtol=1e-9, atol=0.0)
     kinds = {
         "disturbance": arrays["disturbances"].any(),
-        "parameter": arrays["parameters"].shape[1] > 0,
+        "parameter": arrays["parameters"].shape[1] > 0 or bool(data.corners),
         "noise": "noises" in arrays,
         "initial state": begun,
     }

@@ -17,6 +17,7 @@ from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.adversary import find_adversaries
 from sparserob_core.control.studies.answer import Tube, supports, tube
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.terms.superposed import at_corners
 from sparserob_core.control.transcription.transcribe import path_names
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
@@ -110,6 +111,7 @@ def _data(
     axes = np.eye(problem.system.controls)
     tolerance = experiment.loaded.config.method.options.get("tolerance")
     decision, times = np.ravel(theta), _times(model.response.grid.breakpoints)
+    states = _own(model) if states is None else states
     around = _tube(model, decision, times, states)
     answered = {} if model.feedback is None else _answered(model, decision, times, draws, states)
     longest = 0.0 if program.activity is None else float(program.activity.sum())
@@ -137,6 +139,7 @@ def _data(
         names=problem.names,
         plane=_plane(model, decision, around.times),
         tolerance=tolerance if isinstance(tolerance, float) else None,
+        corners=at_corners(model.stated) or (),
         **answered,
     )
 
@@ -146,10 +149,21 @@ def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     them the reach is told at a few times. ``None``: all."""
     if not isinstance(experiment, ControlExperiment) or experiment.problem.system.states <= MOST_STATES:
         return None
-    problem = experiment.problem
-    rough = tube(experiment.transcription, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH))
+    problem, own = experiment.problem, _own(experiment.transcription)
+    if own is not None and len(own) <= MOST_STATES:
+        return own
+    rough = _tube(experiment.transcription, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own)
     reach = rough.upper.max(axis=1) - rough.lower.min(axis=1)
     return sorted({*telling(reach, [*_walls(problem)])[:MOST_STATES], *(problem.names.in_plane or ())})
+
+
+def _own(model: Transcription) -> list[int] | None:
+    """All states but those that parameters beside the time add, which are in the tubes of the others; ``None``: all."""
+    corners = at_corners(model.stated)
+    if corners is None:
+        return None
+    d, size = corners[0].shape
+    return [*range(d), *range(size, model.problem.system.states)]
 
 
 def _tube(model: Transcription, decision: Array, times: Array, states: Sequence[int] | None) -> Tube:

@@ -109,7 +109,9 @@ class FigureData:
     added up to the cost, ``cost_of`` what is added up to it, where that is not the L1 norm alone, ``cost_unit``
     what it is measured in, where that is known, ``counts`` whether cost means the time that the control acts, ``names``
     what everything is called, ``plane`` where the system moves, if the problem says that it does so in one, ``push (m,
-    K)`` the switching function, how hard the constraints push the control, where that is known.
+    K)`` the switching function, how hard the constraints push the control, where that is known. ``corners``: of
+    parameters beside the time, the states at each corner as rows ``(d, size)`` on the first of them, of which those
+    after the ``d``-th are what parameters add, and not drawn.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and
@@ -152,6 +154,7 @@ class FigureData:
     names: Names = UNNAMED
     plane: Plane | None = None
     push: Array | None = None
+    corners: Sequence[Array] = ()
 
     def __post_init__(self) -> None:
         pieces, instants = self.breakpoints.size - 1, self.times.size
@@ -175,7 +178,8 @@ class FigureData:
     @property
     def of_states(self) -> str:
         """What a title adds where not every state is shown."""
-        drawn, known = len(self.drawn_states), self.state.shape[0]
+        added = sum(one.shape[1] - one.shape[0] for one in self.corners[:1])
+        drawn, known = len(self.drawn_states), self.state.shape[0] - added
         return "" if drawn == known else f", {drawn} of {known} states"
 
     def control_label(self, channel: int) -> str:

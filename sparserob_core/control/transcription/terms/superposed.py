@@ -34,9 +34,8 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
     system = problem.system
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return problem
-    depends = system.dependence
-    corners = _corners(system.parameters, depends)
-    rows = [depends.rows(corner) for corner in corners]
+    depends, rows = system.dependence, at_corners(problem)
+    assert rows is not None
     return larger(
         problem,
         depends.states - system.states,
@@ -46,6 +45,15 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
         integral=[_integral(entry, rows) for entry in problem.integral],
         names=_names(problem.names, system, depends),
     )
+
+
+def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
+    """The stated states at every corner of the box of parameters beside the time, as rows ``(d, size)`` on those of one
+    in the middle and on what the parameters add; ``None`` where there are no such parameters."""
+    system = problem.system
+    if not isinstance(system, VaryingSystem) or system.parameters is None:
+        return None
+    return [system.dependence.rows(corner) for corner in _corners(system.parameters, system.dependence)]
 
 
 def _corners(box: Box, depends: Dependence) -> list[Array]:
