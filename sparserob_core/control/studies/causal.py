@@ -25,11 +25,12 @@ INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards b
 AT_ONCE = 8  # signals that a round adds
 TOWARDS = 0.9  # of the way from the bound to the policy's cost: the budget at which the tree is asked for room
 NONE = 1e-9  # a relaxation below is rounding
-# Rounds without a better bound, after which the search ends: each share of the answers once, and the first again.
+# Rounds without a better bound, after which more of them are a bonus: where a limit ends these, the search has settled.
 IDLE = 4
-# Shares of the policy's answers, with which the worst signals are sought in turn. Policies that cost as little answer
-# differently: with the first share alone one of them led to 0.433 where others led to 0.448; more shares find no more.
-ANSWERED = (1.0, 0.5, 0.0)
+# Shares of the policy's answers, with which the worst signals are sought after so many rounds without a better bound;
+# the search ends with the last. Policies that cost as little answer differently: with the first share alone one of them
+# led to 0.433 where others led to 0.448, and with another share after every round, or after three, one led to 0.424.
+ANSWERED = (1.0, 1.0, 1.0, 1.0, 0.5, 0.0)
 WORK, EACH, PER = 1e7, 2e6, 3e3  # that a search may do anyway; for each of a run's programs, and for its columns
 CELLS = 2e7  # numbers of one kind about all signals of a tree: 160 MB
 INSIDE = 1  # times sampled within every piece, beside its ends and the times that the policy's bound rests on
@@ -94,8 +95,8 @@ class Limits:
         """Whether its time, or that of the run, is over."""
         return not self.seconds or self._passed()
 
-    def over(self, tree: Tree) -> bool:
-        """Whether the search for a tree ends, and why."""
+    def over(self, tree: Tree, idle: int = 0) -> bool:
+        """Whether the search for a tree ends after so many ``idle`` rounds, and why."""
         s = tree.sampled
         most = CELLS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
         if self.passed():
@@ -104,7 +105,10 @@ class Limits:
             self.ended = "work"
         elif not self.room(tree):
             self.ended = "signals"
-        return self.ended != "settled"
+        over = self.ended != "settled"
+        if idle >= IDLE and self.ended != "seconds":
+            self.ended = "settled"
+        return over
 
     def begin(self, tree: Tree) -> None:
         """The signals that are at hand do not count."""
@@ -202,7 +206,7 @@ class CausalSearch:
 
     def _least_cost(self, tree: Tree, cost: float, limits: Limits) -> tuple[Tree, Grown, bool] | None:
         best, idle = tree.least(), 0
-        while best is not None and idle < IDLE and not limits.over(tree):
+        while best is not None and idle < len(ANSWERED) and not limits.over(tree, idle):
             aim = cost if np.isfinite(cost) else np.inf
             centre = tree.relaxed(best.value + TOWARDS * max(aim - best.value, 0.0), central=True)
             if centre is None or not self._grow(tree, centre, limits.room(tree), idle):
@@ -240,7 +244,7 @@ class CausalSearch:
 
     def _largest_factor(self, tree: Tree, limits: Limits) -> tuple[Tree, Grown] | None:
         best, idle = tree.least(), 0
-        while best is not None and idle < IDLE and not limits.over(tree):
+        while best is not None and idle < len(ANSWERED) and not limits.over(tree, idle):
             if not self._grow(tree, best, limits.room(tree), idle):
                 break
             better = tree.least()
@@ -251,11 +255,11 @@ class CausalSearch:
         return None if best is None else (tree, best)
 
     def _grow(self, tree: Tree, centre: Grown, most: int, idle: int) -> bool:
-        """Signals that are the worst if the control answers a share of what the policy does, the next share after every
-        ``idle`` round; whether there are new ones."""
+        """Signals that are the worst if the control answers a share of what the policy does, that of so many ``idle``
+        rounds; whether there are new ones."""
         shares = ANSWERED if self.decision is not None else (0.0,)
-        at = idle % len(shares)
-        return any(self._sought(tree, centre, most, share) for share in (*shares[at:], *shares[:at]))
+        at = min(idle, len(shares) - 1)
+        return any(self._sought(tree, centre, most, share) for share in dict.fromkeys((*shares[at:], *shares[:at])))
 
     def _sought(self, tree: Tree, centre: Grown, most: int, share: float) -> bool:
         """Signals that leave one of the tree at a report and are the worst for a row from there on, if the control
