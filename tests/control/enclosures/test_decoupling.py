@@ -3,6 +3,8 @@ rounding in exact arithmetic, and norm bounds that sampling never exceeds."""
 
 from __future__ import annotations
 
+from itertools import product
+
 import flint
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from sparserob_core.control.enclosures import decoupling as module
 from sparserob_core.control.enclosures.comparison import ComparisonSystem, block_norms, block_sizes, comparison_matrix
 from sparserob_core.control.enclosures.decoupling import MANY, _clusters, decoupled, decoupled_transitions
 
@@ -158,3 +161,16 @@ def test_eigenvalues_that_are_near_each_other_are_one_cluster_in_chains():
     assert found == [[0, 2, 5], [1, 6], [3, 4]]
     assert [one.tolist() for one in _clusters(np.array([1.0, 2.0, 3.0]), 0.5)] == np.eye(3, dtype=bool).tolist()
     assert len(_clusters(np.array([1.0, 2.0, 3.0]), 1.0)) == 1
+
+
+def test_what_is_wrong_with_an_inverse_is_in_its_bound_to_either_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an inverse that is told to be off by a thousandth, in every pattern of signs."""
+    T, exact = np.array([[2.0, 1.0], [1.0, 1.0]]), np.array([[1.0, -1.0], [-1.0, 2.0]])
+    for signs in product((-1.0, 1.0), repeat=4):
+        rough = exact + 1e-3 * np.array(signs).reshape(2, 2)
+        with monkeypatch.context() as told:
+            told.setattr(np.linalg, "inv", lambda _, rough=rough: rough)
+            found = module._checked(T, np.zeros(1, dtype=int), np.zeros(2, dtype=int))
+        assert found is not None
+        off = np.abs(exact - np.asarray(found.inverse, dtype=float))
+        assert (off <= found.defect @ np.abs(np.asarray(found.inverse, dtype=float))).all() and off.max() > 1e-7
