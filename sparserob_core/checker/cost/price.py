@@ -3,8 +3,9 @@ with what solves."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 ENOUGH = 1e-20  # of the sizes that are added up: how closely the quadratic terms are wanted
 MOST_BITS = 8192
+KEPT = 3  # walks: of the control, of another one beside it, and of the one that stays 0
 
 
 @final
@@ -49,6 +51,7 @@ class Price:
     control: Dictionary
     clock: Clock = NO_LIMIT
     varying: VaryingFlow | None = None
+    _latest: deque[tuple[Sequence[arb_mat], int, Walk]] = field(default_factory=lambda: deque(maxlen=KEPT))
 
     @cached_property
     def _changing(self) -> Changing | None:
@@ -150,8 +153,8 @@ class Price:
             norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), ball_of(Fraction(0)))
         if not self.is_quadratic:
             return float(norms.mid())
-        found, still = self._quadratic(pieces), [piece * 0 for piece in pieces]
-        constant, linear = self._quadratic(still).value, -found.value
+        found = self._quadratic(pieces)
+        constant, linear = self._quadratic(self._still).value, -found.value
         for piece, slope in zip(pieces, found.slope, strict=True):
             linear = linear + sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), linear * 0)
         bent = linear + constant  # slope'u - value + constant = u'P u / 2
@@ -191,11 +194,27 @@ class Price:
             if term is not None and not _semidefinite(term):
                 raise Broken(f"the matrix of the cost's {name} term is not positive semidefinite")
 
+    @cached_property
+    def _still(self) -> list[arb_mat]:
+        """The control that stays 0."""
+        from flint import arb
+
+        return [stacked([[arb(0)]] * self.problem.system.controls)] * len(self._lengths)
+
     def _quadratic(self, pieces: Sequence[arb_mat]) -> Walk:
-        """The quadratic terms and their slopes, with as many bits as it takes."""
+        """The quadratic terms and their slopes, with as many bits as it takes. The latest are kept: a cost, what is
+        added up to it and what rounding is a share of are asked of one control."""
         from flint import ctx
 
-        bits = int(ctx.prec)
+        for control, bits, found in self._latest:
+            if control is pieces and bits == ctx.prec:
+                return found
+        self._latest.append((pieces, int(ctx.prec), self._resolved(pieces, int(ctx.prec))))
+        return self._latest[-1][2]
+
+    def _resolved(self, pieces: Sequence[arb_mat], bits: int) -> Walk:
+        from flint import ctx
+
         while True:
             with ctx.workprec(bits):
                 found = walked(self.problem, self.control, pieces, self._changing)
