@@ -168,24 +168,27 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
     if len(lattice) > PARAMETERS:
         lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
     count, found = len(lattice), np.full((len(directions), times.size), -np.inf)
+    every = _everywhere(model, directions)
     size = max(1, INSTANTS // count)
     for start in range(0, times.size, size):
         part = slice(start, start + size)
         at, p = np.tile(times[part], count), np.repeat(lattice, times[part].size, axis=0)
-        for row, direction in enumerate(directions):
-            for corner in _everywhere(model, direction):
-                values = model.functionals.values(theta, at, np.tile(corner, (at.size, 1)), p)
-                found[row, part] = np.maximum(found[row, part], values.reshape(count, -1).max(axis=0))
+        for row, direction in every:
+            values = model.functionals.values(theta, at, np.tile(direction, (at.size, 1)), p)
+            found[row, part] = np.maximum(found[row, part], values.reshape(count, -1).max(axis=0))
     return found
 
 
-def _everywhere(model: Transcription, direction: Array) -> Array:
-    """A row ``(d,)`` of states at every corner of the parameters beside the time, ``(corners, d)``."""
-    rows = at_corners(model.stated) or [np.eye(model.stated.system.states)]
-    d, size = rows[0].shape
-    every = np.tile(direction, (len(rows), 1))
-    every[:, d:size] += [direction[:d] @ one[:, d:] for one in rows]
-    return np.unique(every, axis=0)
+def _everywhere(model: Transcription, directions: Array) -> list[tuple[int, Array]]:
+    """Rows ``(d,)`` of ``directions (q, d)``, each with its number, at every corner of the parameters beside the time;
+    one that looks at no state which these reach is there once."""
+    corners = at_corners(model.stated)
+    if corners is None:
+        return list(enumerate(directions))
+    d, size = corners[0].shape
+    every = np.repeat(directions[:, None], len(corners), axis=1)
+    every[:, :, d:size] += np.stack([directions[:, :d] @ one[:, d:] for one in corners], axis=1)
+    return [(row, one) for row, part in enumerate(every) for one in np.unique(part, axis=0)]
 
 
 def _times(time: npt.ArrayLike, horizon: float) -> Array:

@@ -92,10 +92,9 @@ def _known(system: VaryingSystem, depends: Dependence) -> VaryingSystem:
 def _window(entry: PathConstraint | MixedConstraint, rows: list[Array]) -> PathConstraint | MixedConstraint:
     if isinstance(entry, MixedConstraint):
         H, G, h = (np.asarray(part) for part in (entry.H, entry.G, entry.h))
-        both, limits = _apart(
-            np.vstack([np.hstack([H @ one, G]) for one in rows]), np.tile(np.broadcast_to(h, len(H)), len(rows))
-        )
-        return replace(entry, H=both[:, : rows[0].shape[1]], G=both[:, rows[0].shape[1] :], h=limits)
+        limits, size = np.broadcast_to(h, len(H))[:, None], rows[0].shape[1]
+        every = _apart([np.hstack([H @ one, G, limits]) for one in rows])
+        return replace(entry, H=every[:, :size], G=every[:, size:-1], h=every[:, -1])
     moved = None if entry.relative_to is None else columns(entry.relative_to, 1 + rows[0].shape[1])
     return replace(entry, set=_everywhere(entry.set, rows), relative_to=moved)
 
@@ -105,22 +104,22 @@ def _everywhere(bound: ConvexSet | Equality, rows: list[Array]) -> ConvexSet:
     assert not isinstance(bound, Equality)  # which was refused, as curved sets were
     flat = bound.halfspaces()
     assert flat is not None
-    return Polytope(*_apart(np.vstack([flat[0] @ one for one in rows]), np.tile(flat[1], len(rows))))
+    every = _apart([np.column_stack([flat[0] @ one, flat[1]]) for one in rows])
+    return Polytope(every[:, :-1], every[:, -1])
 
 
-def _apart(rows: Array, limits: Array) -> tuple[Array, Array]:
-    """The rows without those that another one repeats."""
-    _, first = np.unique(np.column_stack([rows, limits]), axis=0, return_index=True)
-    kept = np.sort(first)
-    return rows[kept], limits[kept]
+def _apart(blocks: list[Array]) -> Array:
+    """All rows without those that repeat an earlier one."""
+    rows = np.vstack(blocks)
+    _, first = np.unique(rows, axis=0, return_index=True)
+    apart: Array = rows[np.sort(first)]
+    return apart
 
 
 def _integral(entry: IntegralConstraint, rows: list[Array]) -> IntegralConstraint:
     H, G = np.asarray(entry.H), np.asarray(entry.G)
     lower, upper = (np.asarray(side, dtype=float) for side in (entry.lower, entry.upper))
-    every = np.vstack([np.hstack([H @ one, G, lower[:, None], upper[:, None]]) for one in rows])
-    _, first = np.unique(every, axis=0, return_index=True)
-    every, size = every[np.sort(first)], rows[0].shape[1]
+    every, size = _apart([np.column_stack([H @ one, G, lower, upper]) for one in rows]), rows[0].shape[1]
     return replace(entry, H=every[:, :size], G=every[:, size:-2], lower=every[:, -2], upper=every[:, -1])
 
 
