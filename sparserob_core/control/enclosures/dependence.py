@@ -15,21 +15,12 @@ from typing import Any, TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.control.enclosures.elementary import eccentric_anomaly
+from sparserob_core.control.enclosures.elementary import FUNCTIONS, eccentric_anomaly
 from sparserob_core.sip.convex_set import Array
 
 Value: TypeAlias = Any
 """A float, or anything else with arithmetic, such as a `TaylorModel`."""
 Table: TypeAlias = "np.ndarray"
-FUNCTIONS = {
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "exp": np.exp,
-    "sqrt": np.sqrt,
-    "log": np.log,
-    "tanh": np.tanh,
-}
 PARTS = ("A", "B", "E", "c")
 
 

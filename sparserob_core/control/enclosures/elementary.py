@@ -8,6 +8,7 @@ the remainder).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
@@ -16,6 +17,15 @@ import numpy.typing as npt
 from sparserob_core.errors import NotEnclosable
 
 Series: TypeAlias = tuple[list[float], float]
+FUNCTIONS: dict[str, Callable[[Any], Any]] = {
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "exp": np.exp,
+    "sqrt": np.sqrt,
+    "log": np.log,
+    "tanh": np.tanh,
+}
 KEPLER_STEPS = 60  # each halves at least, and most are Newton's; a tenth of them leaves 1e-2 where e is near 1
 KEPLER_CIRCLES = 50  # down to 4 * 0.85^49 = 1.4e-3; with a tenth of them steps are shorter where e is above 0.9
 

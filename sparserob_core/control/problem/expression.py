@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sparserob_core.control.enclosures.elementary import eccentric_anomaly
+from sparserob_core.control.enclosures.elementary import FUNCTIONS, eccentric_anomaly
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -21,15 +21,6 @@ Value: TypeAlias = Any
 """A float, an array, or anything else with arithmetic, such as a `TaylorModel`."""
 Evaluation: TypeAlias = Callable[[Mapping[str, Value]], Value]
 
-FUNCTIONS: dict[str, Callable[[Value], Value]] = {
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "exp": np.exp,
-    "sqrt": np.sqrt,
-    "log": np.log,
-    "tanh": np.tanh,
-}
 CONSTANTS = {"pi": math.pi, "e": math.e}
 KEPLER = "kepler"  # the one function of two arguments
 _OPERATORS: dict[type[ast.operator], Callable[[Value, Value], Value]] = {

@@ -8,7 +8,8 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_core.control.problem.expression import FUNCTIONS, ExpressionMatrix, parse_matrix
+from sparserob_core.control.enclosures.elementary import FUNCTIONS
+from sparserob_core.control.problem.expression import ExpressionMatrix, parse_matrix
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 

@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
+from sparserob_core.control.enclosures.elementary import FUNCTIONS
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass
 from sparserob_core.control.problem.expression import (
     CONSTANTS,
-    FUNCTIONS,
     KEPLER,
     Definitions,
     ExpressionMatrix,

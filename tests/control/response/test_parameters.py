@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 
 from sparserob_core.control.response.parameters import LATTICE, ParameterIndex
-from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
+from sparserob_core.control.sets.sets import NormBall
 from sparserob_core.sip.convex_set import Box, ConvexSet
-
-SETS = {
-    "box": Box([-0.4, -0.2], [0.3, 0.5]),
-    "ellipse": Ellipsoid([0.1, 0.0], [[0.09, 0.03], [0.03, 0.16]]),
-    "simplex": Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.0, 0.0, 0.5]),
-    "diamond": NormBall(p=1.0, radius=0.4, centre=[0.1, 0.0]),
-    "3-norm": NormBall(p=3.0, radius=0.4, dimension=2),
-    "segment": Box([-0.4, 0.2], [0.3, 0.2]),
-}
+from tests.control.constraints.test_sensitivity import SETS
 
 
 class Egg(ConvexSet):
