@@ -20,7 +20,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.flows import Leaps
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, Transitions, exponential, transitions
 from sparserob_core.control.problem.system import System, VaryingSystem
-from sparserob_core.control.response.varying.expansion import Expansion
+from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -38,6 +38,7 @@ AT_ONCE = 50_000  # numbers of a term of the series
 FEW = 128  # indices for which a table beats the loop over the pieces
 INSIDE_KEPT = 4  # sets of durations within pieces whose transitions are remembered
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
+FLOWS_KEPT = 2  # sets of times that a varying system has flown to: a picture asks for many rows at the same ones
 SAME_DURATION = 1e-15  # of the horizon: durations that differ by less are computed once
 ALIKE = 1e-13  # of the horizon: pieces whose lengths differ by less are equally long
 SAME_TIME = 1e-12  # times closer than this share of the horizon are one
@@ -300,6 +301,7 @@ class Propagator:
     grid: TimeGrid
     propagate: Transitions | None = None
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
+    _flows: dict[bytes, Flow] = field(default_factory=dict, repr=False)
 
     @cached_property
     def which(self) -> np.ndarray:
@@ -350,7 +352,10 @@ class Propagator:
         rows, at = np.array(directions, dtype=float)[order], pieces[order]
         begun = self.grid.breakpoints[at]
         distinct, which = np.unique(np.stack([begun, np.maximum(times[order], begun)]), axis=1, return_inverse=True)
-        over, which = expansion.flow(distinct[0], distinct[1]), which.reshape(-1)
+        key, which = distinct.tobytes(), which.reshape(-1)
+        if key not in self._flows:
+            remember(self._flows, key, expansion.flow(distinct[0], distinct[1]), FLOWS_KEPT)
+        over = self._flows[key]
         both = np.concatenate([over.control, over.disturbance], axis=2)
         found = np.zeros((times.size, self.grid.pieces, both.shape[2]))
         found[np.arange(times.size), at] = (rows[:, None] @ both[which])[:, 0]

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.control.response.varying.expansion import Expansion, Flow
+from sparserob_core.control.studies.answer import supports
+from sparserob_core.control.transcription.transcribe import prepare
+from tests.support.plants import uniform
 
 A, B = [[0.0, 1.0], [-2.0, -0.5]], [[0.0], [1.0]]
 
@@ -157,3 +161,33 @@ def test_a_program_of_another_kind_has_no_states(tmp_path):
     result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[1.0], lower=-10.0, upper=10.0, families=[family]))
     assert not isinstance(result, sr.ControlResult)
     assert result.cost == pytest.approx(1.0, abs=1e-7)
+
+
+def test_the_outline_of_a_tube_of_a_varying_system_is_integrated_once_for_all_its_directions(monkeypatch):
+    asked: list[int] = []
+    flow = Expansion.flow
+
+    def counted(self: Expansion, starts: np.ndarray, stops: np.ndarray) -> Flow:
+        asked.append(starts.size)
+        return flow(self, starts, stops)
+
+    monkeypatch.setattr(Expansion, "flow", counted)
+    bound = sr.Box([-0.1], [0.1])
+    turning = sr.VaryingSystem.of(
+        [["0", "cos(t)"], ["-cos(t)", "0"]], [["0"], ["1 + gain"]], 2.0, parameters=bound, names=["gain"]
+    )
+    posed = sr.OptimalControlProblem(
+        system=turning,
+        horizon=2.0,
+        initial_state=[1, 0],
+        control=sr.Box([-1], [1]),
+        terminal=[sr.Box([-2, -2], [2, 2])],
+    )
+    model = prepare(posed, uniform(4, 2.0), uniform(4, 2.0))
+    times, angles = np.linspace(0.0, 2.0, 40), np.linspace(0.0, 6.0, 24)
+    directions = np.zeros((angles.size, model.problem.system.states))
+    directions[:, :2] = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    together = supports(model, np.ones(4), times, directions)
+    assert len(asked) <= 3  # the pieces, and the times, of which rounding may make two sets
+    alone = [supports(model, np.ones(4), times, one[None])[0] for one in directions]
+    np.testing.assert_array_equal(together, alone)
