@@ -10,6 +10,11 @@ from typing import Literal, TypeAlias, TypeVar, final
 
 TOLERANCE = 1e-9  # of a constraint's own unit: a violation of at most this counts as none
 EQUALITY = 1e-12  # of the numbers that are added up: what double precision leaves of an equality, at most
+FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
+# Of what is added up to a cost: so much must agree to `FIGURES` where terms cancel, that is, to 1e-14 of the terms,
+# some forty roundings. Ten times smaller, and honest costs of 0 are refused, whose terms were rounded. Whether a gap is
+# closed is judged by the cost that is derived, where that is the larger one.
+CANCELLED = 1e-3
 RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: TOLERANCE of it is 17 units of rounding
 
 LOOKED = 1024  # items between two looks at the time: some ms; ten times as many may be late, a tenth costs time itself

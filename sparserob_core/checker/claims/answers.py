@@ -14,7 +14,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers
 from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.effort import at_most
 from sparserob_core.checker.reach.flow import stacked
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 PEAK, WORST = "peak", "worst"
-FIGURES = 1e-11  # of an effort: how closely it is known
-SQUARES = 1e-14  # of the terms that squares are added up from, some forty roundings
 
 
 @final
@@ -97,7 +95,7 @@ class Answers:
         one = isinstance(system, LinearSystem) and not system.delay
         if case.answering and case.measurable and not one:
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
-        if case.answering and (case.several or case.lasting is not None):
+        if case.answering and not case.alike:
             raise Unchecked("the checker knows feedback under disturbances of one class, on one dictionary")
         held = (changes or []) if case.measurable and not case.several else (case.changes or [])
         measured = case.problem.measurements if case.answering else None
@@ -186,8 +184,8 @@ class Answers:
         if case.charge == WORST:
             written = arb(number(case.certificate, "cost"))
             terms = max(case.price.added(case.pieces, arb(0)), case.price.terms(case.pieces))
-            rounded = arb(SQUARES) * arb(terms if case.price.is_quadratic else 0.0)
-            self._effort(written - squares + (FIGURES * abs(written)).max(rounded))
+            rounded = CANCELLED * arb(terms if case.price.is_quadratic else 0.0)
+            self._effort(written - squares + FIGURES * abs(written).max(rounded))
             return written.max(squares)  # an effort is never less than 0
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):

@@ -18,7 +18,7 @@ from sparserob_core.checker.claims.duality import Row, steps
 from sparserob_core.checker.claims.multipliers import multiplied, weighted
 from sparserob_core.checker.claims.replay import witnessed
 from sparserob_core.checker.claims.window import Window
-from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
+from sparserob_core.checker.outcome import CANCELLED, FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.loop_tube import Still
@@ -36,12 +36,7 @@ if TYPE_CHECKING:
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
 VARYING = 96  # more bits for a tree of products, in each level of which balls grow; half of it shows after ten orbits
-FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
 SMALL_COST = 1e-6  # of what is added up to a cost: a gap is relative to at least so much
-# Of what is added up to a cost: so much must agree to `FIGURES` where terms cancel, that is, to 1e-14 of the terms,
-# some forty roundings. Ten times smaller, and honest costs of 0 are refused, whose terms were rounded. Whether a gap is
-# closed is judged by the cost that is derived, where that is the larger one.
-CANCELLED = 1e-3
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
 ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
 

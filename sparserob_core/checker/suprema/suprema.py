@@ -12,11 +12,11 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, balls, below
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.cells import Work, prove
-from sparserob_core.checker.claims.claims import FIGURES, judged, precision_of
+from sparserob_core.checker.claims.claims import judged, precision_of
 from sparserob_core.checker.claims.constraints import along, beside, covered, cut, followed, parameters_of, tubes
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
-from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
+from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.reach.adjoint import Worst
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD

@@ -151,7 +151,7 @@ class StateConstraint(Source):
         """Those of a time and a parameter."""
         return np.concatenate([[units.time], units.parameters])
 
-    def bounded(self, row: int) -> np.ndarray:
+    def states_of(self, row: int) -> np.ndarray:
         """Which states ``(d,)`` a row is about, those that the set looks at where it is curved; none where there is no
         such row."""
         if self.shape is not None:

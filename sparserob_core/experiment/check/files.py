@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.outcome import Broken, Finding, Unchecked
+from sparserob_core.checker.outcome import CANCELLED, Broken, Finding, Unchecked
+from sparserob_core.checker.outcome import FIGURES as AGREED
 from sparserob_core.checker.sets.known import known
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import ANSWERS, StoredRun
@@ -225,8 +226,7 @@ def _cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """What is added up to the cost; earlier versions wrote the largest possible cost, or nothing."""
     if "cost_scale" not in summary:
         return None
-    from sparserob_core.checker.claims.claims import CANCELLED, added_up, compared, largest_cost
-    from sparserob_core.checker.claims.claims import FIGURES as AGREED
+    from sparserob_core.checker.claims.claims import added_up, compared, largest_cost
 
     said, decided = summary["cost_scale"], case.certificate.get("decision") is not None
     derived = added_up(case) if decided else 0.0
@@ -268,7 +268,7 @@ def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     anew."""
     if summary.get("epsilon") != 0.0 or case.certificate.get("status") == "infeasible":
         return None
-    from sparserob_core.checker.claims.claims import CANCELLED, compared
+    from sparserob_core.checker.claims.claims import compared
 
     value, cost = summary.get("value"), summary.get("cost")
     slack = FIGURES * CANCELLED * compared(case)

@@ -56,10 +56,10 @@ def _marks(model: Transcription, found: Sequence[tuple[str, float, int]]) -> Act
     states = np.zeros((times.size, model.problem.system.states), dtype=bool)
     constraints = {one.name: one for one in model.constraints}
     rows = {(family, row) for family, _, row in found if family in constraints}  # far fewer than constraints
-    bounded = {one: constraints[one[0]].bounded(one[1])[: states.shape[1]] for one in rows}
+    reached = {one: constraints[one[0]].states_of(one[1])[: states.shape[1]] for one in rows}
     for place, (family, _, row) in zip(which.tolist(), found, strict=True):
-        if (family, row) in bounded:
-            states[place] |= bounded[family, row]
+        if (family, row) in reached:
+            states[place] |= reached[family, row]
     return Active(times, states)
 
 

@@ -13,7 +13,7 @@ import sparserob_core as sr
 from sparserob_core.checker.claims import activity, claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import FIGURES, Broken, Unchecked
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Equality, NormBall
 
@@ -408,14 +408,14 @@ def test_every_claim_of_a_certificate_has_a_verdict():
 
 def test_a_figure_agrees_to_a_share_of_its_own_size_whatever_its_sign():
     for sign in (1.0, -1.0):
-        claims._agrees("cost", sign * 1000.0 * (1.0 + 0.9 * claims.FIGURES), arb(sign * 1000.0), 1.0)
-        claims._agrees("cost", sign * 1000.0 * (1.0 - 0.9 * claims.FIGURES), arb(sign * 1000.0), 1.0)
-        claims._agrees("cost", 1.9 * claims.FIGURES * sign, arb(0.0), 2.0)
+        claims._agrees("cost", sign * 1000.0 * (1.0 + 0.9 * FIGURES), arb(sign * 1000.0), 1.0)
+        claims._agrees("cost", sign * 1000.0 * (1.0 - 0.9 * FIGURES), arb(sign * 1000.0), 1.0)
+        claims._agrees("cost", 1.9 * FIGURES * sign, arb(0.0), 2.0)
         for wrong, size in (
-            (1000.0 * (1.0 + 1.1 * claims.FIGURES), 1000.0),
-            (1000.0 * (1.0 - 1.1 * claims.FIGURES), 1000.0),
+            (1000.0 * (1.0 + 1.1 * FIGURES), 1000.0),
+            (1000.0 * (1.0 - 1.1 * FIGURES), 1000.0),
         ):
             with pytest.raises(Broken, match="is written"):
                 claims._agrees("cost", sign * wrong, arb(sign * size), 1.0)
         with pytest.raises(Broken, match="cost"):
-            claims._agrees("cost", 2.1 * claims.FIGURES * sign, arb(0.0), 2.0)
+            claims._agrees("cost", 2.1 * FIGURES * sign, arb(0.0), 2.0)

@@ -46,12 +46,12 @@ def test_one_row_of_each_index_is_that_of_all_rows(kind):
 
 def test_a_row_is_about_the_states_that_it_looks_at():
     made = {one.name: one.source for one in program("known").families}
-    assert made["path"].bounded(0).tolist() in ([True, False], [False, True])
-    every = np.array([made["path"].bounded(row) for row in range(4)])
+    assert made["path"].states_of(0).tolist() in ([True, False], [False, True])
+    every = np.array([made["path"].states_of(row) for row in range(4)])
     assert every.sum() == 4 and every.any(axis=0).all()
-    assert made["mixed"].bounded(0).tolist() == [True, True] and made["mixed"].bounded(1).tolist() == [False, True]
-    assert made["curved"].bounded(0).tolist() == [True, True]
-    assert not made["path"].bounded(9).any()
+    assert made["mixed"].states_of(0).tolist() == [True, True] and made["mixed"].states_of(1).tolist() == [False, True]
+    assert made["curved"].states_of(0).tolist() == [True, True]
+    assert not made["path"].states_of(9).any()
 
 
 @pytest.mark.parametrize("kind", ["known", "parametric"])
