@@ -15,9 +15,9 @@ from sparserob_core.control.problem.system import VaryingSystem as VaryingSystem
 from sparserob_core.control.problem.problem import OptimalControlProblem as OptimalControlProblem
 from sparserob_core.control.problem.disturbances import Disturbance as Disturbance
 from sparserob_core.control.policies.measurements import Measurements as Measurements
-from sparserob_core.control.problem.problem import IntegralConstraint as IntegralConstraint
-from sparserob_core.control.problem.problem import MixedConstraint as MixedConstraint
-from sparserob_core.control.problem.problem import PathConstraint as PathConstraint
+from sparserob_core.control.problem.terms.integral import IntegralConstraint as IntegralConstraint
+from sparserob_core.control.problem.terms.windows import MixedConstraint as MixedConstraint
+from sparserob_core.control.problem.terms.windows import PathConstraint as PathConstraint
 from sparserob_core.control.problem.problem import ProblemFactory as ProblemFactory
 from sparserob_core.control.sets.sets import Ellipsoid as Ellipsoid
 from sparserob_core.control.sets.sets import Equality as Equality

@@ -14,7 +14,7 @@ import numpy as np
 
 from sparserob_core.shapes import sealed
 
-Quantity: TypeAlias = Mapping[str, Callable[..., Any]]
+Quantity: TypeAlias = Mapping[str, Any]
 Unit: TypeAlias = Callable[[Any], Any]  # of the `Units` of a problem, what one of a quantity is in the user's
 Remaining: TypeAlias = Callable[[Any, float, float], Any]  # of a value, when, and how long from then on
 
@@ -104,3 +104,9 @@ TIME = measured(lambda of: of.time, _clipped)
 STATES = measured(lambda of: of.states)
 CONTROLS = measured(lambda of: of.controls)
 TERMS = measured(lambda of: of, _of_term)
+KIND = "kind"
+
+
+def each(kind: type[Term]) -> Quantity:
+    """A list of terms of one kind."""
+    return {**TERMS, KIND: kind}

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.checker.claims import case as cases
 from sparserob_core.control.loop.remaining import remaining
-from sparserob_core.control.problem.problem import WITHIN, Return
+from sparserob_core.control.problem.terms.repeat import WITHIN, Return
 
 MASS = {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]}
 

@@ -10,13 +10,10 @@ from functools import cache
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_core.control.problem.problem import (
-    IntegralConstraint,
-    MixedConstraint,
-    OptimalControlProblem,
-    PathConstraint,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.control.problem.terms.integral import IntegralConstraint
+from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.plants import uniform

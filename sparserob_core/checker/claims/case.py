@@ -30,8 +30,10 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
-from sparserob_core.control.problem.problem import Accumulated, OptimalControlProblem, Return
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.problem.terms.integral import Accumulated
+from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.sets.sets import Box, ConvexSet, Product, product
 from sparserob_core.sip.convex_set import Array
 

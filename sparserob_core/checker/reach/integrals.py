@@ -16,13 +16,10 @@ import numpy as np
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.problem import (
-    Accumulated,
-    MixedConstraint,
-    OptimalControlProblem,
-    PathConstraint,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.terms.integral import Accumulated
+from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope, Product
 from sparserob_core.sip.convex_set import Array
 

@@ -22,13 +22,15 @@ import numpy as np
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Quadratic
-from sparserob_core.control.problem.problem import IntegralConstraint, MixedConstraint, OptimalControlProblem
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.problem.terms.integral import IntegralConstraint
+from sparserob_core.control.problem.terms.windows import MixedConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, Polytope, Product
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from sparserob_core.control.problem.problem import PathConstraint
+    from sparserob_core.control.problem.terms.windows import PathConstraint
 
 NAMES = ("A", "B", "E", "c")
 FREE = -1  # the key of what no parameter multiplies

@@ -22,7 +22,7 @@ from sparserob_core.control.constraints.local_maxima import (
 )
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.problem.problem import MixedConstraint
+from sparserob_core.control.problem.terms.windows import Flat
 from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.response.functional import LEGS_KEPT, Leg, WorstCase
 from sparserob_core.control.response.initial_support import Supports
@@ -180,7 +180,7 @@ class FlatConstraint(StateConstraint):
     """``H (x(t) - r(t)) + G u(t) <= h`` for all ``t`` in ``[start, stop]``, ``p`` and ``w``; the index is ``(t, p)``.
 
     ``H (r, d)``, ``h (r,)``; ``reference``: ``r``, of a set that moves; ``gains (r, m)``: ``G``, of a mixed constraint,
-    whose rows are there twice (`twofold`): the second half looks at the control that follows a jump. A terminal
+    whose rows are there twice (`of`): the second half looks at the control that follows a jump. A terminal
     constraint is the window ``[T, T]``.
     """
 
@@ -196,15 +196,19 @@ class FlatConstraint(StateConstraint):
     gains: Array | None = None
 
     @staticmethod
-    def twofold(
-        name: str, functionals: WorstCase, entry: MixedConstraint, stop: float, parameters: ParameterIndex
+    def of(
+        name: str,
+        functionals: WorstCase,
+        rows: Flat,
+        window: tuple[float, float],
+        parameters: ParameterIndex,
+        reference: Reference | None = None,
     ) -> FlatConstraint:
-        """A mixed constraint, with its rows for the control before and after a jump."""
-        H, h = entry.set.halfspaces()
-        rows, d = np.vstack([H, H]), np.asarray(entry.H).shape[1]
-        return FlatConstraint(
-            name, functionals, rows[:, :d], np.tile(h, 2), entry.start, stop, parameters, gains=rows[:, d:]
-        )
+        """The rows of a constraint; those of a mixed one for the control before and after a jump."""
+        H, G, h = rows
+        if G is not None:
+            H, G, h = np.vstack([H, H]), np.vstack([G, G]), np.tile(h, 2)
+        return FlatConstraint(name, functionals, H, h, *window, parameters, reference=reference, gains=G)
 
     @cached_property
     def samples(self) -> Samples:

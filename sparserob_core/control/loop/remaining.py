@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.problem.terms.windows import MixedConstraint
 from sparserob_core.control.response.response import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import path_names, prepare

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -192,14 +192,20 @@ class Cylinder(ConvexSet):
         return np.concatenate([self.base.interior_point(), np.zeros(self.size - self.base.dimension)])
 
 
-def cylinder(base: ConvexSet, size: int) -> ConvexSet:
-    """``{x in R^size : x[:b] in base}``, as a box or a polytope where it is one. Raises `InputError` when ``size`` is
-    below ``b``."""
+@overload
+def cylinder(base: ConvexSet, size: int) -> ConvexSet: ...
+@overload
+def cylinder(base: Equality, size: int) -> Equality: ...
+def cylinder(base: ConvexSet | Equality, size: int) -> ConvexSet | Equality:
+    """``{x in R^size : x[:b] in base}``, as a box or a polytope where it is one, or an equality. Raises `InputError`
+    when ``size`` is below ``b``."""
     free = size - base.dimension
     if free < 0:
         raise InputError(
             f"size must be at least {base.dimension}, the dimension of its base, got {size}", path="cylinder"
         )
+    if isinstance(base, Equality):
+        return Equality(np.append(base.values, np.full(free, np.nan)))
     if base.is_box:
         box = base.bounding_box()
         return Box(np.append(box.lower, np.full(free, -np.inf)), np.append(box.upper, np.full(free, np.inf)))

@@ -12,13 +12,10 @@ import numpy as np
 from sparserob_core.brief import brief
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
-from sparserob_core.control.problem.problem import (
-    MixedConstraint,
-    OptimalControlProblem,
-    PathConstraint,
-    Return,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.terms.repeat import Return
+from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within

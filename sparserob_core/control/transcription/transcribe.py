@@ -12,15 +12,10 @@ from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import (
-    Accumulated,
-    MixedConstraint,
-    OptimalControlProblem,
-    PathConstraint,
-    Return,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.representable import require_representable
 from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.problem.units import Units, ratios
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
@@ -295,18 +290,13 @@ def _state_constraints(
     found: list[StateConstraint] = []
     for name, entry in windows_of(problem):
         stop = problem.horizon if entry.stop is None else entry.stop
-        sides = entry.set.halfspaces()
-        if isinstance(entry, MixedConstraint):
-            found.append(FlatConstraint.twofold(name, functionals, entry, stop, parameters))
-            continue
-        moved = Reference.of(entry.relative_to)
-        if sides is None:
+        rows, window, moved = entry.flat, (entry.start, stop), Reference.of(entry.relative_to)
+        if rows is None:
             from sparserob_core.control.constraints.curved import CurvedConstraint
 
-            window = (entry.start, stop)
             found.append(CurvedConstraint(name, functionals, entry.set, *window, parameters, reference=moved))
-        elif sides[1].size:
-            found.append(FlatConstraint(name, functionals, *sides, entry.start, stop, parameters, reference=moved))
+        elif rows[-1].size:
+            found.append(FlatConstraint.of(name, functionals, rows, window, parameters, moved))
     return tuple(found)
 
 
@@ -319,7 +309,7 @@ def windows_of(problem: OptimalControlProblem) -> list[tuple[str, PathConstraint
 
 def path_names(problem: OptimalControlProblem) -> list[str]:
     """What the families of the path constraints are called: by their own name, or by their place."""
-    own = sum(not isinstance(entry, Return | Accumulated) for entry in problem.windows)
+    own = sum(entry.stated for entry in problem.windows)
     return [entry.name or _name("path", i, own) for i, entry in enumerate(problem.windows)]
 
 

@@ -25,13 +25,9 @@ from sparserob_core.control.problem.expression import (
     parse_matrix,
 )
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.problem import (
-    MixedConstraint,
-    OptimalControlProblem,
-    PathConstraint,
-    ProblemFactory,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
 from sparserob_core.control.problem.system import TIME, LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.matrices.packed import OrPacked, Packed

@@ -21,7 +21,8 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from sparserob_core.control.problem.problem import IntegralConstraint, MixedConstraint, PathConstraint
+from sparserob_core.control.problem.terms.integral import IntegralConstraint
+from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, NormBall, Polytope, SetFactory, intersection
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.matrices.packed import RowsOfNumbers

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.adversary import find_adversaries

@@ -28,8 +28,9 @@ from sparserob_core.checker.reach.measurable import Kernel
 from sparserob_core.checker.reach.tube import Polynomial, Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.expression import parse_matrix
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope
 from sparserob_core.control.transcription.transcribe import prepare

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparserob_core.control.constraints.control import ControlConstraint, Places
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope, cylinder
 from sparserob_core.control.transcription.transcribe import transcribe
 from sparserob_core.sip.convex_set import Box

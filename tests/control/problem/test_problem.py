@@ -6,8 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.problems import LinearProblem

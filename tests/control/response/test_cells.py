@@ -11,8 +11,9 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.problem.disturbances import joined
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Polytope
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.errors import NotEnclosable

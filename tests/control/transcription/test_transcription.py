@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 import sparserob_core as sr
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.sets.sets import Ellipsoid, Equality, NormBall, Polytope
 from sparserob_core.control.transcription.transcribe import transcribe
 from sparserob_core.errors import InputError

@@ -10,16 +10,11 @@ import numpy as np
 
 from sparserob_core.control.problem.disturbances import SHORTEST, legs
 from sparserob_core.control.problem.names import Names, measured_in
-from sparserob_core.control.problem.problem import (
-    Accumulated,
-    IntegralConstraint,
-    MixedConstraint,
-    OptimalControlProblem,
-    PathConstraint,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
-from sparserob_core.control.sets.sets import Equality, Polytope, cylinder
-from sparserob_core.control.transcription.terms.larger import columns, larger
+from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
+from sparserob_core.control.sets.sets import Polytope, cylinder
+from sparserob_core.control.transcription.terms.larger import larger
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
@@ -60,8 +55,8 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
         problem,
         k,
         system=_system(problem.system, running, problem.horizon),
-        path=[_widened(entry, d + k) for entry in (*problem.windows, *ends)],
-        terminal=[_ended(end, d + k) for end in problem.terminal],
+        path=[entry.widened(d + k) for entry in (*problem.windows, *ends)],
+        terminal=[cylinder(end, d + k) for end in problem.terminal],
         integral=(),
         names=_names(problem.names, d, running),
     )
@@ -112,20 +107,6 @@ def _system(system: System, running: list[Running], horizon: float) -> System:
     if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
         return pieces[0][1]
     return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay)
-
-
-def _widened(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint | MixedConstraint:
-    """A window that leaves the states beyond its own free, ``size`` in all."""
-    if isinstance(entry, MixedConstraint):
-        return replace(entry, H=columns(entry.H, size))
-    moved = None if entry.relative_to is None else columns(entry.relative_to, 1 + size)
-    return replace(entry, set=cylinder(entry.set, size), relative_to=moved)
-
-
-def _ended(end: ConvexSet | Equality, size: int) -> ConvexSet | Equality:
-    if isinstance(end, Equality):
-        return Equality(np.append(end.values, np.full(size - end.dimension, np.nan)))
-    return cylinder(end, size)
 
 
 def _names(names: Names, states: int, running: list[Running]) -> Names:

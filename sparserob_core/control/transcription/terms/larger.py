@@ -10,8 +10,9 @@ import numpy as np
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.terms.windows import columns
 from sparserob_core.control.sets.sets import product
-from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.convex_set import Box
 
 
 def larger(problem: OptimalControlProblem, more: int, **told: Any) -> OptimalControlProblem:
@@ -26,12 +27,6 @@ def larger(problem: OptimalControlProblem, more: int, **told: Any) -> OptimalCon
         measurements=replace(measured, C=columns(measured.C, d + more)),
         **told,
     )
-
-
-def columns(rows: Any, count: int) -> Array:
-    """Rows of numbers with so many columns, zeros after their own."""
-    given = np.asarray(rows)
-    return np.pad(given, ((0, 0), (0, count - given.shape[1])))
 
 
 def _costing(term: Quadratic | None, more: int) -> Quadratic | None:

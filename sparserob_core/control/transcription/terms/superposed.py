@@ -11,17 +11,13 @@ import numpy as np
 
 from sparserob_core.control.enclosures.dependence import PARTS, Dependence, Superposed
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.problem import (
-    IntegralConstraint,
-    MixedConstraint,
-    OptimalControlProblem,
-    PathConstraint,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import TIME, LinearSystem, VaryingSystem
-from sparserob_core.control.sets.sets import Box, Equality, Polytope
-from sparserob_core.control.transcription.terms.larger import columns, larger
+from sparserob_core.control.problem.terms.windows import everywhere
+from sparserob_core.control.sets.sets import Box
+from sparserob_core.control.transcription.terms.larger import larger
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array
 
 CORNERS = 64  # of a box of parameters: rows are as many times more, with ten times as many it would take minutes
 
@@ -40,9 +36,9 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
         problem,
         depends.states - system.states,
         system=_known(system, depends),
-        path=[_window(entry, rows) for entry in problem.windows],
-        terminal=[_everywhere(end, rows) for end in problem.terminal],
-        integral=[_integral(entry, rows) for entry in problem.integral],
+        path=[entry.everywhere(rows) for entry in problem.windows],
+        terminal=[everywhere(end, rows) for end in problem.terminal_sets],
+        integral=[entry.everywhere(rows) for entry in problem.integral],
         names=_names(problem.names, system, depends),
     )
 
@@ -87,40 +83,6 @@ def _known(system: VaryingSystem, depends: Dependence) -> VaryingSystem:
         times = Box([begin], [until])
         laws.append((begin, LinearSystem(made["A"], made["B"], made["E"], times, (TIME,), made.get("c"))))
     return VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:]))
-
-
-def _window(entry: PathConstraint | MixedConstraint, rows: list[Array]) -> PathConstraint | MixedConstraint:
-    if isinstance(entry, MixedConstraint):
-        H, G, h = (np.asarray(part) for part in (entry.H, entry.G, entry.h))
-        limits, size = np.broadcast_to(h, len(H))[:, None], rows[0].shape[1]
-        every = _apart([np.hstack([H @ one, G, limits]) for one in rows])
-        return replace(entry, H=every[:, :size], G=every[:, size:-1], h=every[:, -1])
-    moved = None if entry.relative_to is None else columns(entry.relative_to, 1 + rows[0].shape[1])
-    return replace(entry, set=_everywhere(entry.set, rows), relative_to=moved)
-
-
-def _everywhere(bound: ConvexSet | Equality, rows: list[Array]) -> ConvexSet:
-    """The states of which all that a corner makes are in a set with flat sides."""
-    assert not isinstance(bound, Equality)  # which was refused, as curved sets were
-    flat = bound.halfspaces()
-    assert flat is not None
-    every = _apart([np.column_stack([flat[0] @ one, flat[1]]) for one in rows])
-    return Polytope(every[:, :-1], every[:, -1])
-
-
-def _apart(blocks: list[Array]) -> Array:
-    """All rows without those that repeat an earlier one."""
-    rows = np.vstack(blocks)
-    _, first = np.unique(rows, axis=0, return_index=True)
-    apart: Array = rows[np.sort(first)]
-    return apart
-
-
-def _integral(entry: IntegralConstraint, rows: list[Array]) -> IntegralConstraint:
-    H, G = np.asarray(entry.H), np.asarray(entry.G)
-    lower, upper = (np.asarray(side, dtype=float) for side in (entry.lower, entry.upper))
-    every, size = _apart([np.column_stack([H @ one, G, lower, upper]) for one in rows]), rows[0].shape[1]
-    return replace(entry, H=every[:, :size], G=every[:, size:-2], lower=every[:, -2], upper=every[:, -1])
 
 
 def _names(names: Names, system: VaryingSystem, depends: Dependence) -> Names:

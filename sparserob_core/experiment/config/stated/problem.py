@@ -14,13 +14,10 @@ import numpy as np
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.problem import (
-    MixedConstraint,
-    OptimalControlProblem,
-    Return,
-    widths,
-)
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.terms.repeat import Return, widths
+from sparserob_core.control.problem.terms.windows import MixedConstraint
 from sparserob_core.control.problem.tracing import traced
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
 from sparserob_core.control.term import Term

@@ -1,0 +1,112 @@
+"""Bounds of integrals of state and control over windows of time: terms of a problem."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Self, final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.brief import noun
+from sparserob_core.control.problem.terms.windows import PathConstraint, Setting, Window, at_corners, coefficients
+from sparserob_core.control.term import SAME_TIME, TIME, UNITLESS, measured, over
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box, as_bound
+
+
+@dataclass(frozen=True, eq=False)
+class IntegralConstraint(Window):
+    """``lower <= int_start^stop (H x(t) + G u(t)) dt <= upper``, row by row: fuel of a channel, energy of a battery, a
+    mean temperature. ``H (r, d)``, ``G (r, m)``, either of them absent: 0; ``lower``, ``upper (r,)``, a number for all
+    rows alike, infinite or ``None`` where there is no bound; ``stop`` is the horizon when ``None``.
+
+    ``u(t)`` is the commanded control, delay or not. The running integral from ``start`` on is one more state for each
+    row, which nothing measures.
+    """
+
+    H: npt.ArrayLike | None = field(default=None, metadata=measured(lambda of: 1.0 / (of.states * of.time)))
+    G: npt.ArrayLike | None = field(default=None, metadata=measured(lambda of: 1.0 / (of.controls * of.time)))
+    lower: npt.ArrayLike | Sequence[float | None] | None = field(default=None, metadata=UNITLESS)
+    upper: npt.ArrayLike | Sequence[float | None] | None = field(default=None, metadata=UNITLESS)
+    start: float = field(default=0.0, metadata=TIME)
+    stop: float | None = field(default=None, metadata=TIME)
+    name: str | None = field(default=None, metadata=UNITLESS)
+
+    among = "integral"
+
+    __repr__ = noun
+
+    def checked(self, where: str, setting: Setting) -> Self:
+        given = {"H": (self.H, setting.states, "state"), "G": (self.G, setting.controls, "control")}
+        named = {name: one for name, one in given.items() if one[0] is not None}
+        told = dict(zip(named, coefficients(where, **named), strict=True))
+        if len({len(rows) for rows in told.values()}) != 1:
+            got = " and ".join(f"{len(rows)} in {name}" for name, rows in told.items()) or "neither"
+            raise InputError(path=where, expected="H, or G, or both with as many rows", got=got)
+        count = len(next(iter(told.values())))
+        H, G = (told.get(name, np.zeros((count, width))) for name, (_, width, _) in given.items())
+        if (empty := np.flatnonzero(~np.hstack([H, G]).any(axis=1))).size:
+            raise InputError(path=where, expected="rows that integrate something", got=f"zeros in row {empty[0] + 1}")
+        lower, upper = _limits(where, self, count)
+        horizon, delay = setting.horizon, setting.delay
+        start, stop = float(self.start), horizon if self.stop is None else float(self.stop)
+        if not (0.0 <= start < stop - SAME_TIME * horizon and stop <= horizon):
+            raise InputError(
+                path=where,
+                expected=f"0 <= from < to <= {horizon:g} (the horizon), apart by more than rounding",
+                got=f"from {start:g} to {stop:g}",
+            )
+        if delay > 0.0 and G.any() and stop + delay > horizon * (1.0 + SAME_TIME):
+            raise InputError(
+                path=f"{where}.to",
+                expected=f"at most {horizon - delay:g}, the horizon less the delay, where G is not 0: a control"
+                " that is commanded later never acts",
+                got=f"{stop:g}",
+            )
+        return replace(self, H=H, G=G, lower=lower, upper=upper, start=start, stop=stop)
+
+    def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
+        left = super().remaining(begin, horizon, **given)
+        if left is not None and (self.start < begin or not over(self.stop or 0.0, begin + horizon)):
+            raise InputError("a part of an integral is known as a state only: see `accumulated`", path="integral")
+        return left
+
+    @property
+    def bounds(self) -> Box:
+        return Box(np.asarray(self.lower), np.asarray(self.upper))
+
+    def everywhere(self, corners: Sequence[Array]) -> Self:
+        """Itself of a larger state ``z``, of the states that are a matrix ``(d, size)`` times ``z``, at all of these
+        ``corners``."""
+        ends = np.column_stack([np.asarray(side, dtype=float) for side in (self.lower, self.upper)])
+        H, G, sides = at_corners(corners, np.asarray(self.H), np.asarray(self.G), ends)
+        return replace(self, H=H, G=G, lower=sides[:, 0], upper=sides[:, 1])
+
+    def scaled(self, factor: float) -> Self:
+        box = self.bounds.scaled(factor)
+        return replace(self, lower=box.lower, upper=box.upper)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Accumulated(PathConstraint):
+    """An `IntegralConstraint` where its integral is a state: a window of one time."""
+
+    stated = False
+
+
+def _limits(where: str, entry: IntegralConstraint, count: int) -> tuple[Array, Array]:
+    """The bounds ``(r,)`` of an integral, infinite where there is none."""
+    sides = []
+    for name, given, none in (("lower", entry.lower, -np.inf), ("upper", entry.upper, np.inf)):
+        filled = [none if v is None else v for v in given] if isinstance(given, list | tuple) else given
+        sides.append(as_bound(f"{where}.{name}", none if filled is None else filled, count))
+    lower, upper = sides
+    if not (lower <= upper).all() or np.isposinf(lower).any() or np.isneginf(upper).any():
+        got = f"{lower.tolist()} and {upper.tolist()}"
+        raise InputError(path=where, expected="lower bounds that are no larger than the upper ones", got=got)
+    if (np.isinf(lower) & np.isinf(upper)).any():
+        raise InputError(path=where, expected="a lower or an upper bound of every row", got="a row without one")
+    return lower, upper
