@@ -20,7 +20,7 @@ from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
-from sparserob_core.checker.reach.integrals import integrating
+from sparserob_core.checker.reach.integrals import integrating, spelt
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.superposition import parted
@@ -64,8 +64,9 @@ class Case:
     policy: Policy | None = None
 
     def __post_init__(self) -> None:
-        known = parted(self.problem)
-        if known is not self.problem and self.policy is not None:
+        plain = spelt(self.problem)
+        known = parted(plain)
+        if known is not plain and self.policy is not None:
             raise Unchecked("the checker knows no feedback beside parameters and the time")
         object.__setattr__(self, "problem", integrating(known))
         if self.problem.disturbance_breakpoints is not None:

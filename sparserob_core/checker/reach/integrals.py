@@ -7,9 +7,9 @@ coordinates, first that of ``h``, and the second is integrated as much later.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Any, TypeAlias, final
 
 import numpy as np
 
@@ -18,9 +18,11 @@ from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
-from sparserob_core.control.problem.terms.integral import Accumulated
+from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
+from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope, Product
+from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 APART = 1e-12  # of the horizon: times that are nearer are one; ten times more would join what a clock tells apart
@@ -54,6 +56,33 @@ class Above:
         whole = np.zeros((n + k, width), dtype=object)
         whole[:n, :columns], whole[n:] = table, self.below
         return whole
+
+
+Rows: TypeAlias = list[PathConstraint | MixedConstraint | IntegralConstraint]
+DERIVED: dict[type, Callable[[Any, str], Rows]] = {
+    kind: lambda entry, called: [replace(entry, name=called)]
+    for kind in (PathConstraint, MixedConstraint, Return, Accumulated, IntegralConstraint)
+}
+"""Which windows and integrals a constraint is, by its exact kind, under what it is called."""
+
+
+def spelt(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem with windows and integrals alone; it itself where it has no others. Raises `InputError` for a
+    constraint that is not among the `DERIVED` ones, so that none is left out."""
+    every = [(name, entry) for name, entries in problem.lists.items() for entry in entries]
+    for name, entry in every:
+        if type(entry) not in DERIVED:
+            expected = "a constraint that the checker derives too"
+            raise InputError(path=name, expected=expected, got=type(entry).__name__)
+    if all(name in ("path", "integral") for name, _ in every):
+        return problem
+    found: dict[str, Any] = {name: [] for name in problem.lists}
+    for name, entries in problem.lists.items():
+        for i, entry in enumerate(entries):
+            called = entry.name or (name if len(entries) == 1 else f"{name}[{i}]")
+            for row in DERIVED[type(entry)](entry, called):
+                found["integral" if isinstance(row, IntegralConstraint) else "path"].append(row)
+    return replace(problem, **found)
 
 
 def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:

@@ -10,7 +10,8 @@ from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.windows import MixedConstraint
 from sparserob_core.control.response.response import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.transcribe import path_names, prepare
+from sparserob_core.control.transcription.terms.accumulated import in_rows
+from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -30,7 +31,7 @@ def refuse_remaining(model: Transcription) -> None:
         "disturbances of one class": disturbed and not isinstance(problem.disturbance_class, str),
         "disturbances on the pieces of one dictionary": problem.disturbance_breakpoints is not None,
         "integrals of controls alone, and none beside feedback: what states add up to between measurements is not"
-        " known": any(model.feedback is not None or np.any(entry.H) for entry in model.stated.integral),
+        " known": any(model.feedback is not None or np.any(entry.H) for entry in in_rows(model.stated).integral),
         "a control that acts at once, without a delay": problem.system.delay > 0.0,
         "a policy that measures the whole state, not outputs": model.feedback is not None
         and problem.measurements is not None,
@@ -69,7 +70,7 @@ def remaining(
     horizon = control.horizon
     windows = [
         entry.remaining(begin, horizon, name=name)
-        for entry, name in zip(problem.windows, path_names(problem), strict=True)
+        for entry, name in zip(problem.windows, problem.called("path"), strict=True)
     ]
     left = problem.remaining(
         begin,

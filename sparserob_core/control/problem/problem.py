@@ -196,9 +196,15 @@ class OptimalControlProblem(Term):
         return {one.name: getattr(self, one.name) for one in fields(self) if KIND in one.metadata}
 
     @property
-    def sums(self) -> list[Window]:
+    def sums(self) -> dict[str, tuple[Window, ...]]:
         """Those of them that are not on the path: they add up what state and control do."""
-        return [entry for name, entries in self.lists.items() if name != "path" for entry in entries]
+        return {name: entries for name, entries in self.lists.items() if name != "path" and entries}
+
+    def called(self, name: str) -> list[str]:
+        """What messages, tables and figures call the constraints of a list: by their own name, or by their place."""
+        entries = self.lists[name]
+        several = sum(entry.stated for entry in entries) > 1
+        return [entry.name or (f"{name}[{i}]" if several else name) for i, entry in enumerate(entries)]
 
     @property
     def windows(self) -> list[PathConstraint | MixedConstraint]:
@@ -457,9 +463,9 @@ class OptimalControlProblem(Term):
             )
         if self.sums:
             raise InputError(
-                path=next(name for name, entries in self.lists.items() if name != "path" and entries),
+                path=next(iter(self.sums)),
                 expected="none where the plan repeats, of which integrals over a period are not proven yet",
-                got=f"{len(self.sums)}",
+                got=f"{sum(map(len, self.sums.values()))}",
             )
         if any(entry.name == RETURN for entry in self.windows):
             raise InputError(path="repeat", expected=f"no path constraint named {RETURN}, which is that of repeat")

@@ -304,13 +304,7 @@ def windows_of(problem: OptimalControlProblem) -> list[tuple[str, PathConstraint
     """The path and terminal constraints with the names of their families; a terminal one has the window of one time."""
     end, ends = problem.horizon, problem.terminal_sets
     finals = [(_name("terminal", i, len(ends)), PathConstraint(one, end, end)) for i, one in enumerate(ends)]
-    return [*zip(path_names(problem), problem.windows, strict=True), *finals]
-
-
-def path_names(problem: OptimalControlProblem) -> list[str]:
-    """What the families of the path constraints are called: by their own name, or by their place."""
-    own = sum(entry.stated for entry in problem.windows)
-    return [entry.name or _name("path", i, own) for i, entry in enumerate(problem.windows)]
+    return [*zip(problem.called("path"), problem.windows, strict=True), *finals]
 
 
 def _name(kind: str, position: int, count: int) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, TypeAlias, final
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +48,7 @@ from sparserob_core.experiment.config.set_options import (
     PathOptions,
     SetOptions,
     TerminalOptions,
+    TermOptions,
 )
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
@@ -552,6 +553,15 @@ class ProblemKeys(ProblemFactory, Options):
             found.append(Disturbance(bound, E, one.kind, one.start or 0.0, one.stop, times))
         return found
 
+    def constraints(self) -> dict[str, Any]:
+        """Those that are written field by field, by their key, which is the list of the problem that they are in."""
+        given = {name: getattr(self, name) for name in type(self).model_fields}
+        return {
+            name: [one.build() for one in every]
+            for name, every in given.items()
+            if isinstance(every, list) and every and isinstance(every[0], TermOptions)
+        }
+
     def windows(self, states: int) -> list[PathConstraint | MixedConstraint]:
         """The path constraints, one per set or bounds of state and control together; raises `InputError`."""
         listed = enumerate(self.path)
@@ -571,6 +581,8 @@ class LinearKeys(ProblemKeys):
 
 class ControlKeys(ProblemKeys):
     """The keys of problems whose control is that of the system; what the system is, they say themselves."""
+
+    makes: ClassVar[type[OptimalControlProblem]] = OptimalControlProblem
 
     control: SetOptions
     """Set that the control takes its values in, bounded."""
@@ -603,7 +615,7 @@ class ControlKeys(ProblemKeys):
                 expected="control_step or a system.delay beside it, since the control before time 0 does nothing else",
                 got="neither of them",
             )
-        return OptimalControlProblem(
+        return self.makes(
             system=system,
             horizon=self.horizon,
             initial_state=self.initial(system.states),
@@ -615,7 +627,7 @@ class ControlKeys(ProblemKeys):
             disturbances=self.disturbances(system),
             path=self.windows(system.states),
             terminal=self.ends(system.states),
-            integral=[entry.build() for entry in self.integral],
+            **self.constraints(),
             cost=self.cost.build(system.states),
             initial_control=self._control_before(system.controls),
             control_step=(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import is_dataclass, replace
-from typing import Annotated, Any, cast, final
+from typing import Annotated, Any, ClassVar, cast, final
 
 import numpy as np
 from pydantic import (
@@ -22,7 +22,7 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
-from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
+from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint, Window
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, NormBall, Polytope, SetFactory, intersection
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.matrices.packed import RowsOfNumbers
@@ -204,9 +204,21 @@ class PathOptions(SetOptions, populate_by_name=True):
         return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, stop, self.name)]
 
 
+class TermOptions(Options, populate_by_name=True):
+    """A constraint that a config writes field by field, under the key of the list of a problem that it is in."""
+
+    term: ClassVar[type[Window]]
+
+    def build(self) -> Any:
+        """The constraint."""
+        return self.term(**{name: getattr(self, name) for name in type(self).model_fields})
+
+
 @final
-class IntegralOptions(Options, populate_by_name=True):
+class IntegralOptions(TermOptions):
     """``lower <= int (H x(t) + G u(t)) dt <= upper`` over a window of time, row by row."""
+
+    term = IntegralConstraint
 
     H: RowsOfNumbers | None = None
     """One column per state; 0 unless given."""
@@ -228,10 +240,6 @@ class IntegralOptions(Options, populate_by_name=True):
 
     name: Annotated[str, Field(min_length=1)] | None = None
     """What messages, tables and figures call it; integral, or integral[0] and so on, unless given."""
-
-    def build(self) -> IntegralConstraint:
-        """The constraint."""
-        return IntegralConstraint(self.H, self.G, self.lower, self.upper, self.start, self.stop, self.name)
 
 
 @final

@@ -19,7 +19,6 @@ from sparserob_core.control.studies.adversary import find_adversaries
 from sparserob_core.control.studies.answer import Tube, supports, tube
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.terms.superposed import at_corners
-from sparserob_core.control.transcription.transcribe import path_names
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
@@ -276,7 +275,7 @@ def _plane(model: Transcription, decision: Array, times: Array) -> Plane | None:
 
 def _limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array) -> Iterator[Limit]:
     """What path and terminal constraints say of the place alone; of a curved set the sides ``around (q, 2)`` it."""
-    end, names = problem.horizon, path_names(problem)
+    end, names = problem.horizon, problem.called("path")
     for name, entry in zip(names, problem.path, strict=True):
         if not isinstance(entry, PathConstraint):
             continue

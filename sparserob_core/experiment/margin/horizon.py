@@ -226,11 +226,11 @@ def horizon_search(
             "of: horizon is the period of a plan that repeats, of which none excludes another; expected another thing"
             " to vary"
         )
-    if problem.integral:
+    if problem.sums:
         raise InputError(
-            path="integral",
+            path=next(iter(problem.sums)),
             expected="none where the horizon is varied, since windows of integrals stay where they are",
-            got=f"{len(problem.integral)}",
+            got=f"{sum(map(len, problem.sums.values()))}",
         )
     try:
         return HorizonSearch(title, problem, *dictionaries, method, tools, width, Points(HORIZON, notify))

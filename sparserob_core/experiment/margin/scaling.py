@@ -65,11 +65,10 @@ def scaling(
     absent = {
         "disturbance": problem.disturbance,
         "parameters": problem.system.parameters,
-        "path": problem.path,
-        "integral": problem.integral,
         "execution": problem.execution is not None,
         "control_step": problem.control_step,
         "terminal": problem.terminal,
+        **problem.lists,
     }
     part = of.split(".", maxsplit=1)[0]
     if part in absent and not absent[part]:
@@ -88,8 +87,8 @@ def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
         "parameters": "",
         "control": joined(names.control_units),
         "control_step": joined(names.control_units),
-        "integral": "",
         "execution": "",
+        **dict.fromkeys(problem.sums, ""),
     }.get(chosen.of.split(".")[0], of_states if chosen.relative else joined([names.time])).strip()
     label = chosen.label.replace("[unit of time]", f"[{unit}]") if unit else chosen.label
     quantity = f"{chosen.quantity} [{unit}]" if unit else chosen.quantity
@@ -111,15 +110,12 @@ def _choices(
         yield "control_step", partial(_set, problem, "control_step", label, "smallest", "largest step of a control")
     if problem.execution is not None:
         yield "execution", partial(_execution, problem)
-    for i, positions in enumerate(members):
-        if positions:
-            yield f"path.{i}", partial(_listed, problem, "path", f"path.{i}", positions)
-            yield f"path.{i}.from", partial(_window, problem, f"path.{i}", positions)
-    for i in range(len(problem.integral)):
-        yield f"integral.{i}", partial(_listed, problem, "integral", f"integral.{i}", [i])
-    for i, positions in enumerate(ends):
-        if positions:
-            yield f"terminal.{i}", partial(_listed, problem, "terminal", f"terminal.{i}", positions)
+    of_sums = {name: [[i] for i in range(len(entries))] for name, entries in problem.sums.items()}
+    for name, places in {"path": members, **of_sums, "terminal": ends}.items():
+        for of, positions in ((f"{name}.{i}", positions) for i, positions in enumerate(places) if positions):
+            yield of, partial(_listed, problem, name, of, positions)
+            if name == "path":
+                yield f"{of}.from", partial(_window, problem, of, positions)
 
 
 def _set(problem: OptimalControlProblem, of: str, label: str, sense: Sense, quantity: str) -> Scaling:
@@ -140,7 +136,7 @@ def _listed(problem: OptimalControlProblem, field: str, of: str, positions: Sequ
         return replace(problem, **{field: changed})
 
     width = max(_half_width(_bounds(entries[i])) for i in positions)
-    what = "bounds" if field == "integral" else "set"
+    what = "bounds" if field in problem.sums else "set"
     return Scaling(of, f"factor on the {what} {of}", "smallest", at, "largest half-width", _times(width))
 
 

@@ -56,8 +56,8 @@ class Window(Term, ABC):
     relative_to: npt.ArrayLike | None = None
     lasting: ClassVar[bool] = False
     stated: ClassVar[bool] = True
-    among: ClassVar[str] = "path"
-    """The list of a problem that rows like its own are in."""
+    among: ClassVar[str] = ""
+    """The list of a problem whose rows are its own; none of one that says its `rows` by others."""
 
     @classmethod
     def of(cls, where: str, entry: object) -> Window:
@@ -85,7 +85,7 @@ class Window(Term, ABC):
         """Whether it excludes anything."""
         return True
 
-    def rows(self, called: str, states: int, controls: int) -> Sequence[Window]:
+    def rows(self, called: str) -> Sequence[Window]:
         """Which bounds of state and control at times (`PathConstraint`, `MixedConstraint`), and of integrals of them
         (`IntegralConstraint`), it is; messages, tables and figures say ``called``."""
         return [replace(cast("Any", self), name=called)]
@@ -111,6 +111,8 @@ class PathConstraint(Window):
     stop: float | None = field(default=None, metadata=TIME)
     name: str | None = field(default=None, metadata=UNITLESS)
     relative_to: npt.ArrayLike | None = field(default=None, metadata=timed(lambda of: of.states, _moved))
+
+    among = "path"
 
     __repr__ = noun
 
@@ -169,6 +171,7 @@ class MixedConstraint(Window):
     stop: float | None = field(default=None, metadata=TIME)
     name: str | None = field(default=None, metadata=UNITLESS)
     lasting = True  # a control lasts
+    among = "path"
 
     __repr__ = noun
 

@@ -4,7 +4,7 @@ states, so that a row of the state at the end of a window is all that is left of
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -38,12 +38,11 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
     and not measured, that is bounded at one time. The system stays a single one where it is one and all windows begin
     at 0: integrals then go on to the horizon, since nothing looks at them again. Parameters beside the time became
     states before (`superposed`), of which there are integrals too."""
-    problem = superposed(problem)
+    problem = superposed(in_rows(problem))
     if not problem.integral:
         return problem
     running, ends, d = list[Running](), list[Accumulated](), problem.system.states
-    for i, entry in enumerate(problem.integral):
-        name = entry.name or ("integral" if len(problem.integral) == 1 else f"integral[{i}]")
+    for entry, name in zip(problem.integral, problem.called("integral"), strict=True):
         rows, end = _running(problem, entry, name)
         bound = _bounded(entry, rows, d + len(running))
         ends.append(Accumulated(bound, end, end, name))
@@ -60,6 +59,18 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
         integral=(),
         names=_names(problem.names, d, running),
     )
+
+
+def in_rows(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The same problem with no other constraints than windows and integrals, which others say that they are."""
+    if all(entry.among for entries in problem.lists.values() for entry in entries):
+        return problem
+    told: dict[str, Any] = {name: [] for name in problem.lists}
+    for name, entries in problem.lists.items():
+        for entry, called in zip(entries, problem.called(name), strict=True):
+            for row in entry.rows(called):
+                told[row.among].append(row)
+    return replace(problem, **told)
 
 
 def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: str) -> tuple[list[list[Running]], float]:

@@ -16,7 +16,7 @@ from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
-from sparserob_core.control.problem.terms.repeat import Return, widths
+from sparserob_core.control.problem.terms.repeat import widths
 from sparserob_core.control.problem.terms.windows import MixedConstraint
 from sparserob_core.control.problem.tracing import traced
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
@@ -29,10 +29,10 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
-    "path", "terminal", "integral", "title", "initial_control", "control_step", "names", "cost", "disturbances",
+    "terminal", "title", "initial_control", "control_step", "names", "cost", "disturbances",
     "measurements", "repeat", "execution", "disturbance_breakpoints",
 }  # fmt: skip
-"""The fields of a problem that are written; one that is added and not named here is refused, not lost."""
+"""The fields of a problem that are written beside lists of constraints; another one is refused, not lost."""
 CALLED = {"start": "from", "stop": "to"}
 """Fields of a term that a config calls otherwise."""
 MANY = 2500  # entries of a matrix that nobody reads: of ten times more a config has as many values as it may have
@@ -41,10 +41,10 @@ WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
 
 def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
     """The key ``problem`` of a config, as the problem ``linear`` reads it."""
-    unknown = {one.name for one in fields(problem)} - WRITTEN
+    unknown = {one.name for one in fields(problem)} - WRITTEN - set(problem.lists)
     if unknown:
         raise InputError(path=sorted(unknown)[0], expected="a field that a config can say", got="another one")
-    path = [entry for entry in problem.windows if not isinstance(entry, Return)]
+    stated = {name: [entry for entry in entries if entry.stated] for name, entries in problem.lists.items()}
     fixed = bool(problem.repeat) and bool((widths(problem.initial_set, problem.system.states) == 0.0).any())
     ends = problem.terminal[: len(problem.terminal) - fixed]  # what repeat adds is said by repeat
     keys: dict[str, Any] = {
@@ -55,9 +55,8 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         "control": set_keys("control", problem.control),
         "weights": np.asarray(problem.weights).tolist(),
         "disturbance_class": _class_of(problem, 0),
-        "path": [_term_keys(f"path.{i}", entry) for i, entry in enumerate(path)],
         "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
-        "integral": [_term_keys(f"integral.{i}", entry) for i, entry in enumerate(problem.integral)],
+        **{name: [_term_keys(f"{name}.{i}", one) for i, one in enumerate(every)] for name, every in stated.items()},
         **_cost_keys(problem.cost),
         **_names_keys(problem.names),
     }
