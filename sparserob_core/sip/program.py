@@ -50,7 +50,7 @@ class Separation:
 class Enclosure:
     """Proven upper bounds ``(k,)`` of the violation on index cells, and the coordinate ``(k,)`` whose halving would
     help most. ``bend (k,)``, where it is known: what of the bounds falls with the square of a cell's width, of a family
-    whose index is one number; its separation then says where cells have to be short."""
+    whose index is one number; its separation then says where cells have to be short, unless rows have deviations."""
 
     bounds: Array
     split: Array

@@ -292,9 +292,10 @@ class FeedbackConstraint(Source):
             added = flat.gains[:proven] @ self.loop.controls(x)[acting]
             beside = [np.concatenate([more + added[..., :1], added[..., 1:]], axis=-1) for more in beside]
         # an equality is one of computed numbers, to their rounding, as it is without feedback
-        found = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]), computed=self.exact)[0]
-        bounds = (found - flat.h[:proven]).max(axis=1)
-        return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
+        found, late = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]), computed=self.exact)
+        excess, every = found - flat.h[:proven], np.arange(found.shape[0])
+        worst = excess.argmax(axis=1)
+        return Enclosure(excess[every, worst], np.zeros_like(every), late[every, worst])
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people, at every disturbance, or at the deviations that the index says."""

@@ -26,7 +26,7 @@ from sparserob_core.control.enclosures.elementary import (
     tanh_series,
     undefined,
 )
-from sparserob_core.control.enclosures.matrix_exponential import rounding
+from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 _NUMBERS = (float, int, np.floating, np.integer)
 _LARGEST_POWER = 64
+HALF = EPSILON / 2  # what an operation is off by, as a share of what it gives
+OUTWARD = 1.0 + 1e-10  # for bounds that are sums of at most some hundred thousand numbers that are not negative
 
 
 @final
@@ -71,7 +73,8 @@ class TaylorSpace:
 
     ``exponents (M, nu)`` in graded order, the constant first; ``degrees (M,)``; ``index`` from an exponent tuple to its
     place; ``products``: three arrays ``(left, right, target)``, every pair of monomials whose product is in the space;
-    ``faces``: what `face_of` remembers.
+    ``faces``: what `face_of` remembers; ``rounded``: of
+    every such pair, what the coefficient that it is added to is off by, as a share of the modulus of what it adds up.
     """
 
     def __init__(self, nu: int, degree: int) -> None:
@@ -94,7 +97,8 @@ class TaylorSpace:
         self._codes = codes[self._order]
         target = self._order[np.searchsorted(self._codes, codes[left] + codes[right])]
         self.products = (left, right, target)
-        self.terms = int(np.bincount(target).max())  # products that add up to one coefficient, at most
+        added = HALF * np.bincount(target)[target]
+        self.rounded: Array = added / (1.0 - added)  # what a coefficient is off by, as a share of all that it adds up
         self.faces: dict[bytes, Face] = {}
 
     def places(self, exponents: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
@@ -236,11 +240,12 @@ class TaylorModel:
     def _product(self, other: TaylorModel) -> TaylorModel:
         left, right, target = self.space.products
         a, b = self.coefficients, other.coefficients
-        coefficients = np.bincount(target, weights=a[left] * b[right], minlength=self.space.size).astype(float)
+        products = a[left] * b[right]
+        coefficients = np.bincount(target, weights=products, minlength=self.space.size).astype(float)
         cross = self._magnitude() * other.remainder + self.remainder * (other._magnitude() + other.remainder)
         if a[1:].any() or b[1:].any():
-            cross += rounding(self.space.terms) * float(np.abs(a).sum()) * float(np.abs(b).sum())
-        return TaylorModel(self.space, coefficients, self.space.overflow(a, b) + cross)
+            cross += float(self.space.rounded @ np.abs(products))
+        return TaylorModel(self.space, coefficients, (self.space.overflow(a, b) + cross) * OUTWARD)
 
     def _power(self, count: int) -> TaylorModel:
         result, base = self.space.constant(1.0), self
@@ -333,5 +338,5 @@ class TaylorModel:
 def _rounded(space: TaylorSpace, coefficients: Array, remainder: float) -> TaylorModel:
     """A model of which every coefficient has been rounded once."""
     if coefficients[1:].any():
-        remainder += rounding(0) * float(np.abs(coefficients).sum())
-    return TaylorModel(space, coefficients, remainder)
+        remainder += HALF * float(np.abs(coefficients).sum())
+    return TaylorModel(space, coefficients, remainder * OUTWARD)

@@ -135,7 +135,8 @@ class Rounds:
         # Prove: over the whole continuum; a witness that the proof meets is one more index to impose, and what rounding
         # may do, where it alone keeps a proof open, is allowed for like the solver's accuracy.
         proofs, imposed = proofs_of(working, ledger, prover, answer, found)
-        again = imposed or working.exchange(answer, witnesses(program, proofs), number) or working.allow_for(proofs)
+        again = imposed or working.exchange(answer, witnesses(program, proofs), number)
+        again = again or working.allow_for(ledger, answer, proofs)
         if again and not last and not tools.deadline.passed:
             return None
 

@@ -267,12 +267,17 @@ def _branch_and_bound(
         if not open_.any():
             return _answers(course, "proven", best, leaves)
 
-        # Cut what is open, as long as cells, their width and time allow: once towards the peaks, then into halves.
+        # Cut what is open, as long as cells, their width and time allow: once towards the peaks, then into halves. Rows
+        # under the worst deviations have kinks, not peaks that are smooth.
         worst, at = float(bounds.max()), int(bounds.argmax())
         course.opened(lower[open_], upper[open_])
         course.tell(int(open_.sum()), worst, lower[at], upper[at])
         low, high = lower[open_], upper[open_]
-        parts = None if bend is None else _towards(peaks, low, high, bounds[open_], bend[open_])
+        parts = (
+            None
+            if bend is None or family.uncertain is not None
+            else _towards(peaks, low, high, bounds[open_], bend[open_])
+        )
         if parts is None or course.examined + parts[0].shape[0] > course.budget:
             parts, known = _halved(low, high, split[open_]), np.tile(bounds[open_], 2)
         else:

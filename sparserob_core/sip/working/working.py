@@ -31,6 +31,9 @@ THINNER = 1e-3
 # Times that a proof is helped over rounding. The first helps nearly always; ten times as many are full proofs, of
 # minutes, of what no margin will show.
 ALLOWANCES = 4
+# Of the tolerated gap, what is paid for what a proof must allow for, as what transitions are off by over many orbits.
+# With all of it nothing is left for the bounds; with a tenth of it gaps stay open that a larger margin closes.
+AFFORDED = 0.5
 # Active rows at which a margin may cost a quarter of the tolerated gap. With ten times as many, a day on a wall takes
 # twice as many cells; with a tenth of them, costs of ordinary problems are 2e-8 of themselves above the least.
 MANY_ACTIVE = 32
@@ -180,18 +183,27 @@ class Working(ABC):
         self.margin = max(self.margin, self.floor)
         return True
 
-    def allow_for(self, proofs: Sequence[Proof]) -> bool:
+    def allow_for(self, ledger: Ledger, answer: Answer, proofs: Sequence[Proof]) -> bool:
         """Nothing is violated, but a proof must allow for rounding and cannot show it: tighten by as much; ``False``
-        where that is more than rounding, or was tried."""
+        where that is more than rounding, and more than the tolerated gap pays for, or was tried."""
         if any(proof.verdict == "refuted" for proof in proofs) or not self.slater:
             return False
         missed = [self.distance(one) for one in left_open(self.program, proofs)]
         floor = self.margin + 1.25 * max(missed, default=np.inf)
-        if floor > self.most or self.allowed >= ALLOWANCES:
+        if (floor > self.most and not self._affords(ledger, answer, floor)) or self.allowed >= ALLOWANCES:
             return False
         self.floor = self.margin = floor
+        self.most = max(self.most, floor)
         self.allowed += 1
         return True
+
+    def _affords(self, ledger: Ledger, answer: Answer, margin: float) -> bool:
+        """Whether the tolerated gap pays for a margin beyond the largest, where no such margin left nothing feasible.
+        What no multiplier prices may cost anything."""
+        price = self.priced(answer)
+        return self.most >= LARGEST_MARGIN and 0.0 < price * margin <= AFFORDED * ledger.tolerance * size_of(
+            self.program, answer
+        )
 
 
 def at_rest(program: SemiInfiniteProgram, x: Array) -> Array:

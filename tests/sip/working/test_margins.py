@@ -98,16 +98,39 @@ def test_an_imposed_row_that_is_violated_is_tightened_by_twice_as_much_and_no_ot
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_rounding_leaves_open_is_allowed_for_a_few_times_and_what_is_more_is_not(kind: str) -> None:
     working, ledger = begun(kind)
-    answer(working, ledger)
+    exact = answer(working, ledger)
     before = working.margin
-    assert not working.allow_for([undecided(1e-5)])
-    assert not working.allow_for([undecided(np.inf)])
-    assert not working.allow_for([Proof("above", "refuted", np.inf, violation=1e-8, index=AT[0])])
+    assert not working.allow_for(ledger, exact, [undecided(1e-5)])
+    assert not working.allow_for(ledger, exact, [undecided(np.inf)])
+    refuted = Proof("above", "refuted", np.inf, violation=1e-8, index=AT[0])
+    assert not working.allow_for(ledger, exact, [refuted])
     assert working.margin == before
     for number in range(1, ALLOWANCES + 1):
-        assert working.allow_for([undecided(2e-9)])
+        assert working.allow_for(ledger, exact, [undecided(2e-9)])
         assert working.margin == pytest.approx(before + number * 2.5e-9)
-    assert not working.allow_for([undecided(2e-9)])
+    assert not working.allow_for(ledger, exact, [undecided(2e-9)])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_more_than_the_largest_margin_is_allowed_for_where_the_tolerated_gap_pays_for_it(kind: str) -> None:
+    working, ledger = begun(kind)
+    exact = answer(working, ledger)  # a margin of 1 costs 1, of a cost of 0.5
+    working.margin, ledger.tolerance = LARGEST_MARGIN, 1e-4
+    assert not working.allow_for(ledger, exact, [undecided(2.1e-5)])
+    assert working.allow_for(ledger, exact, [undecided(1.8e-5)])
+    assert working.margin == working.floor == working.most == pytest.approx(LARGEST_MARGIN + 1.25 * 1.8e-5)
+    tightened = answer(working, ledger)
+    assert tightened.solution.x == pytest.approx([0.5 + working.margin], abs=1e-11)
+    assert ledger.gap(tightened.solution.x) <= ledger.tolerance
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_margin_that_left_nothing_is_not_bought_again(kind: str) -> None:
+    working, ledger = begun(kind)
+    exact = answer(working, ledger)
+    assert working.thin()
+    ledger.tolerance = 1.0
+    assert not working.allow_for(ledger, exact, [undecided(1e-8)])
 
 
 @pytest.mark.parametrize("kind", KINDS)
