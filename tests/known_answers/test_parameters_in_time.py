@@ -15,6 +15,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.control.studies.laws import ParametersInTime
+from sparserob_core.control.studies.simulate import walk
 from sparserob_core.control.transcription.provable import unprovable
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
@@ -100,6 +102,44 @@ def test_tubes_and_figures_are_of_the_states_at_all_parameters() -> None:
     np.testing.assert_allclose(data.tube_lower[0], -1.0 + 0.9 * given + data.times / 2, atol=1e-9)
     np.testing.assert_allclose(data.tube_upper[0], -1.0 + 1.2 * given + data.times / 2, atol=1e-9)
     np.testing.assert_allclose(data.state[0], -1.0 + 1.05 * given + data.times / 2, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_drawn_trajectory_has_a_parameter_of_its_own() -> None:
+    """``x' = (1 + p) (2 - t) + q`` under a control of 1, whose integral stays that of the corners."""
+    made = beside(A=[[0]], B=[["(1 + p) * (2 - t)"]], E=[[1]], c=["q"], parameters={"p": [-0.1, 0.2], "q": [0, 1]})
+    made["problem"].update(
+        horizon=2.0, initial_state=[-1.0], disturbance=None, terminal=[{"box": [9]}], path=[],
+        integral=[{"H": [[1]], "G": [[0]], "from": 0, "to": 2, "upper": [9.0]}],
+    )  # fmt: skip
+    model = assemble(load_config(made)).transcription
+    drawn = ParametersInTime.of(model.stated)
+    assert drawn is not None
+    state = list(walk(model.response, model.functionals.on_grid(np.ones(10)), np.zeros((400, 0)), None))[-1]
+    uniform = drawn.at(state, drawn.draw("iid", 400, None, np.random.default_rng(0)))[0]
+    assert uniform.std() == pytest.approx(np.hypot(0.6, 2.0) / np.sqrt(12), rel=0.1)
+    corners = drawn.at(state, drawn.draw("vertices", 400, None, np.random.default_rng(0)))
+    assert {round(x, 9) for x in corners[0].tolist()} == {0.8, 1.4, 2.8, 3.4}  # -1 + 2 (1 + p) + 2 q
+    np.testing.assert_array_equal(corners[1:3], 0.0)
+    np.testing.assert_array_equal(corners[3:], state[3:])
+    upper = drawn.seen(np.array([1.0, *(drawn.every[-1][0, 1:])]))
+    near = drawn.at(state, drawn.draw("neighbours", 400, np.tile(upper, (400, 1)), np.random.default_rng(0)))[0]
+    assert near.min() >= 3.14 - 1e-9 and near.max() <= 3.4 + 1e-9  # a tenth of the way to a random one, at most
+    at_corner = drawn.at(state, upper[None])[0]
+    np.testing.assert_allclose(at_corner, 3.4, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["vertices", "neighbours", "adversary"])
+def test_draws_come_to_the_worst_parameters_and_never_beyond(law: str, tmp_path: Path) -> None:
+    outcome = solved(BASE, tmp_path / "run")
+    found = sr.simulate(outcome, None if law == "adversary" else 400, law)
+    worst = {one.name: one.worst for one in found.constraints}
+    for one in found.constraints:
+        assert one.violated == 0 and one.largest <= one.worst + 1e-9
+    assert max(one.largest for one in found.constraints) >= max(worst.values()) - 0.05
+    assert np.ptp(found.fan[:, 0, -1]) > 0.01
+    np.testing.assert_array_equal(found.fan[:, 2:], 0.0)  # nothing is left for a parameter to add
 
 
 def at_the_corners(config: Config) -> float:

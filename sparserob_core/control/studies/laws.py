@@ -11,11 +11,15 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.enclosures.dependence import Dependence
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.studies.simulate import worst_errors
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.control.transcription.terms.superposed import at_corners
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 LawName: TypeAlias = Literal["iid", "vertices", "slow", "neighbours"]
 KNOTS = 6  # a slow disturbance is linear between at most so many extreme points
@@ -39,11 +43,23 @@ class Uncertainty:
     constraints: Sequence[StateConstraint]
     worst: tuple[Array, Array, Array]
 
-    def draw(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array, Array | None]:
+    def bases(self, law: LawName, count: int, rng: np.random.Generator) -> np.ndarray | None:
+        """The numbers ``(count,)`` of the worst cases that neighbours are near to; ``None`` for another law."""
+        return rng.integers(0, self._bases[2].shape[0], size=count) if law == "neighbours" else None
+
+    def directions(self, bases: np.ndarray) -> Array:
+        """Those of these worst cases, ``(k, d)``."""
+        return np.asarray(self._bases[1][bases])
+
+    def draw(
+        self, law: LawName, count: int, rng: np.random.Generator, bases: np.ndarray | None = None
+    ) -> tuple[Array | None, Array, Array | None]:
         """``count`` disturbances ``(count, mw, L)`` on the pieces of the merged grid (or ``None``), parameters
-        ``(count, nu)``, and initial states ``(count, d)`` (``None``: there is one only)."""
-        if law == "neighbours":
-            return self._neighbours(count, rng)
+        ``(count, nu)``, and initial states ``(count, d)`` (``None``: there is one only); ``bases``: those of
+        neighbours, drawn where none are given."""
+        near = self.bases(law, count, rng) if bases is None else bases
+        if near is not None:
+            return self._neighbours(near, rng)
         disturbances, parameters = self._drawn(law, count, rng)
         bound = self.functionals.initial
         if bound is None:
@@ -108,10 +124,10 @@ class Uncertainty:
             return _drawn_in(model.set, coefficients.reshape(count, 1, -1))
         return _drawn_in(model.set, coefficients / np.where(model.scale > 0, model.scale, 1.0)[:, None])
 
-    def _neighbours(self, count: int, rng: np.random.Generator) -> tuple[Array | None, Array, Array | None]:
-        """The worst disturbance of a random time and constraint with a few blocks replaced by extreme points, a
+    def _neighbours(self, base: np.ndarray, rng: np.random.Generator) -> tuple[Array | None, Array, Array | None]:
+        """The worst disturbance of random times and constraints with a few blocks replaced by extreme points, a
         parameter near its own, and the worst initial state, for some drawn towards an extreme one."""
-        base = rng.integers(0, self._bases[2].shape[0], size=count)
+        count = base.size
         disturbances, parameters = self._near(base, rng)
         bound = self.functionals.initial
         if bound is None:
@@ -168,6 +184,49 @@ class Uncertainty:
     @cached_property
     def _worst_blocks(self) -> Array:
         return self.functionals.worst_blocks(*self._bases)
+
+
+@dataclass(frozen=True, eq=False)
+class ParametersInTime:
+    """Parameters beside the time, in a ``box``, of a problem whose states hold what each of them adds (`superposed`):
+    ``every``: the stated states at each corner of the box, ``(d, size)`` each."""
+
+    box: Box
+    depends: Dependence
+    every: Sequence[Array]
+
+    @staticmethod
+    def of(problem: OptimalControlProblem) -> ParametersInTime | None:
+        """Those of a problem as it was stated; ``None`` where it has none."""
+        every, system = at_corners(problem), problem.system
+        if every is None or not isinstance(system, VaryingSystem) or system.parameters is None:
+            return None
+        return ParametersInTime(system.parameters, system.dependence, every)
+
+    def draw(self, law: LawName, count: int, directions: Array | None, rng: np.random.Generator) -> Array:
+        """``count`` of them as rows on all states, ``(count, d, size)``: those of neighbours are near the corners that
+        the ``directions (count, size or more)`` look at, each that of a row."""
+        drawn = (_extreme if law == "vertices" else _uniform)(self.box, count, rng) - self.depends.centre
+        found = np.stack([self.depends.rows(one) for one in drawn])
+        if directions is None:
+            return found
+        looked = np.stack([self.seen(one) for one in directions])
+        return np.asarray(looked + rng.uniform(0.0, NEAR, size=(count, 1, 1)) * (found - looked))
+
+    def seen(self, direction: Array) -> Array:
+        """The corner, as rows ``(d, size)``, that a ``direction (size or more,)`` on all states looks at; any of those
+        that it does not tell apart."""
+        d, size = self.every[0].shape
+        missed = [np.abs(direction[:d] @ one - direction[:size]).max() for one in self.every]
+        return self.every[int(np.argmin(missed))]
+
+    def at(self, states: Array, rows: Array) -> Array:
+        """All ``states (size or more, n)`` at parameters, ``rows (n or 1, d, size)``: nothing is left for these to add,
+        so that every corner sees the same states. What is integrated of them stays that of the corners."""
+        d, size = self.every[0].shape
+        found = states.copy()
+        found[:d], found[d:size] = (rows @ states[:size].T[:, :, None])[:, :, 0].T, 0.0
+        return found
 
 
 def admissibility(model: DisturbanceModel, signals: Array) -> Array:

@@ -15,7 +15,7 @@ from sparserob_core.control.constraints.flat import INSIDE
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
-from sparserob_core.control.studies.laws import LawName, Uncertainty, noises
+from sparserob_core.control.studies.laws import LawName, ParametersInTime, Uncertainty, noises
 from sparserob_core.control.studies.simulate import delivered, fine_times, finer, trajectories_at_once, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.errors import InputError
@@ -91,6 +91,9 @@ def simulate(
     if law == ADVERSARY:
         replayed = read_adversaries(finished.directory, model) or worst
         moments, states = propagated(model, finished.decision, replayed)
+        if (beside := ParametersInTime.of(model.stated)) is not None:
+            pairs = zip(states, replayed["directions"], strict=True)
+            states = np.stack([beside.at(one, beside.seen(direction)[None]) for one, direction in pairs])
         replayed = {**replayed, "state_times": moments, "states": states}
         found = _replayed(finished, replayed, started)
     else:
@@ -114,7 +117,7 @@ def _sampled(
 ) -> Simulation:
     model = finished.experiment.transcription
     response, parameters = model.response, model.parameters
-    acting = _Acting()
+    acting, beside = _Acting(), ParametersInTime.of(model.stated)
     ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
     fine = Response(response.system, finer(response.grid, times), response.initial_state)
@@ -131,7 +134,10 @@ def _sampled(
     rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0
     while done < count:
         size = min(block, count - done)
-        disturbances, drawn, begun = uncertainty.draw(law, size, rng)
+        near = uncertainty.bases(law, size, rng)
+        disturbances, drawn, begun = uncertainty.draw(law, size, rng, near)
+        looked = None if near is None else uncertainty.directions(near)
+        here = None if beside is None else beside.draw(law, size, looked, rng)
         seen = noises(model.noise, law, size, model.control.pieces, rng)
         control = controlled(model, finished.decision, np.arange(response.grid.pieces), seen)
         if callable(control):
@@ -141,6 +147,8 @@ def _sampled(
         for one in counts:
             one.begin(size)
         for position, state in enumerate(walk(fine, control, drawn, disturbances, begun)):
+            if beside is not None and here is not None:
+                state = beside.at(state, here)
             envelope.add(position, state)
             for one in counts:
                 one.add(position, state, acting.now(position, model.functionals.channels))
