@@ -46,6 +46,13 @@ TOUCHED = 60  # rounds of tangents: each quarters what squares are below, 30 lea
 # 1 835 rows went in circles from there, and took 1 188 steps from nothing. With a tenth of it programs that come to an
 # end are begun anew; with ten times as many a small one takes half a minute.
 STALLED = 10
+# Numbers in the rows, from which on a program without a basis is solved by the interior point method of HiGHS, which
+# ends at one too. With half of them both take as long; with 480 000, of a policy that answers one noisy output on 40
+# pieces, the simplex method took 35 000 steps to the optimum and went in circles from there, where this takes 9 s.
+LARGE = 200_000
+# Steps from the last basis for each row and column of such a program, after which it is begun anew: that takes as long
+# as so many. With ten times as many one round took more than a minute; with a tenth of them small rounds begin anew.
+PATIENT = 0.25
 ROBUST = "feedback"  # what these programs are called where a solver fails on some
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME = 1e-12  # points of a set that are closer are one
@@ -469,13 +476,15 @@ class Growing:
         self._begin()
         if np.isfinite(seconds):
             self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))
-        self.highs.setOptionValue("simplex_iteration_limit", STALLED * (self.columns + self.count))
-        steps = self._run()
-        status = self.highs.getModelStatus()
-        if status in (highspy.HighsModelStatus.kUnknown, highspy.HighsModelStatus.kIterationLimit):
-            self.highs.clearSolver()  # the last basis led nowhere: once more from none
+        begun, large = bool(self.highs.getBasis().valid), self.highs.getNumNz() >= LARGE
+        patience = PATIENT if begun and large else STALLED
+        self.highs.setOptionValue("simplex_iteration_limit", int(patience * (self.columns + self.count)))
+        steps = self._run(inside=large and not begun)
+        status, stalled = self.highs.getModelStatus(), highspy.HighsModelStatus
+        if status in (stalled.kUnknown, stalled.kIterationLimit, stalled.kSolveError):
+            self.highs.clearSolver()  # this way led nowhere: once more from nothing, and not by the same
             self.highs.setOptionValue("simplex_iteration_limit", highspy.kHighsIInf)
-            steps += self._run()
+            steps += self._run(inside=large == begun)
             status = self.highs.getModelStatus()
         self.work = float(steps) * self.highs.getNumNz()
         said = f"HiGHS: {self.highs.modelStatusToString(status)}"
@@ -531,9 +540,15 @@ class Growing:
         multipliers[fixed] = claim.y
         return True, claim.message, np.clip(claim.x, posed.lower, posed.upper), kappa * multipliers / norms
 
-    def _run(self) -> int:
-        """Solve it; the steps that this took."""
-        run(self.highs)
+    def _run(self, inside: bool) -> int:
+        """Solve it, by an interior point method where it is to be sought from ``inside``; the steps that this took."""
+        if inside:
+            self.highs.setOptionValue("solver", "ipm")
+        try:
+            run(self.highs)
+        finally:
+            if inside:
+                self.highs.setOptionValue("solver", "choose")
         done = self.highs.getInfo()
         return int(1 + max(0, done.simplex_iteration_count) + INNER * max(0, done.ipm_iteration_count))
 

@@ -245,6 +245,31 @@ def test_a_basis_from_which_there_is_no_end_is_forgotten(name: str, monkeypatch:
     assert base.objective(begun_anew.x) == pytest.approx(base.objective(steps.x), abs=1e-9)
 
 
+@pytest.mark.parametrize("patient", [0.0, 10.0])
+@pytest.mark.parametrize("name", SPREADS)
+def test_large_programs_are_begun_from_inside_and_end_at_the_same_optimum(
+    name: str, patient: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first one, and where no step from the last basis is allowed, those after it."""
+    rng = np.random.default_rng(3)  # one of which the second rows ask for steps of both
+    base, blocks = program(rng), [rows(rng, "several"), rows(rng, "several", 0.3)]
+    steps = solved(Counterpart(base, SPREADS[name]), blocks)
+    monkeypatch.setattr(simplex, "LARGE", 0)
+    monkeypatch.setattr(simplex, "PATIENT", patient)
+    ways, run = list[bool](), Growing._run
+    monkeypatch.setattr(Growing, "_run", lambda self, inside: ways.append(inside) or run(self, inside))
+    large = Counterpart(base, SPREADS[name])
+    first = solved(large, blocks[:1])
+    again = solved(large, blocks[1:])
+    assert first.solved
+    assert again.solved
+    assert ways[0]
+    assert any(ways[1:]) == (patient == 0.0)
+    assert base.objective(again.x) == pytest.approx(base.objective(steps.x), abs=1e-9)
+    proven, _ = robust_bound(base, blocks, again.y, again.deviations, again.mu, True, again.at)
+    assert proven == pytest.approx(base.objective(again.x), abs=1e-8)
+
+
 def test_squares_that_are_to_be_0_are_answered_though_no_tangent_is_sharp_enough() -> None:
     """No share of a cost that tends to 0 is ever met, so that the rounds end by their number."""
     none = np.zeros((0, N))
