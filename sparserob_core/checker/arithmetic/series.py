@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, final
 
 from sparserob_core.checker.arithmetic.jets import Monomials
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
 SMALL = 0.25  # norm below which the exponential series is summed
 SPARE = 16  # bits of the working precision that what is left out of the series may take
 STRIDE = 4  # of the powers by which it is summed; divides the number of terms
+MOST_STRIDES = 2**60  # in one time: what takes more is no number
+STRIDES_KEPT = 256  # whole numbers of strides that are remembered, beside powers of two
+LEAST = 2.0**-900  # norm that counts, so that a stride is a number
 
 
 @final
@@ -39,7 +43,7 @@ class Series:
         return self._there
 
     @property
-    def _generated(self) -> list[bool]:
+    def generated(self) -> list[bool]:
         """Which coefficients a power of this series may have: those of monomials in the variables that appear."""
         every = self.monomials.exponents
         present = [e for e, here in zip(every, self.there, strict=True) if here]
@@ -111,7 +115,7 @@ class Series:
             for order in range(STRIDE):
                 result = result + powers[order].scaled(factors[first + order])
         tail = arb_mat([[arb(0, _tail(size, terms).upper())] * n] * n)
-        parts = [part + tail if mine else part for part, mine in zip(result.parts, self._generated, strict=True)]
+        parts = [part + tail if mine else part for part, mine in zip(result.parts, self.generated, strict=True)]
         result = Series(self.monomials, parts)
         for _ in range(halvings):
             result = result * result
@@ -146,39 +150,158 @@ class Series:
 
 @final
 class Exponentials:
-    """``e^{matrix t}`` at whole numbers of ticks, each remembered: that of the longest time before it, times that of
-    the time between, which is remembered too, since cells are halves of halves. A product costs a tenth of a series,
-    and balls hardly grow."""
+    """``e^{matrix t}`` at many times ``t``. Powers of the matrix are made once: within a *stride*, in which its norm is
+    below `SMALL`, an exponential is a sum of them; the longer ones are products of whole strides, each remembered. Such
+    a sum costs about a product, a series of its own ten of these.
 
-    def __init__(self, matrix: Series, tick: float) -> None:
+    Norms are in ``units (n,)``, powers of two: any are right, those in which the matrix is small take the fewest
+    strides.
+    """
+
+    def __init__(self, matrix: Series, tick: float, units: Sequence[float] | None = None) -> None:
         self.matrix, self.tick = matrix, tick
+        self._units = [1.0] * matrix.parts[0].nrows() if units is None else list(map(float, units))
         self._known: dict[int, Series] = {}
-        self._times: list[int] = []
-        self._steps: dict[int, Series] = {}
+        self._strides: dict[int, Series] = {}
 
     def at(self, ticks: int) -> Series:
         """After that many ticks, exactly."""
-        if ticks not in self._known:
-            place = bisect_right(self._times, ticks)
-            before = self._times[place - 1] if place else 0
-            step = self.over(ticks - before)
-            self._known[ticks] = step * self._known[before] if before else step
-            self._times.insert(place, ticks)
-        return self._known[ticks]
-
-    def over(self, ticks: int) -> Series:
-        """The same, of a time that occurs often, by its own series."""
         from flint import arb
 
-        if ticks not in self._steps:
-            self._steps[ticks] = self.matrix.scaled(arb(self.tick) * ticks).exp()
-        return self._steps[ticks]
+        if ticks not in self._known:
+            self._known[ticks] = self.of(arb(self.tick) * ticks)
+        return self._known[ticks]
 
     def around(self, ticks: int) -> Series:
         """From so many ticks before to so many after."""
         from flint import arb
 
-        return self.matrix.scaled(arb(0, self.tick * ticks)).exp()
+        return self.of(arb(0, self.tick * ticks))
+
+    def of(self, time: arb) -> Series:
+        """At every time of a ball that is not much wider than a stride."""
+        from flint import arb
+
+        stride = self._stride
+        count = 0 if stride is None else math.floor(min(float(time.mid()) / stride, MOST_STRIDES))
+        if stride is None or not count < MOST_STRIDES:
+            return self._none()
+        if not count > 0:
+            return self._near(time)
+        return self._whole(count) * self._near(time - arb(stride) * count)
+
+    def within(self, length: arb) -> Series:
+        """At every time from 0 to the ``length``."""
+        from flint import arb
+
+        halvings = 0
+        while not self._size * length < SMALL:
+            length, halvings = length / 2, halvings + 1
+            if halvings > 60:
+                return self._none()
+        found = self._near(arb(0).union(length))
+        for _ in range(halvings):
+            found = found * found
+        return found
+
+    def power(self, order: int) -> Series:
+        """A power of the matrix."""
+        while len(self._powers) <= order:
+            self._powers.append(self.matrix * self._powers[-1])
+        return self._powers[order]
+
+    @cached_property
+    def _powers(self) -> list[Series]:
+        from flint import arb_mat
+
+        n = self.matrix.parts[0].nrows()
+        unit = arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
+        return [Series.constant(self.matrix.monomials, unit), self.matrix]
+
+    @cached_property
+    def _size(self) -> arb:
+        """`Series.size` of the matrix in the units."""
+        from flint import arb_mat
+
+        n, u = len(self._units), self._units
+        left, right = (
+            arb_mat([[factors[i] if i == j else 0 for j in range(n)] for i in range(n)])
+            for factors in ([1.0 / x for x in u], u)
+        )
+        return Series(self.matrix.monomials, [left * part * right for part in self.matrix.parts]).size()
+
+    @cached_property
+    def _stride(self) -> float | None:
+        """A time in which the norm is below `SMALL`, a power of two; ``None`` where there is none."""
+        size = float(self._size.upper())
+        if not size < math.inf:
+            return None
+        return 2.0 ** math.floor(math.log2(SMALL / max(size, LEAST)))
+
+    @cached_property
+    def _terms(self) -> int:
+        """How many powers are added up within a stride."""
+        from flint import arb, ctx
+
+        terms = STRIDE
+        while not _tail(arb(SMALL), terms) < arb(2) ** (SPARE - ctx.prec):
+            terms += 1
+        return terms
+
+    @cached_property
+    def _table(self) -> arb_mat:
+        """Every entry of every coefficient of the powers, a column for each power."""
+        from flint import arb_mat
+
+        columns = [[x for part in self.power(order).parts for x in part.entries()] for order in range(self._terms + 1)]
+        return arb_mat(list(zip(*columns, strict=True)))
+
+    def _near(self, time: arb) -> Series:
+        """At every time of a ball by the powers, with what the others add in every unit."""
+        from flint import arb, arb_mat
+
+        size = upper(self._size * upper(abs(time)))
+        if not size < 1.0:
+            return self._none()
+        factors, n = [[arb(1)]], len(self._units)
+        for order in range(1, self._terms + 1):
+            factors.append([factors[-1][0] * time / order])
+        entries, tail = (self._table * arb_mat(factors)).entries(), _tail(size, self._terms).upper()
+        missing = arb_mat([[arb(0, (tail * (a / b)).upper()) for b in self._units] for a in self._units])
+        parts = [arb_mat(n, n, entries[first : first + n * n]) for first in range(0, len(entries), n * n)]
+        return Series(
+            self.matrix.monomials,
+            [part + missing if mine else part for part, mine in zip(parts, self._generated, strict=True)],
+        )
+
+    @cached_property
+    def _generated(self) -> list[bool]:
+        return self.matrix.generated
+
+    def _whole(self, count: int) -> Series:
+        """After whole strides."""
+        from flint import arb
+
+        if count in self._strides:
+            return self._strides[count]
+        last = count & -count
+        if count > last:
+            found = self._whole(count - last) * self._whole(last)
+            if len(self._strides) >= STRIDES_KEPT:
+                return found
+        elif count == 1:
+            assert self._stride is not None
+            found = self._near(arb(self._stride))
+        else:
+            found = self._whole(count // 2) * self._whole(count // 2)
+        self._strides[count] = found
+        return found
+
+    def _none(self) -> Series:
+        """Of a matrix that is too large for an exponential to be enclosed."""
+        from flint import arb
+
+        return Series(self.matrix.monomials, [part * arb("nan") for part in self.matrix.parts])
 
 
 def _tail(size: arb, terms: int) -> arb:

@@ -14,7 +14,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.arithmetic.series import Exponentials, Series
-from sparserob_core.checker.reach.flow import Flow, in_time, stacked, up_to
+from sparserob_core.checker.reach.flow import ORDER, Flow, expansion, exponentials, stacked
 from sparserob_core.checker.reach.lasting import Lasting
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING, Enclosed, lengths, rounding
@@ -407,27 +407,25 @@ class DisturbanceSupports:
     def _factors(self, ticks: int) -> list[Series]:
         """What makes the coefficients in time of a row within that many ticks; whatever a row does in two ticks to
         either side is included, since lags are rounded to ticks twice."""
-        from flint import arb
-
         if self._latest_factors is not None and self._latest_factors[0] == ticks:
             return self._latest_factors[1]
-        A, length = self.flow.rows, self.scene.duration(ticks)
-        size = A.parts[0].nrows()
-        unit = Series.constant(A.monomials, stacked([[arb(int(i == j)) for j in range(size)] for i in range(size)]))
-        factors = [unit] + (in_time(A, A, length, A.scaled(up_to(length)).exp()) if ticks else [])
-        found = [factor * self._widened for factor in factors]
+        length, (start, *derivatives) = self.scene.duration(ticks), self._derivatives
+        found = [start]
+        if ticks:
+            found += expansion(derivatives, length, self._exponentials.within(length))
         self._latest_factors = ticks, found
         return found
 
     @cached_property
     def _exponentials(self) -> Exponentials:
         """What becomes of rows."""
-        return Exponentials(self.flow.rows, self.scene.tick)
+        return exponentials(self.flow.rows, self.scene.tick, self.scene.grid[-1])
 
     @cached_property
-    def _widened(self) -> Series:
-        """What a row does in two ticks to either side."""
-        return self._exponentials.around(2)
+    def _derivatives(self) -> list[Series]:
+        """What makes a row, and its derivatives in time, of those within two ticks to either side."""
+        widened = self._exponentials.around(2)
+        return [self._exponentials.power(order) * widened for order in range(ORDER + 1)]
 
     def _row(self, ticks: int) -> Enclosed:
         """The rows after that many ticks, as columns: ``(M, n, b)``."""
@@ -446,7 +444,7 @@ class DisturbanceSupports:
         before = known[0][place - 1]
         if before == ticks:
             return known[1][place - 1]
-        row = self._exponentials.over(ticks - before) * known[1][place - 1]
+        row = self._exponentials.at(ticks - before) * known[1][place - 1]
         known[0].insert(place, ticks)
         known[1].insert(place, row)
         return row

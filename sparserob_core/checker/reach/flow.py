@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
-from sparserob_core.checker.arithmetic.series import Series, norm, upper
+from sparserob_core.checker.arithmetic.series import Exponentials, Series, norm, upper
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -221,11 +221,26 @@ def in_time(matrix: Series, derivative: Series, length: arb, inside: Series) -> 
     The last term is Lagrange's: with ``inside``, which holds ``e^{matrix s}`` for every ``s`` up to ``length``, it is
     right anywhere in between.
     """
-    terms, v, factor = [], derivative, length
-    for order in range(1, ORDER):
-        terms.append(v.scaled(factor))
-        v, factor = matrix * v, factor * length / (order + 1)
-    return [*terms, (inside * v).scaled(factor)]
+    derivatives = [derivative]
+    while len(derivatives) < ORDER:
+        derivatives.append(matrix * derivatives[-1])
+    return expansion(derivatives, length, inside)
+
+
+def expansion(derivatives: Sequence[Series], length: arb, inside: Series) -> list[Series]:
+    """`in_time` from the first derivatives at the start, `ORDER` of them."""
+    terms, factor = [], length
+    for order, v in enumerate(derivatives, 1):
+        terms.append(v.scaled(factor) if order < ORDER else (inside * v).scaled(factor))
+        factor = factor * length / (order + 1)
+    return terms
+
+
+def exponentials(matrix: Series, tick: float, horizon: float) -> Exponentials:
+    """Those of a matrix in units in which it is small."""
+    sizes = np.sum([np.abs(middles(part)) for part in matrix.parts], axis=0)
+    units = balanced(sizes, horizon, np.zeros(sizes.shape[0])) if np.isfinite(sizes).all() else None
+    return Exponentials(matrix, tick, None if units is None else units.tolist())
 
 
 def held(matrix: arb_mat, inputs: arb_mat, time: arb) -> tuple[arb_mat, arb_mat]:

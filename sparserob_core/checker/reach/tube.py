@@ -15,7 +15,17 @@ from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.arithmetic.series import Exponentials, Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
-from sparserob_core.checker.reach.flow import Flow, Remainder, beyond, held, in_time, middles, stacked, up_to
+from sparserob_core.checker.reach.flow import (
+    Flow,
+    Remainder,
+    beyond,
+    exponentials,
+    held,
+    in_time,
+    middles,
+    stacked,
+    up_to,
+)
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
@@ -68,7 +78,7 @@ class Tube:
     _ahead: dict[tuple[int, int], tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict)
     _inside: dict[tuple[int, int], Series] = field(default_factory=dict)
     _parts: dict[tuple[int, int], tuple[Series, Series]] = field(default_factory=dict)
-    _exponentials: dict[int, tuple[Exponentials, Series]] = field(default_factory=dict)
+    _exponentials: dict[int, Exponentials] = field(default_factory=dict)
     _states: dict[tuple[int, float, int], Enclosed] = field(default_factory=dict)
 
     @property
@@ -164,8 +174,8 @@ class Tube:
         """What a whole piece of the grid makes of a state and of an input."""
         span, leg = self._spans[piece], self.scene.leg(piece)
         if (leg, span) not in self._transitions:
-            flow = self.flows[leg]
-            self._transitions[leg, span] = flow.states.held(flow.inputs, self._lengths[span])
+            n = self.flows[leg].states.parts[0].nrows()
+            self._transitions[leg, span] = self._every(leg).of(self._lengths[span]).apart(n)
         return self._transitions[leg, span]
 
     def _growth(self, piece: int) -> tuple[arb_mat, arb_mat]:
@@ -215,7 +225,7 @@ class Tube:
         if ticks:
             length = self.scene.duration(ticks)
             if (leg, ticks) not in self._inside:
-                self._inside[leg, ticks] = states.scaled(up_to(length)).exp()
+                self._inside[leg, ticks] = self._every(leg).within(length).apart(states.parts[0].nrows())[0]
             terms += in_time(states, states * x + inputs.applied(u), length, self._inside[leg, ticks])
         every = [self._rows * part for term in terms for part in term.parts]
         return self._kept(piece, start, ticks, every)
@@ -231,12 +241,17 @@ class Tube:
             return states.held(inputs, arb(start) - arb(node))
         ticks = round((start - node) / self.scene.tick)
         if (leg, ticks) not in self._parts:
-            if leg not in self._exponentials:
-                every = Exponentials(states.beside(inputs), self.scene.tick)
-                self._exponentials[leg] = every, every.around(1)
-            every, widened = self._exponentials[leg]
-            self._parts[leg, ticks] = (every.at(ticks) * widened).apart(states.parts[0].nrows())
+            near = arb(arb(self.scene.tick) * ticks, self.scene.tick)
+            self._parts[leg, ticks] = self._every(leg).of(near).apart(states.parts[0].nrows())
         return self._parts[leg, ticks]
+
+    def _every(self, leg: int) -> Exponentials:
+        """What becomes of states and of inputs that stay as they are."""
+        if leg not in self._exponentials:
+            flow = self.flows[leg]
+            both = flow.states.beside(flow.inputs)
+            self._exponentials[leg] = exponentials(both, self.scene.tick, self.scene.grid[-1])
+        return self._exponentials[leg]
 
     @cached_property
     def _rows(self) -> arb_mat:

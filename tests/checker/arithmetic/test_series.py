@@ -10,6 +10,7 @@ import pytest
 import scipy.linalg
 from flint import arb, arb_mat, ctx
 
+from sparserob_core.checker.arithmetic import series
 from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.arithmetic.series import Exponentials, Series, _tail, norm
 
@@ -64,6 +65,67 @@ def test_exponentials_that_are_products_of_one_another_hold_the_exact_ones_and_h
                         assert found[0, 0].contains((arb(a) * time).exp() * (arb(b) * time) ** k / arb(k).fac())
                 assert float(part[0, 0].rad()) < 2.0**-70
                 assert float(beside[0, 0].rad()) < 2.0**-34
+
+
+def test_exponentials_hold_those_of_every_time_of_a_ball_in_any_units_and_in_many_strides():
+    """A rotation whose speed depends on a parameter, in units that are 2^40 apart: ``exp`` of ``(a + b delta) J t``."""
+    known, (a, b), c = Monomials(1, 3), (3.0, 0.5), 2.0**40
+    turn, order = np.array([[0.0, 1.0 / c], [-c, 0.0]]), range(4)
+    with ctx.workprec(96):
+        parts = [matrix(a * turn), matrix(b * turn), matrix(0 * turn), matrix(0 * turn)]
+        every = Exponentials(Series(known, parts), 2.0**-20, [1.0, c])
+        for centre, rad in ((0.0, 2.0**-30), (0.25, 0.0), (7.0, 2.0**-50), (37.7, 2.0**-40), (300.0, 0.0)):
+            found = every.of(arb(centre, rad))
+            for time in (arb(centre) - arb(rad), arb(centre), arb(centre) + arb(rad)):
+                for part, k in zip(found.parts, order, strict=True):
+                    with ctx.workprec(400):
+                        angle, scale = arb(a) * time, (arb(b) * time) ** k / arb(k).fac()
+                        # the k-th derivative of cosine and sine
+                        waves = [angle.cos(), -angle.sin(), -angle.cos(), angle.sin()]
+                        cosine, sine = scale * waves[k % 4], -scale * waves[(k + 1) % 4]
+                        assert part[0, 0].contains(cosine.mid()) and part[1, 1].contains(cosine.mid())
+                        assert part[0, 1].contains((sine / arb(c)).mid()) and part[1, 0].contains((-sine * c).mid())
+            most = 2.0**-60 + 4.0 * rad * (1.0 + b * centre) ** 3
+            for part in found.parts:
+                sizes = np.array([[float(x.rad()) for x in row] for row in part.tolist()])
+                assert (sizes * [[1.0, c], [1.0 / c, 1.0]]).max() < most * (1.0 + centre**3)
+        for length in (2.0**-9, 0.3, 2.0):
+            inside = every.within(arb(length))
+            for time in np.linspace(0.0, length, 5):
+                assert inside.parts[0][0, 1].contains(arb(a * time).sin() / c)
+            assert float(inside.parts[0][0, 0].rad()) < 3.0 * (np.exp(3.5 * length) - 1.0)
+
+
+def test_what_is_left_out_of_a_sum_of_powers_is_in_every_entry():
+    """With as few terms as one, the first entries are off by the whole tail, in their units."""
+    with ctx.workprec(64):
+        every = Exponentials(Series(Monomials(0, 0), [matrix([[0.0, 8.0], [0.0, 0.0]])]), 1.0, [8.0, 1.0])
+        every.__dict__["_terms"] = 1
+        (found,) = every.of(arb(0.125)).parts
+        for (i, j), unit in {(0, 0): 1.0, (0, 1): 8.0, (1, 0): 0.125, (1, 1): 1.0}.items():
+            assert float(found[i, j].rad()) >= unit * 0.125**2 / 2.0
+            assert float(found[i, j].rad()) < unit * 0.125**2 * 1.1
+
+
+def test_whole_strides_are_remembered_and_no_more_than_are_kept(monkeypatch):
+    monkeypatch.setattr(series, "STRIDES_KEPT", 8)
+    with ctx.workprec(96):
+        every = Exponentials(Series(Monomials(1, 1), [matrix([[0.2]]), matrix([[0.01]])]), 1.0)
+        for ticks in range(1, 200):
+            assert every.at(ticks).parts[0][0, 0].contains((arb(0.2) * ticks).exp())
+            assert every.at(ticks) is every.at(ticks)
+        assert len(every._strides) < 8 + 9
+
+
+def test_an_exponential_in_too_many_strides_is_no_number():
+    for value in (1e30, float("inf"), float("nan")):
+        every = Exponentials(Series(Monomials(1, 1), [matrix([[value]]), matrix([[1.0]])]), 1.0)
+        for found in (every.of(arb(1)), every.within(arb(1))):
+            assert not found.parts[0][0, 0].is_finite()
+    every = Exponentials(Series(Monomials(1, 1), [matrix([[1.0]]), matrix([[1.0]])]), 1.0)
+    assert not every.of(arb(0, 2.0)).parts[0][0, 0].is_finite()  # wider than a stride
+    none = Exponentials(Series(Monomials(1, 1), [matrix([[0.0]]), matrix([[0.0]])]), 1.0)
+    assert float(none.of(arb(1e6)).parts[0][0, 0].mid()) == 1.0
 
 
 def test_the_exponential_of_a_matrix_that_depends_on_two_parameters_is_that_at_each_of_them():
