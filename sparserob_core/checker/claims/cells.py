@@ -59,28 +59,36 @@ def prove(
     """Show that no row, with what stands ``beside`` the state in it, is exceeded by more than its slack on the cells
     ``work``; raises `Broken` where one is, and
     `Unchecked` where neither could be shown."""
-    stack = list(reversed(work))
+    waiting = dict[Corners, list[tuple[Sides, list[Interval]]]]()
+    for box, sides, todo in reversed(work):
+        waiting.setdefault(box, []).append((sides, todo))
     found, cells, items = _Found(), 0, 0
     most = max(MOST_CELLS, TIMES * sum(len(todo) for _, _, todo in work))
-    while stack:
-        box, sides, todo = stack.pop()
+    while waiting:
+        # all directions of one box, whose tube is dear, before any of its halves
+        box, stack = waiting.popitem()
         if not parameters.meets(box):
             continue
-        items += 1
-        left = _Left(np.zeros(len(box[0])))
-        while todo:
-            cells += len(todo)
-            if cells > most or items > MOST_BOXES:
-                raise Unchecked(
-                    f"neither shown nor refuted: after {cells} cells a violation of more than {TOLERANCE:.0e} of its"
-                    " unit is not excluded"
-                )
-            _examine(Place(tubes(box), parameters, box, clock, beside), sides, todo, left, found)
-            todo, left.halves = left.halves, []
-        if left.turned:
-            stack += [(box, half, left.turned) for half in reversed(sides.halves(left.slopes))]
-        if left.wide:
-            stack += [(half, sides, left.wide) for half in reversed(_split(box, left.influence))]
+        halved = list[Work]()
+        while stack:
+            sides, todo = stack.pop()
+            items += 1
+            left = _Left(np.zeros(len(box[0])))
+            while todo:
+                cells += len(todo)
+                if cells > most or items > MOST_BOXES:
+                    raise Unchecked(
+                        f"neither shown nor refuted: after {cells} cells a violation of more than {TOLERANCE:.0e} of"
+                        " its unit is not excluded"
+                    )
+                _examine(Place(tubes(box), parameters, box, clock, beside), sides, todo, left, found)
+                todo, left.halves = left.halves, []
+            if left.turned:
+                stack += [(half, left.turned) for half in reversed(sides.halves(left.slopes))]
+            if left.wide:
+                halved += [(half, sides, left.wide) for half in _split(box, left.influence)]
+        for half, sides, todo in reversed(halved):
+            waiting.setdefault(half, []).append((sides, todo))
     return Proven(found.bound, found.share, cells, items)
 
 

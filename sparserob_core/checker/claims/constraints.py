@@ -333,7 +333,9 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
     made: dict[Corners, Tube] = {}
 
     def tube(box: Corners) -> Tube:
-        if box not in made:
+        if box in made:
+            made[box] = made.pop(box)  # the latest
+        else:
             low, high = np.array(box[0]), np.array(box[1])
             centre = (low + high) / 2
             radius = np.nextafter(np.maximum(high - centre, centre - low) + extra, np.inf) if nu else np.zeros(0)

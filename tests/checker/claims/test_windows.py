@@ -831,3 +831,41 @@ def test_a_direction_of_a_curved_wall_is_allowed_a_billionth_of_its_width_or_of_
     assert told.sums == pytest.approx([3.0, 2.5])
     expected = 1e-9 * RESOLVED * float(np.abs(direction) @ told.sums)
     assert told.slack(direction, window.limit(direction, 0.0)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_a_box_of_parameters_is_looked_at_once_for_all_directions(monkeypatch):
+    """``x' = ((p, q), (-q, p)) x`` with ``|p| <= 0.1`` and ``|q| <= 1``: at most ``e^0.2`` from the origin, from 1."""
+    names, made, cells = ("p", "q"), list[Any](), []
+    system = LinearSystem(
+        parse_matrix("A", [["p", "q"], ["-q", "p"]], names),
+        np.zeros((2, 1)),
+        parameters=Box([-0.1, -1.0], [0.1, 1.0]),
+        names=names,
+    )
+    for axis in range(2):
+        for sign in (-1.0, 1.0):
+            for low, high in ((-1.0, 0.0), (0.0, 1.0)):
+                a, b = np.array([low, low]), np.array([high, high])
+                a[axis] = b[axis] = sign
+                cells.append(([2.0, -0.1, -1.0, *a], [2.0, 0.1, 1.0, *b]))
+    known_tube = constraints.Tube
+    monkeypatch.setattr(constraints, "Tube", lambda *given: made.append(given[0][0].centre) or known_tube(*given))
+
+    def shown(radius):
+        made.clear()
+        return kept(
+            case_of(
+                system=system,
+                initial_state=[1.0, 0.0],
+                disturbance=None,
+                decision=((0.0, 0.0),),
+                terminal=[NormBall(2.0, radius, dimension=2)],
+                certificate={"proof": {"terminal": proof(*cells)}},
+            )
+        )
+
+    assert "boxes" in shown(math.exp(0.2) * 1.03)
+    assert len(made) == len(set(made)) > 2
+    with pytest.raises(Broken, match="exceeded"):
+        shown(math.exp(0.2) * 0.95)
