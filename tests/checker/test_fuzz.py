@@ -29,6 +29,16 @@ PUSHED: dict[str, Any] = {
     "terminal": [{"box": [0.4, 0.5]}],
 }
 AFFINE = {"name": "affine", "cost": "peak"}
+SEEN: dict[str, Any] = {
+    **PUSHED,
+    "initial_state": {"centre": [0.5, 0], "box": [0.02, 0.02]},
+    "measurements": {"C": [[1.0, 0.0]], "noise": {"box": [0.01]}},
+}
+BESIDE: dict[str, Any] = {
+    **DECAY,
+    "system": {"A": [["-1 - 0.2*sin(t)"]], "B": [["1 + p1*t"]], "E": [[1.0]], "parameters": {"p1": [-0.1, 0.2]}},
+    "disturbance": {"box": [0.05]},
+}
 KINDS: dict[str, dict[str, Any]] = {
     "known": on(6, {**SPRING, "horizon": 2.0, "path": [{"box": [1.2, None], "from": 0.3}], "terminal": [{"box": 0.9}]}),
     "parameter": on(6, DECAY),
@@ -79,16 +89,37 @@ KINDS: dict[str, dict[str, Any]] = {
             "initial_state": {"centre": [2], "box": [0.05]},
         },
     ),
+    "varying, parameter": on(3, BESIDE),
+    "varying, measurable": on(
+        3,
+        {
+            **DECAY,
+            "system": {"A": [["-1 - 0.2*sin(t)"]], "B": [[1]], "E": [["1 + t"]]},
+            "disturbance": {"box": [0.05]},
+            "disturbance_class": "measurable",
+        },
+    ),
+    "list": on(
+        3,
+        {
+            **PUSHED,
+            "system": {"A": [[0, 1], [-1, -0.1]], "B": [[0], [1]]},
+            "disturbance": [
+                {"set": {"box": [0.1]}, "E": [[0], [1]], "breakpoints": [0, 0.4, 1.7, 2]},
+                {"set": {"norm": {"p": 2, "radius": 0.02}}, "E": [[1, 0], [0, 1]], "pieces": 2},
+            ],
+        },
+    ),
     "execution": on(4, {**DECAY, "system": {"A": [[-1.0]], "B": [[1.0]]}, "execution": [0.05]}),
     "repeat": on(
         3, {**PUSHED, "initial_state": {"centre": [0.5, 0], "box": [0.3, 0.3]}, "repeat": True}, policy=AFFINE
     ),
-    "feedback, outputs": on(
-        3, {**PUSHED, "measurements": {"C": [[1.0, 0.0]], "noise": {"box": [0.01]}}}, policy=AFFINE
-    ),
+    "feedback, outputs": on(3, SEEN, policy=AFFINE),
     "feedback, integral": on(3, {**PUSHED, "integral": [{"G": [[1.0]], "upper": 3.0}]}, policy=AFFINE),
     "bound": on(3, {**PUSHED, "terminal": []}),
     "bound, parameter": on(3, DECAY),
+    "bound, outputs": on(3, {**SEEN, "terminal": []}),
+    "bound, varying": on(3, BESIDE),
 }
 PARTS = 8
 SECONDS = 5.0  # of a check, which ends without a verdict then: the honest ones take a fifth of one
