@@ -115,6 +115,11 @@ class ConvexSet(ABC):
         width = self.support(axes) + self.support(-axes)
         return few_digits(axes / np.where((width > 0.0) & np.isfinite(width), width / 2.0, 1.0)[:, None])
 
+    @shaped
+    def along(self, z: Float[Array, "*k b"]) -> Float[Array, "*k d"]:
+        """The directions ``(k, d)`` with coordinates ``z (k, b)`` in the `frame`."""
+        return np.asarray(z @ self.frame)
+
     @property
     def is_bounded(self) -> bool:
         """Whether the support function is finite in every direction."""

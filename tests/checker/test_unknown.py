@@ -65,6 +65,10 @@ def forced(case: Case, **fields: Any) -> Case:
     return made
 
 
+def returning(case: Case) -> object:
+    return replace(case, given=None)
+
+
 def largest_effort(a: arb, limit: float) -> Callable[[], object]:
     return lambda: effort.at_most([a], [[arb(0)]], lambda row: arb(0), np.zeros(1), arb(limit), Clock())
 
@@ -80,11 +84,11 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "Kepler's equation of no number": (lambda: kepler_root(arb("nan"), arb(0.3)), Unchecked, "Kepler's equation"),
     "an observer of another shape": (observed, Broken, r"the observer has shape \(1, 1, 1\), expected \(2, 1, 1\)"),
     "a flat set of initial states": (
-        lambda: (
+        lambda: returning(
             forced(
                 repeating(initial_set=Box([-0.25, 0.0], [0.25, 0.0])),
                 initial_set=Polytope([[1, 0], [-1, 0], [0, 1], [0, -1]], [0.25, 0.25, 0.0, 0.0]),
-            ).returned
+            )
         ),
         Unchecked,
         "of a flat set of initial states, the checker knows boxes only",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, final, get_args
@@ -49,8 +49,9 @@ INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: t
 @final
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What is checked: a certificate (plain data) against a problem on its two dictionaries; what it integrates is
-    made states of it here, once, for every claim. ``counts``: its cost is
+    """What is checked: a certificate (plain data) against a problem on its two dictionaries; what it integrates, and
+    what parameters add beside the time, is made states of it here, once, for every claim; ``given`` is the problem
+    before that, where there is another one. ``counts``: its cost is
     the time that the control acts, which may take the values ``letters`` only where there are any; ``policy``: the
     control answers what it measures."""
 
@@ -62,8 +63,12 @@ class Case:
     counts: bool = False
     letters: tuple[float, ...] | None = None
     policy: Policy | None = None
+    given: OptimalControlProblem | None = None
 
     def __post_init__(self) -> None:
+        if self.given is None:
+            object.__setattr__(self, "given", self.problem)
+            object.__setattr__(self, "problem", self._returning(self.problem))
         plain = spelt(self.problem)
         known = parted(plain)
         if known is not plain and self.policy is not None:
@@ -76,6 +81,11 @@ class Case:
         if self.policy is not None and self.control.functions == self.control.pieces:
             # as many functions as pieces, which are independent, make all controls on these: what is written are values
             object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))
+
+    @property
+    def stated(self) -> OptimalControlProblem:
+        """The problem as it was given, whose states come first."""
+        return self.problem if self.given is None else self.given
 
     @cached_property
     def of_control(self) -> str:
@@ -125,7 +135,7 @@ class Case:
             )
             for i, entry in enumerate(path)
         ]
-        found += [] if self.returned is None else [self.returned]
+        found += self.returned
         return found + [
             Window(
                 f"terminal[{i}]" if len(ends) > 1 else "terminal", end, self.problem.horizon, self.problem.horizon, d
@@ -133,27 +143,45 @@ class Case:
             for i, end in enumerate(ends)
         ]
 
-    @cached_property
-    def returned(self) -> Window | None:
-        """Of a plan that repeats, that every final state is one of the initial states, and inside their set by more
-        than what counts as no violation; ``None`` where there is but one of each coordinate. Derived from the initial
-        states alone, whatever the problem's records say of it."""
-        bound, end = self.problem.initial_set, self.problem.horizon
-        if not self.problem.repeat or bound is None or len(self.single) == self.problem.system.states:
-            return None
+    def _returning(self, problem: OptimalControlProblem) -> OptimalControlProblem:
+        """The problem with, of a plan that repeats, one constraint more: that every final state is one of the initial
+        states, and inside their set by more than what counts as no violation; none where there is but one of each
+        coordinate. Derived from the initial states alone, whatever the problem's records say of it."""
+        bound, end, path = problem.initial_set, problem.horizon, problem.windows
+        path = [entry for entry in path if not isinstance(entry, Return)]
+        if not problem.repeat or bound is None or len(self.single) == problem.system.states:
+            return replace(problem, path=path) if len(path) < len(problem.path) else problem
         free = np.isin(np.arange(bound.dimension), self.single)
         if free.any():
             if not isinstance(bound, Box):
                 raise Unchecked("of a flat set of initial states, the checker knows boxes only")
             bound = Box(np.where(free, -np.inf, bound.lower), np.where(free, np.inf, bound.upper))
-        centre = np.asarray(self.problem.initial_state, dtype=float)
-        moved = np.column_stack([[0.0, end], np.vstack([centre, centre])])
-        return Window(RETURN, bound.scaled(1.0 - INSIDE), end, end, bound.dimension, moved if centre.any() else None)
+        centre = np.asarray(problem.initial_state, dtype=float)
+        moved = np.column_stack([[0.0, end], np.vstack([centre, centre])]) if centre.any() else None
+        back = Return(bound.scaled(1.0 - INSIDE), end, end, RETURN, moved)
+        return replace(problem, path=[*path, back])
+
+    @cached_property
+    def returned(self) -> list[Window]:
+        """Of a plan that repeats, that every final state is one of the initial states, where there is more than one of
+        a coordinate; for every corner of parameters beside the time where these states are in a curved set."""
+        return [
+            Window(
+                entry.name or RETURN,
+                entry.set,
+                entry.start,
+                self.problem.horizon if entry.stop is None else entry.stop,
+                entry.set.dimension,
+                None if entry.relative_to is None else np.asarray(entry.relative_to),
+            )
+            for entry in self.problem.windows
+            if isinstance(entry, Return)
+        ]
 
     @cached_property
     def single(self) -> list[int]:
-        """The coordinates in which all initial states are alike."""
-        bound, d = self.problem.initial_set, self.problem.system.states
+        """The coordinates of the stated state in which all initial ones are alike."""
+        bound, d = self.stated.initial_set, self.stated.system.states
         if bound is None:
             return list(range(d))
         axes = np.eye(d).tolist()

@@ -219,12 +219,12 @@ def _unit(case: Case, window: Window) -> str:
 def normals_of(window: Window, data: object) -> Array:
     """The coordinates of a curved set's directions, ``(b, d)``: they must be able to name every direction in which it
     is bounded. Those of the state where the certificate has none."""
-    b, d = window.seen.spanned, window.shape.dimension
+    shape, b, d = window.seen, window.seen.spanned, window.shape.dimension
     if data is None:
-        return np.eye(b, d)
+        return shape.lifted(np.eye(b))
     normals = numbers(data, "normals")
-    if normals.shape != (b, d) or normals[:, b:].any():
-        raise Broken(f"normals: expected {b} directions of the first {b} of {d} states")
+    if normals.shape != (b, d) or not np.array_equal(shape.lifted(normals[:, :b]), normals):
+        raise Broken(f"normals: expected {b} directions of the first {b} of {d} states, or of their sums with others")
     from flint import fmpq, fmpq_mat
 
     if fmpq_mat([[fmpq(*v.as_integer_ratio()) for v in row] for row in normals[:, :b].tolist()]).det() == 0:

@@ -195,6 +195,8 @@ def _free(bound: ConvexSet, size: int) -> ConvexSet:
         ends = ((bound.lower, -np.inf), (bound.upper, np.inf))
         return Box(*(np.pad(side, (0, more), constant_values=far) for side, far in ends))
     flat = bound.halfspaces()
+    if flat is None and isinstance(bound, Cylinder) and bound.slopes is not None:
+        return Cylinder(bound.base, size, np.pad(bound.slopes, ((0, 0), (0, more))))
     return Cylinder(bound, size) if flat is None else Polytope(np.pad(flat[0], ((0, 0), (0, more))), flat[1])
 
 

@@ -1,10 +1,11 @@
 """Parameters beside the time, as coordinates of a larger state: derived from the problem's records alone.
 
 Where every entry of ``[A B E c]`` is a sum ``f_0(t) + sum_j f_j(t) s_j``, ``s_j`` what parameter ``j`` deviates from a
-middle one by as a share of a power of two, the state is ``x = x_0 + sum_j s_j y_j``, if no entry of ``A`` that has an
-``s_j`` meets a state that depends on a parameter: then ``y_j' = A_0 y_j + A_j x_0 + B_j u + E_j w + c_j``. After the
-``d`` states of the problem come the coordinates of ``y_1`` that anything moves, then those of ``y_2``, and so on. Rows
-on ``x`` are affine in ``s``, and hold on a box where they hold at its corners.
+middle one by as a share of the most that it can, the state is ``x = x_0 + sum_j s_j y_j``, if no entry of ``A`` that
+has an ``s_j`` meets a state that depends on a parameter: then ``y_j' = A_0 y_j + A_j x_0 + B_j u + E_j w + c_j``. After
+the ``d`` states of the problem come the coordinates of ``y_1`` that anything moves, then those of ``y_2``, and so on.
+Rows on ``x`` are affine in ``s``, and hold on a box where they hold at its corners, at which every ``s_j`` is -1 or 1;
+so do convex sets.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import product
-from math import frexp, inf, nextafter
+from math import inf, nextafter
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -25,8 +26,9 @@ from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
+from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint
-from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, Polytope, Product
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope, Product
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -150,14 +152,15 @@ class Parts:
 
     @cached_property
     def scales(self) -> list[float]:
-        """The powers of two that parameters are counted in, next above what they deviate by; 0 where that is 0."""
-        box, found = self.system.parameters, []
+        """The most that every parameter deviates by, or a double above it."""
+        box = self.system.parameters
         if not isinstance(box, Box):
             raise Unchecked("the checker knows boxes of parameters beside the time")
-        for low, high, middle in zip(box.lower.tolist(), box.upper.tolist(), self.middle, strict=True):
-            far = max(high - middle, middle - low)
-            found.append(2.0 ** frexp(far)[1] if far > 0.0 else 0.0)
-        return found
+        every = zip(box.lower.tolist(), box.upper.tolist(), self.middle, strict=True)
+        return [
+            _above(max(Fraction(high) - Fraction(middle), Fraction(middle) - Fraction(low)))
+            for low, high, middle in every
+        ]
 
     def tables(self, entry: object, time: object) -> list[np.ndarray]:
         """``f_0, f_1, ..., f_nu`` of a matrix at a time; raises `Unchecked` where it is no such sum."""
@@ -220,13 +223,8 @@ class Parts:
 
     def corners(self) -> Iterator[tuple[float, ...]]:
         """Those of a box that holds all shares; of parameters that move nothing one suffices."""
-        box, ends = self.system.parameters, []
-        assert isinstance(box, Box)
-        every = zip(box.lower.tolist(), box.upper.tolist(), self.middle, self.scales, self.moved, strict=True)
-        for low, high, middle, scale, places in every:
-            least, most = (_beyond(Fraction(end) - Fraction(middle), side) for end, side in ((low, -inf), (high, inf)))
-            ends.append([end / scale for end in dict.fromkeys((least, most))] if places else [0.0])
-        return product(*ends)
+        pairs = zip(self.scales, self.moved, strict=True)
+        return product(*((-1.0, 1.0) if scale and places else (0.0,) for scale, places in pairs))
 
 
 @final
@@ -261,8 +259,11 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     d, more = system.states, parts.size - system.states
     corners = [parts.seen(shares) for shares in parts.corners()]
     measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
-    if problem.repeat or any(isinstance(end, Equality) for end in problem.terminal):
-        raise Unchecked("the checker knows no return, and no fixed final values, beside parameters and the time")
+    reached = {place for places in parts.moved for place in places}
+    if any(reached & set(end.fixed.tolist()) for end in problem.terminal_equalities):
+        raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
+    several = sum(not isinstance(entry, Return) for entry in problem.windows) > 1
+    called_as = [entry.name or (f"path[{i}]" if several else "path") for i, entry in enumerate(problem.windows)]
     called = list(problem.names.states or [f"x{i + 1}" for i in range(d)])
     units = list(problem.names.state_units)
     for name, scale, places in zip(system.names, parts.scales, parts.moved, strict=True):
@@ -276,8 +277,16 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
         system=VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:])),
         initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(more)]),
         initial_set=_begun(begun, more) if begun is not None and more else begun,
-        path=[_seen(entry, corners) for entry in problem.path],
-        terminal=[_polytope(end, corners) for end in problem.terminal if not isinstance(end, Equality)],
+        path=[one for entry, name in zip(problem.path, called_as, strict=True) for one in _seen(entry, name, corners)],
+        terminal=[
+            one
+            for end in problem.terminal
+            for one in (
+                [Equality(np.pad(end.values, (0, more), constant_values=np.nan))]
+                if isinstance(end, Equality)
+                else _bounds(end, corners)
+            )
+        ],
         integral=[_sums(entry, corners) for entry in problem.integral],
         cost=replace(problem.cost, state=costs[0], final=costs[2]),
         names=replace(problem.names, states=called, state_units=units),
@@ -289,11 +298,10 @@ def _may_be(value: object) -> bool:
     return isinstance(value, Something) or float(value) != 0.0  # type: ignore[arg-type]  # a number then
 
 
-def _beyond(exact: Fraction, side: float) -> float:
-    """The double next to a number on one side of it, or the number itself."""
+def _above(exact: Fraction) -> float:
+    """The number itself, or the next double above it."""
     found = float(exact)
-    off = Fraction(found) - exact
-    return nextafter(found, side) if (off < 0 < side) or (side < 0 < off) else found
+    return nextafter(found, inf) if Fraction(found) < exact else found
 
 
 def _law(parts: Parts, law: LinearSystem, begin: float, until: float) -> LinearSystem:
@@ -313,17 +321,21 @@ def _rows(blocks: list[Array]) -> Array:
     return np.array(list(dict.fromkeys(tuple(row) for block in blocks for row in block.tolist())))
 
 
-def _polytope(bound: ConvexSet, corners: list[Array]) -> Polytope:
+def _bounds(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
+    """What a set says at all corners: one with flat sides in rows, another one in a set for every corner."""
     flat = bound.halfspaces()
-    if flat is None:
-        raise Unchecked("beside parameters and the time the checker knows sets with flat sides")
-    every = _rows([np.column_stack([flat[0] @ seen, flat[1]]) for seen in corners])
-    return Polytope(every[:, :-1], every[:, -1])
+    if flat is not None:
+        every = _rows([np.column_stack([flat[0] @ seen, flat[1]]) for seen in corners])
+        return [Polytope(every[:, :-1], every[:, -1])]
+    base = bound.base if isinstance(bound, Cylinder) else bound
+    b = base.dimension
+    leaning = list(dict.fromkeys(tuple(map(tuple, seen[:b, b:].tolist())) for seen in corners))
+    return [Cylinder(base, corners[0].shape[1], np.array(one)) for one in leaning]
 
 
 def _seen(
-    entry: PathConstraint | MixedConstraint | ConvexSet, corners: list[Array]
-) -> PathConstraint | MixedConstraint:
+    entry: PathConstraint | MixedConstraint | ConvexSet, name: str, corners: list[Array]
+) -> list[PathConstraint | MixedConstraint]:
     assert not isinstance(entry, ConvexSet)
     d, size = corners[0].shape
     if isinstance(entry, MixedConstraint):
@@ -331,10 +343,14 @@ def _seen(
         every = _rows(
             [np.column_stack([H @ seen, G, np.broadcast_to(np.asarray(entry.h), len(H))]) for seen in corners]
         )
-        return replace(entry, H=every[:, :size], G=every[:, size:-1], h=every[:, -1])
+        return [replace(entry, name=name, H=every[:, :size], G=every[:, size:-1], h=every[:, -1])]
     rows = None if entry.relative_to is None else np.asarray(entry.relative_to)
     moved = None if rows is None else np.pad(rows, ((0, 0), (0, size - d)))
-    return replace(entry, set=_polytope(entry.set, corners), relative_to=moved)
+    found = _bounds(entry.set, corners)
+    return [
+        replace(entry, name=name if len(found) == 1 else f"{name} at corner {k + 1}", set=one, relative_to=moved)
+        for k, one in enumerate(found)
+    ]
 
 
 def _sums(entry: IntegralConstraint, corners: list[Array]) -> IntegralConstraint:

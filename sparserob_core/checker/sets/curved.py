@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, balls
-from sparserob_core.checker.outcome import Broken
+from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
 from sparserob_core.checker.sets.shape import Shape, along, total
 from sparserob_core.control.sets.sets import Cylinder, Ellipsoid, NormBall, Product
@@ -158,13 +158,19 @@ class Ball(Shape):
 
 @final
 class Cylindrical(Shape):
-    """A cylinder: the first coordinates are in the set ``base``, the others are free."""
+    """A cylinder: the first coordinates, or their sums with others, are in the set ``base``; what else there is is
+    free."""
 
     source: Cylinder
 
     def __init__(self, source: Cylinder, base: Shape) -> None:
         super().__init__(source)
         self.base = base
+        given = np.zeros((base.dimension, source.dimension - base.dimension))
+        self.slopes = given if source.slopes is None else np.asarray(source.slopes, dtype=float)
+        whole = np.isin(self.slopes, (-1.0, 0.0, 1.0)).all() and (np.count_nonzero(self.slopes, axis=0) <= 1).all()
+        if self.slopes.shape != given.shape or not whole:
+            raise Unchecked("the checker knows cylinders along sums and differences of coordinates")
 
     @property
     def spanned(self) -> int:
@@ -174,16 +180,32 @@ class Cylindrical(Shape):
     def centre(self) -> Array:
         return np.concatenate([self.base.centre, np.zeros(self.dimension - self.spanned)])
 
+    def lifted(self, directions: Array) -> Array:
+        """Directions of the base ``(k, b)`` as directions of the set; exact, for one number makes each entry."""
+        return np.hstack([directions, directions @ self.slopes])
+
     def support(self, direction: Sequence[arb]) -> arb:
-        if any(not c.is_zero() for c in direction[self.spanned :]):
-            raise Broken("a direction points where its set is unbounded")
-        return self.base.support(direction[: self.spanned])
+        own = direction[: self.spanned]
+        for place, c in enumerate(direction[self.spanned :]):
+            (which,) = np.nonzero(self.slopes[:, place])
+            off = c - total(float(self.slopes[i, place]) * own[i] for i in which.tolist()) if which.size else c
+            # a ball that holds 0 is what rounding leaves of a direction that `lifted` made exactly
+            if not (off.is_zero() if not which.size else off.contains(0)):
+                raise Broken("a direction points where its set is unbounded")
+        return self.base.support(own)
+
+    def _seen(self, point: Sequence[arb]) -> list[arb]:
+        """What of a point is looked at in the base."""
+        found = list(point[: self.spanned])
+        for i, place in np.argwhere(self.slopes).tolist():
+            found[i] = found[i] + float(self.slopes[i, place]) * point[self.spanned + place]
+        return found
 
     def holds(self, point: Sequence[arb]) -> bool:
-        return self.base.holds(point[: self.spanned])
+        return self.base.holds(self._seen(point))
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
-        return self.base.gauge(offsets[: self.spanned])
+        return self.base.gauge(self._seen(offsets))
 
     def far(self, direction: Sequence[arb]) -> list[arb]:
         return [*self.base.far(direction[: self.spanned]), *balls(np.zeros(self.dimension - self.spanned))]

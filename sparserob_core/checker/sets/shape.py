@@ -63,8 +63,12 @@ class Shape(ABC):
 
     @property
     def spanned(self) -> int:
-        """How many of the first coordinates the set bounds."""
+        """How many of the first coordinates the set bounds, alone or in sums with others."""
         return self.dimension
+
+    def lifted(self, directions: Array) -> Array:
+        """Directions of the `spanned` coordinates ``(k, b)`` as those of the set, ``(k, d)``."""
+        return directions
 
     # Flat sets
 

@@ -73,7 +73,7 @@ def _asked(case: Case) -> list[Asked]:
     found = [
         Asked(window, direction, b)
         for window in case.windows
-        if window is not case.returned
+        if window not in case.returned
         for direction, b in window.seen.facets or []
     ]
     if found:

@@ -178,10 +178,11 @@ class Dependence:
         """How many states there are in all."""
         return int(self.reached.shape[1] + self.reached.sum())
 
-    def rows(self, deviations: Array) -> Array:
-        """``x`` as rows on all states, ``(d, states)``, where the parameters deviate from their centre by these."""
+    def rows(self, shares: Array) -> Array:
+        """``x`` as rows on all states, ``(d, states)``, where the parameters deviate from their centre by these shares
+        of their units."""
         nu, d = self.reached.shape
-        axes, shares = np.eye(d), deviations / np.where(self.units > 0.0, self.units, 1.0)
+        axes = np.eye(d)
         return np.hstack([axes, *(shares[j] * axes[:, self.reached[j]] for j in range(nu))])
 
     def matrix(self, name: str, entry: object, time: Value) -> Table:
@@ -215,12 +216,11 @@ class Superposed:
         return self.dependence.matrix(self.name, self.entry, p[0])
 
 
-def dependence(laws: Sequence[Sequence[object]], centre: Array, far: Array) -> Dependence | tuple[int, str, int, int]:
+def dependence(laws: Sequence[Sequence[object]], centre: Array, units: Array) -> Dependence | tuple[int, str, int, int]:
     """That of a system whose laws have these ``A``, ``B``, ``E`` and ``c`` (or ``None``), and whose parameters are at
-    most ``far (nu,)`` from their ``centre``: a power of two above that is their unit, so that states are in no units
-    that are much larger or smaller than what they do. Or the law, the matrix and
-    the entry of it that make the state no affine function of the parameters."""
-    units = np.where(far > 0.0, np.ldexp(1.0, np.frexp(far)[1]), 0.0)
+    most ``units (nu,)`` from their ``centre``: so states are in units of what they do, and rows at a corner are sums
+    and differences of them. Or the law, the matrix and the entry of it that make the state no affine function of the
+    parameters."""
     every: list[tuple[Split, list[Split]]] = []
     for number, entries in enumerate(laws):
         parts = []

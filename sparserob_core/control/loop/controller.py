@@ -136,6 +136,7 @@ class Controller:
         measured = None if state is None else self._measured(state)
         if period > self._period:
             self._begin(period)
+            measured = None if state is None else self._measured(state)  # integrals begin anew
         # from any of the initial states the proof holds for another period
         anew = period > 0 and piece == 0 and self._observer is None
         covered = measured is not None and (self._covered or anew) and self._within(measured)
@@ -162,6 +163,7 @@ class Controller:
         """Apply the plan anew, in the next period."""
         self._take(self._planned)
         self._next, self._period = 0, period
+        self._added_up = np.zeros_like(self._added_up)
 
     def _begins_at(self, period: int, piece: int) -> float:
         points = self._planned.model.control.breakpoints

@@ -31,7 +31,7 @@ from sparserob_core.control.problem.system import (
     require_period,
 )
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
-from sparserob_core.control.problem.terms.repeat import RETURN, SAME, Repeating, ending
+from sparserob_core.control.problem.terms.repeat import RETURN, SAME, Repeating, ending, widths
 from sparserob_core.control.problem.terms.windows import (
     MixedConstraint,
     PathConstraint,
@@ -178,10 +178,10 @@ class OptimalControlProblem(Term):
             if KIND in one.metadata:
                 self._set(one.name, tuple(self._constraints(one.name, one.metadata[KIND])))
         self._set("terminal", tuple(self._terminal()))
-        if isinstance(self.system, VaryingSystem) and self.system.parameters is not None:
-            self._check_uncertain()
         if self.repeat is not Repeating.IMPOSED:
             self._return()
+        if isinstance(self.system, VaryingSystem) and self.system.parameters is not None:
+            self._check_uncertain(self.system)
         self._set("execution", self._executed())
         sealed(self)
 
@@ -264,23 +264,19 @@ class OptimalControlProblem(Term):
                 )
             begin = until
 
-    def _check_uncertain(self) -> None:
+    def _check_uncertain(self, system: VaryingSystem) -> None:
         """Raise `InputError` for what is not proven of a system that changes with time and has parameters."""
-        if self.repeat:
-            raise InputError(path="repeat", expected="false where parameters stand beside the time t", got="true")
-        where = [(f"path.{i}", one.set) for i, one in enumerate(self.path) if not isinstance(one, ConvexSet)]
         for i, end in enumerate(self.terminal):
-            if isinstance(end, Equality):
-                raise InputError(
-                    path=f"terminal.{i}",
-                    expected="no fixed final values where parameters stand beside the time t, which reach them",
-                    got="some",
-                )
-            where.append((f"terminal.{i}", end))
-        for path, bound in where:
-            if bound.halfspaces() is None:
-                expected = "a set with flat sides where parameters stand beside the time t"
-                raise InputError(path=path, expected=expected, got=bound.kind)
+            if not isinstance(end, Equality):
+                continue
+            for parameter, state in np.argwhere(system.dependence.reached).tolist():
+                if state in end.fixed:
+                    returns = self.repeat and widths(self.initial_set, system.states)[state] == 0.0
+                    raise InputError(
+                        path="repeat" if returns else f"terminal.{i}",
+                        expected="final values fixed of states that no parameter reaches, beside the time t",
+                        got=f"{self.names.state(state)}, which {system.names[parameter]} reaches",
+                    )
 
     def _executed(self) -> Array | None:
         """The errors of execution, ``None`` where there are none; raises `InputError` for what they are not proven
@@ -301,7 +297,8 @@ class OptimalControlProblem(Term):
                 self.terminal_equalities
             ),
             "pieces of the system": isinstance(self.system, SwitchedSystem),
-            "uncertain parameters": bool(self.system.parameter_count),
+            "uncertain parameters, but for those beside the time t": bool(self.system.parameter_count)
+            and not isinstance(self.system, VaryingSystem),
             "a delay": self.system.delay > 0.0,
             "measurable disturbances": self.measurable is not None,
             "integrals of state and control": bool(self.sums),
@@ -460,12 +457,6 @@ class OptimalControlProblem(Term):
                 path="repeat",
                 expected="a control that acts at once: with system.delay the last controls of a period act in the next",
                 got=f"a delay of {self.system.delay:g}",
-            )
-        if self.sums:
-            raise InputError(
-                path=next(iter(self.sums)),
-                expected="none where the plan repeats, of which integrals over a period are not proven yet",
-                got=f"{sum(map(len, self.sums.values()))}",
             )
         if any(entry.name == RETURN for entry in self.windows):
             raise InputError(path="repeat", expected=f"no path constraint named {RETURN}, which is that of repeat")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
 from typing import TypeAlias, final
@@ -598,7 +599,9 @@ class VaryingSystem:
         centre = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
         entries = [[law.entry(name) for name in PARTS] for _, _, law in self.laws]
         ends = (centre, centre) if self.parameters is None else (self.parameters.lower, self.parameters.upper)
-        found = dependence(entries, centre, np.maximum(ends[1] - centre, centre - ends[0]))
+        sides = ((centre, ends[1]), (ends[0], centre))
+        far = [[_difference(a, b) for a, b in zip(*side, strict=True)] for side in sides]
+        found = dependence(entries, centre, np.max(far, axis=0))
         if isinstance(found, Dependence):
             return found
         number, name, i, j = found
@@ -756,6 +759,12 @@ class VaryingSystem:
 
 
 System: TypeAlias = LinearSystem | SwitchedSystem | VaryingSystem
+
+
+def _difference(low: float, high: float) -> float:
+    """``high - low``, or the next double above it."""
+    exact, found = Fraction(float(high)) - Fraction(float(low)), float(high) - float(low)
+    return found if Fraction(found) >= exact else float(np.nextafter(found, np.inf))
 
 
 def require_period(system: VaryingSystem) -> None:

@@ -18,7 +18,7 @@ PER_EDGE = {1: 1, 2: 33, 3: 9, 4: 5}
 def shares(convex_set: ConvexSet, z: Float[Array, "k b"]) -> Float[Array, "k b"]:
     """Cube points ``(k, b)`` divided by how far the set reaches from its middle ``m`` along ``c = z N``:
     ``h(c) - c'm``. By its length where the set has no extent; 0 stays 0."""
-    directions = z @ convex_set.frame
+    directions = convex_set.along(z)
     return np.asarray(z / _rooms(convex_set, directions)[:, None])
 
 
@@ -26,13 +26,13 @@ def shares(convex_set: ConvexSet, z: Float[Array, "k b"]) -> Float[Array, "k b"]
 def unit(convex_set: ConvexSet, z: Float[Array, "k b"]) -> Float[Array, "k d"]:
     """Directions ``(k, d)`` of cube points ``(k, b)``, in the span in which the support function is finite, such that
     ``h(c) - c'm = 1``: what ``c'x`` exceeds ``h(c)`` by is then the gauge about the middle ``m`` less 1; 0 stays 0."""
-    return np.asarray(shares(convex_set, z) @ convex_set.frame)
+    return np.asarray(convex_set.along(shares(convex_set, z)))
 
 
 @shaped
 def across(convex_set: ConvexSet, z: Float[Array, "k b"], slopes: Float[Array, "k b"]) -> Float[Array, "k b"]:
     """Derivatives ``(k, b)`` in cube points, from derivatives ``slopes (k, b)`` in their `shares`; 0 at the point 0."""
-    directions = z @ convex_set.frame
+    directions = convex_set.along(z)
     rooms, sizes = _rooms(convex_set, directions), np.linalg.norm(directions, axis=1, keepdims=True)
     outwards = convex_set.support_point(directions) - convex_set.interior_point()
     flat = (outwards * directions).sum(axis=1, keepdims=True) <= 0.0

@@ -30,6 +30,7 @@ __all__ = [
     "Zonotope",
     "cylinder",
     "intersection",
+    "oblique",
     "product",
 ]
 
@@ -138,36 +139,54 @@ def intersection(sets: Sequence[ConvexSet]) -> ConvexSet | tuple[ConvexSet, ...]
     return Polytope(np.vstack([H for H, _ in flats]), np.concatenate([h for _, h in flats]))
 
 
+# Of a direction, by which it may be off the span of an oblique cylinder by rounding: a hundredth would call what matrix
+# products make of one unbounded, a hundred times as much would not be rounding.
+ROUNDED = 1e-12
+
+
 @dataclass(frozen=True, eq=False)
 class Cylinder(ConvexSet):
-    """``{x in R^size : x[:b] in base}`` for a curved ``base`` in ``R^b``: the other coordinates are free. Made by
-    `cylinder`."""
+    """``{x in R^size : x[:b] + slopes x[b:] in base}`` for a curved ``base`` in ``R^b`` and ``slopes (b, size - b)``;
+    ``None``: the other coordinates are free. Made by `cylinder` and `oblique`."""
 
     base: ConvexSet
     size: int
+    slopes: Array | None = None
 
     @property
     def dimension(self) -> int:
         return self.size
 
     @property
+    def kind(self) -> str:
+        return type(self).__name__.lower() if self.slopes is None else self.base.kind
+
+    @property
     def normals(self) -> Array:
-        return np.eye(self.base.dimension, self.size)
+        return self._lifted(np.eye(self.base.dimension))
 
     @property
     def frame(self) -> Array:
-        own = self.base.frame
-        return np.hstack([own, np.zeros((own.shape[0], self.size - own.shape[1]))])
+        return self._lifted(self.base.frame)
+
+    @shaped
+    def along(self, z: Float[Array, "*k b"]) -> Float[Array, "*k d"]:
+        return self._lifted(self.base.along(z))
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> Cylinder:
-        return Cylinder(self.base.in_units(units[: self.base.dimension]), self.size)
+        mine, others = units[: self.base.dimension], units[self.base.dimension :]
+        slopes = None if self.slopes is None else self.slopes * others / mine[:, None]
+        return Cylinder(self.base.in_units(mine), self.size, slopes)
 
     @shaped
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
-        bounded = (directions[..., self.base.dimension :] == 0.0).all(axis=-1)
-        height: Array = np.where(bounded, self.base.support(directions[..., : self.base.dimension]), np.inf)
+        own, others = directions[..., : self.base.dimension], directions[..., self.base.dimension :]
+        room: Array | float = 0.0
+        if self.slopes is not None:
+            others, room = others - own @ self.slopes, ROUNDED * (np.abs(own) @ np.abs(self.slopes))
+        height: Array = np.where((np.abs(others) <= room).all(axis=-1), self.base.support(own), np.inf)
         return height
 
     @shaped
@@ -178,18 +197,40 @@ class Cylinder(ConvexSet):
 
     @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        return self.base.violation(np.asarray(points)[..., : self.base.dimension])
+        return self.base.violation(self._seen(points))
 
     @shaped
     def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        return self.base.gauge(np.asarray(points)[..., : self.base.dimension])
+        return self.base.gauge(self._seen(points))
 
     def scaled(self, factor: float) -> Cylinder:
-        return Cylinder(self.base.scaled(factor), self.size)
+        return Cylinder(self.base.scaled(factor), self.size, self.slopes)
 
     @shaped
     def interior_point(self) -> Float[Array, " d"]:
         return np.concatenate([self.base.interior_point(), np.zeros(self.size - self.base.dimension)])
+
+    def _lifted(self, directions: Array) -> Array:
+        """Directions of the base ``(k, b)`` as directions of the set."""
+        free = np.zeros((*directions.shape[:-1], self.size - self.base.dimension))
+        beside = free if self.slopes is None else directions @ self.slopes
+        return np.concatenate([directions, beside], axis=-1)
+
+    def _seen(self, points: Array) -> Array:
+        """The point of the base's space that each point is looked at as."""
+        given = np.asarray(points, dtype=float)
+        own, others = given[..., : self.base.dimension], given[..., self.base.dimension :]
+        return own if self.slopes is None else own + others @ self.slopes.T
+
+
+def oblique(base: ConvexSet, slopes: Array) -> Cylinder:
+    """``{x : x[:d] + slopes x[d:] in base}`` for a curved ``base`` in ``R^d`` and ``slopes (d, more)``."""
+    size = base.dimension + slopes.shape[1]
+    if isinstance(base, Cylinder):
+        free, kept = base.size - base.base.dimension, base.base.dimension
+        assert base.slopes is None
+        return Cylinder(base.base, size, np.hstack([np.zeros((kept, free)), slopes[:kept]]))
+    return Cylinder(base, size, slopes)
 
 
 @overload
@@ -210,6 +251,8 @@ def cylinder(base: ConvexSet | Equality, size: int) -> ConvexSet | Equality:
         box = base.bounding_box()
         return Box(np.append(box.lower, np.full(free, -np.inf)), np.append(box.upper, np.full(free, np.inf)))
     flat = base.halfspaces()
+    if flat is None and isinstance(base, Cylinder) and base.slopes is not None:
+        return Cylinder(base.base, size, np.pad(base.slopes, ((0, 0), (0, free))))
     if flat is None:
         return Cylinder(base, size)
     return Polytope(np.hstack([flat[0], np.zeros((len(flat[0]), free))]), flat[1])

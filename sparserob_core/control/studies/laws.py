@@ -206,8 +206,9 @@ class ParametersInTime:
     def draw(self, law: LawName, count: int, directions: Array | None, rng: np.random.Generator) -> Array:
         """``count`` of them as rows on all states, ``(count, d, size)``: those of neighbours are near the corners that
         the ``directions (count, size or more)`` look at, each that of a row."""
-        drawn = (_extreme if law == "vertices" else _uniform)(self.box, count, rng) - self.depends.centre
-        found = np.stack([self.depends.rows(one) for one in drawn])
+        drawn, units = (_extreme if law == "vertices" else _uniform)(self.box, count, rng), self.depends.units
+        shares = (drawn - self.depends.centre) / np.where(units > 0.0, units, 1.0)
+        found = np.stack([self.depends.rows(one) for one in shares])
         if directions is None:
             return found
         looked = np.stack([self.seen(one) for one in directions])

@@ -12,6 +12,7 @@ import numpy as np
 
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.terms.integral import Accumulated
 from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
@@ -126,7 +127,7 @@ def _data(
         state=around.nominal,
         tube_lower=around.lower,
         tube_upper=around.upper,
-        walls=list(_walls(problem)),
+        walls=list(_walls(model)),
         active_times=np.empty(0) if active is None else active.times,
         active_states=None if active is None else active.states,
         history=history,
@@ -154,7 +155,7 @@ def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
         return own
     rough = _tube(experiment.transcription, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own)
     reach = rough.upper.max(axis=1) - rough.lower.min(axis=1)
-    return sorted({*telling(reach, [*_walls(problem)])[:MOST_STATES], *(problem.names.in_plane or ())})
+    return sorted({*telling(reach, [*_walls(experiment.transcription)])[:MOST_STATES], *(problem.names.in_plane or ())})
 
 
 def _own(model: Transcription) -> list[int] | None:
@@ -270,7 +271,7 @@ def _plane(model: Transcription, decision: Array, times: Array) -> Plane | None:
     left, next_left = (np.stack([-one[:, 1], one[:, 0]], axis=1)[:, None] for one in (normals, after))
     # where the lines c'y = h of two neighbouring directions meet
     places = (next_heights[..., None] * left - heights[..., None] * next_left) / np.sin(2.0 * np.pi / CORNERS)
-    return Plane(states=pair, places=places.transpose(1, 0, 2), limits=tuple(_limits(problem, pair, normals)))
+    return Plane(states=pair, places=places.transpose(1, 0, 2), limits=tuple(_limits(model.stated, pair, normals)))
 
 
 def _limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array) -> Iterator[Limit]:
@@ -312,9 +313,10 @@ def _lines(bounds: ConvexSet, pair: tuple[int, int], around: Array) -> tuple[Arr
     return H[alone][:, pair], h[alone]
 
 
-def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:
-    end = problem.horizon
-    for entry in problem.of_states:
+def _walls(model: Transcription) -> Iterator[Wall]:
+    """Those of the stated constraints, and of the integrals that are states of the problem that is solved."""
+    problem, end = model.stated, model.problem.horizon
+    for entry in [*problem.of_states, *(one for one in model.problem.of_states if isinstance(one, Accumulated))]:
         stop = end if entry.stop is None else entry.stop
         moved = Reference.of(entry.relative_to)
         if moved is None:

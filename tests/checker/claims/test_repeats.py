@@ -77,8 +77,8 @@ def test_a_plan_that_does_not_repeat_is_none_for_ever() -> None:
 
 def test_what_counts_as_no_violation_of_the_return_is_still_an_initial_state() -> None:
     case = case_of(**begun(0.25))
-    window = case.returned
-    assert window is not None and (window.start, window.stop) == (2.0, 2.0)
+    (window,) = case.returned
+    assert (window.start, window.stop) == (2.0, 2.0)
     assert 0.25 * (1.0 - 1e-6) < float(window.shape.upper[0]) < 0.25
     claims._strictly(case, window)
     for width in (0.25, 0.25 * (1.0 + 1e-9), 0.5):
@@ -89,8 +89,7 @@ def test_what_counts_as_no_violation_of_the_return_is_still_an_initial_state() -
     # beside numbers that are much larger what counts as none is more than the set
     with pytest.raises(Unchecked, match="too thin"):
         thin = case_of(**{**begun(1e-7), "initial_state": [1e9], "control": Box([-1e9], [1e9])})
-        assert thin.returned is not None
-        claims._strictly(thin, thin.returned)
+        claims._strictly(thin, *thin.returned)
 
 
 def test_the_next_periods_deviation_is_one_of_the_initial_states() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
-from sparserob_core.control.sets.sets import Equality, Polytope, cylinder
+from sparserob_core.control.sets.sets import Equality, Polytope, cylinder, oblique
 from sparserob_core.control.term import SAME_TIME, STATES, TIME, UNITLESS, Term, measured, over, timed
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense
@@ -145,11 +145,14 @@ class PathConstraint(Window):
         moved = None if self.relative_to is None else columns(self.relative_to, 1 + size)
         return replace(self, set=cylinder(self.set, size), relative_to=moved)
 
-    def everywhere(self, corners: Sequence[Array]) -> Self:
+    def everywhere(self, corners: Sequence[Array], called: str) -> list[Self]:
         """Itself of a larger state ``z``, of the states that are a matrix ``(d, size)`` times ``z``, at all of these
-        ``corners``; the set has flat sides."""
+        ``corners``: one constraint, or where its set is curved one for each of them, under the name that it is
+        ``called`` by."""
         moved = None if self.relative_to is None else columns(self.relative_to, 1 + corners[0].shape[1])
-        return replace(self, set=everywhere(self.set, corners), relative_to=moved)
+        found = everywhere(self.set, corners)
+        names = [called] if len(found) == 1 else [f"{called} at corner {i}" for i in range(1, len(found) + 1)]
+        return [replace(self, name=name, set=one, relative_to=moved) for name, one in zip(names, found, strict=True)]
 
     def scaled(self, factor: float) -> Self:
         return replace(self, set=self.set.scaled(factor))
@@ -209,12 +212,12 @@ class MixedConstraint(Window):
         """Itself of a state with ``size`` coordinates, of which those beyond its own are free."""
         return replace(self, H=columns(self.H, size))
 
-    def everywhere(self, corners: Sequence[Array]) -> Self:
+    def everywhere(self, corners: Sequence[Array], called: str) -> list[Self]:
         """Itself of a larger state ``z``, of the states that are a matrix ``(d, size)`` times ``z``, at all of these
-        ``corners``."""
+        ``corners``, under the name that it is ``called`` by."""
         limits = np.broadcast_to(np.asarray(self.h), len(np.asarray(self.H)))
         H, G, h = at_corners(corners, self.H, self.G, limits)
-        return replace(self, H=H, G=G, h=h[:, 0])
+        return [replace(self, name=called, H=H, G=G, h=h[:, 0])]
 
     @property
     def bounds(self) -> ConvexSet:
@@ -268,12 +271,15 @@ def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *beside: npt.ArrayLik
     return np.split(rows[np.sort(first)], np.cumsum(widths)[:-1], axis=1)
 
 
-def everywhere(bound: ConvexSet, corners: Sequence[Array]) -> ConvexSet:
-    """The points ``z`` of which every matrix ``(d, size)`` of the ``corners`` makes one of a set with flat sides."""
-    flat = bound.halfspaces()
-    assert flat is not None  # curved ones were refused
+def everywhere(bound: ConvexSet, corners: Sequence[Array]) -> list[ConvexSet]:
+    """The points ``z`` of which every matrix ``(d, size)`` of the ``corners``, the identity and what stands beside it,
+    makes one of a set: one polytope, or where the set is curved as many as there are corners."""
+    flat, d = bound.halfspaces(), bound.dimension
+    if flat is None:
+        apart = {(one[:, d:] + 0.0).tobytes(): one[:, d:] for one in corners}  # -0.0 is 0.0
+        return [oblique(bound, slopes) for slopes in apart.values()]
     H, h = at_corners(corners, *flat)
-    return Polytope(H, h[:, 0])
+    return [Polytope(H, h[:, 0])]
 
 
 def checked_set(name: str, value: object, dimension: int, of: str, bounded: bool = False) -> ConvexSet:

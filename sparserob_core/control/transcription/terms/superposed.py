@@ -4,7 +4,6 @@ of which every bound of the state is one for each corner of their box."""
 from __future__ import annotations
 
 from dataclasses import replace
-from fractions import Fraction
 from itertools import product as every_choice
 
 import numpy as np
@@ -14,19 +13,19 @@ from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import TIME, LinearSystem, VaryingSystem
 from sparserob_core.control.problem.terms.windows import everywhere
-from sparserob_core.control.sets.sets import Box
+from sparserob_core.control.sets.sets import Equality, cylinder
 from sparserob_core.control.transcription.terms.larger import larger
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, Box
 
 CORNERS = 64  # of a box of parameters: rows are as many times more, with ten times as many it would take minutes
 
 
 def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same problem without parameters beside the time. The states of one in the middle of their box stay the first
-    ones, after which comes what each parameter adds, per about half of its interval; both obey known equations. A bound
-    of the state holds for all parameters where it holds at the corners. Differences to the middle are rounded
-    outwards."""
+    ones, after which comes what each parameter adds, per half of its interval; both obey known equations. A bound of
+    the state holds for all parameters where it holds at the corners; a curved one is one constraint for each of them.
+    Halves of intervals are rounded outwards."""
     system = problem.system
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return problem
@@ -36,8 +35,16 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
         problem,
         depends.states - system.states,
         system=_known(system, depends),
-        path=[entry.everywhere(rows) for entry in problem.windows],
-        terminal=[everywhere(end, rows) for end in problem.terminal_sets],
+        path=[
+            one
+            for entry, name in zip(problem.windows, problem.called("path"), strict=True)
+            for one in entry.everywhere(rows, name)
+        ],
+        terminal=[
+            one
+            for end in problem.terminal
+            for one in ([cylinder(end, depends.states)] if isinstance(end, Equality) else everywhere(end, rows))
+        ],
         integral=[entry.everywhere(rows) for entry in problem.integral],
         names=_names(problem.names, system, depends),
     )
@@ -49,29 +56,18 @@ def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
     system = problem.system
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return None
-    return [system.dependence.rows(corner) for corner in _corners(system.parameters, system.dependence)]
+    return [system.dependence.rows(corner) for corner in _corners(system.dependence)]
 
 
-def _corners(box: Box, depends: Dependence) -> list[Array]:
-    """The corners of the box as deviations from its middle, of parameters that reach a state; rounded outwards."""
-    ends = [
-        sorted({_outwards(low, middle, up=False), _outwards(high, middle, up=True)}) if any(reached) else [0.0]
-        for low, high, middle, reached in zip(
-            box.lower.tolist(), box.upper.tolist(), depends.centre.tolist(), depends.reached.tolist(), strict=True
-        )
-    ]
-    count = int(np.prod([len(one) for one in ends]))
+def _corners(depends: Dependence) -> list[Array]:
+    """The corners of the box as shares of what the parameters may deviate from its middle by, of those that reach a
+    state."""
+    moves = depends.reached.any(axis=1) & (depends.units > 0.0)
+    count = 2 ** int(moves.sum())
     if count > CORNERS:
         expected = f"a box with at most {CORNERS} corners beside the time t"
         raise InputError(path="system.parameters", expected=expected, got=f"{count}")
-    return [np.array(one) for one in every_choice(*ends)]
-
-
-def _outwards(end: float, middle: float, up: bool) -> float:
-    """The difference of two numbers, or the next double beyond it."""
-    exact, found = Fraction(end) - Fraction(middle), end - middle
-    short = Fraction(found) < exact if up else Fraction(found) > exact
-    return float(np.nextafter(found, np.inf if up else -np.inf)) if short else found
+    return [np.array(one) for one in every_choice(*((-1.0, 1.0) if one else (0.0,) for one in moves.tolist()))]
 
 
 def _known(system: VaryingSystem, depends: Dependence) -> VaryingSystem:

@@ -85,7 +85,6 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
         {"system": sr.LinearSystem([[0]], [[1]], delay=0.5), "initial_state": [0]},
         "integral.0.to",
     ),
-    "a plan that repeats": ({"G": [[1]]}, {"repeat": True}, "integral"),
 }
 
 
