@@ -3,6 +3,7 @@ rectangles."""
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -178,3 +179,68 @@ def test_a_path_set_at_time_0_bounds_the_set() -> None:
     np.testing.assert_allclose(found.outer.max(axis=0), [2.0, 1.5], atol=1e-6)
     np.testing.assert_allclose(found.inner.min(axis=0), [-2.0, -1.5], atol=1e-6)
     np.testing.assert_allclose(found.path[0].max(axis=0), [2.0, 1.5], atol=1e-9)
+
+
+IN_TIME: dict[str, Any] = {
+    "problem": {
+        "name": "linear",
+        "system": {
+            "A": [[0, 0], [0, "-t / 2"]],
+            "B": [["(1 + p) * (2 - t)", 0], [0, 1]],
+            "E": [[1, 0], [0, 1]],
+            "parameters": {"p": [-0.1, 0.1]},
+        },
+        "horizon": 2.0,
+        "initial_state": [0.0, 0.0],
+        "control": {"box": 1.0},
+        "terminal": [{"box": [0.2, 0.3]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 8}},
+    "observers": [],
+}
+
+
+@pytest.mark.slow
+def test_of_a_plant_in_time_with_a_parameter_the_set_is_a_rectangle_in_closed_form() -> None:
+    """What the first channel gives is between 0.9 and 1.1 of U, at most 2: with all of it -2 comes to between -0.2 and
+    0.2. The second state keeps a share 1/e, and the channel adds the integral of ``e^(t^2/4 - 1)``."""
+    found = sr.initial_states(IN_TIME, directions=12, values=3)
+    fine = np.linspace(0.0, 2.0, 20001)
+    wide = np.array([2.0, np.e * (0.3 + float(np.trapezoid(np.exp(fine**2 / 4 - 1), fine)))])
+    assert found.status == "certified"
+    assert (np.abs(found.inner).max(axis=0) <= wide * (1 + 1e-9)).all()
+    assert (np.abs(found.outer).max(axis=0) >= wide * (1 - 1e-9)).all()
+    np.testing.assert_allclose(np.abs(found.outer).max(axis=0), wide, rtol=1e-6)
+    gains = np.array([2 - (k + 0.5) / 4 for k in range(8)]) / 4
+    for (first, second), cost, lower in zip(found.points, found.costs, found.lower_bounds, strict=True):
+        if second != 0.0 or abs(first) < 0.2:
+            continue
+        needed, least = (abs(first) - 0.2) / 0.9, 0.0
+        for gain in gains:
+            share = min(1.0, needed / gain)
+            needed, least = needed - share * gain, least + share / 4
+        assert lower <= least * (1 + 1e-9)
+        assert cost == pytest.approx(least, rel=1e-6)
+
+
+def test_of_a_plant_in_time_whose_end_is_out_of_reach_no_state_is_feasible() -> None:
+    config = copy.deepcopy(IN_TIME)
+    config["problem"]["disturbance"] = {"box": [0.11, 0.0]}
+    found = sr.initial_states(config, values=0, within=5)
+    assert found.status == "infeasible"
+
+
+@pytest.mark.parametrize(
+    ("change", "path"),
+    [
+        ({"policy": {"name": "affine"}}, "policy.name"),
+        ({"problem": {"terminal": [{"equals": [None, 0.0]}]}}, "problem.terminal"),
+    ],
+)
+def test_what_is_not_proven_of_a_plant_in_time_is_refused(change: dict[str, Any], path: str) -> None:
+    config = copy.deepcopy(IN_TIME)
+    for key, value in change.items():
+        config[key] = {**config.get(key, {}), **value}
+    config["problem"]["system"]["B"], config["problem"]["system"]["parameters"] = [["2 - t", 0], [0, 1]], {}
+    with pytest.raises(sr.InputError, match=path):
+        sr.initial_states(config)

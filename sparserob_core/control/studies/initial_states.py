@@ -17,6 +17,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.rounding import SHARE, added_up, rounded_down
 from sparserob_core.control.transcription.transcribe import from_state
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -30,6 +31,7 @@ from sparserob_core.sip.program import (
     SemiInfiniteProgram,
     Separation,
 )
+from sparserob_core.sip.result import Result
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -79,6 +81,13 @@ class InitialPlane:
             A, b = self._equalities(z)
             remember(self._programs, key, replace(moved, A=A, b=b), PROGRAMS_KEPT)
         return self._programs[key]
+
+    def rounded(self, z: Array, result: Result) -> Result:
+        """The result of the program at ``z`` with a lower bound that steps of a system which changes with time do not
+        raise."""
+        if self.model.response.propagator.expansion is None:
+            return result
+        return rounded_down(from_state(self.centred, self._state(z)), result, None)
 
     def _equalities(self, z: Array) -> tuple[Array | None, Array | None]:
         """Those of the program at ``z``, without any that no control moves and that holds there but for rounding."""
@@ -242,7 +251,9 @@ class _Joined(_OfPlane):
         )
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
-        """The rows at the centre, and two columns more: ``c'e^{A(p)t}`` at the two coordinates."""
+        """The rows at the centre, and two columns more: ``c'e^{A(p)t}`` at the two coordinates. Of a system that
+        changes with time they are met by all that meets the true ones: by what steps may be off, wherever in the plane
+        it begins, and by what rounding is."""
         G, h = self.base.rows(indices)
         constraint = self.plane.centred.constraint(self.base)
         if constraint is None:
@@ -250,6 +261,10 @@ class _Joined(_OfPlane):
         times, directions, parameters, _ = constraint.functionals_at(indices)
         free = constraint.functionals.response.weights(times, directions, parameters).free
         columns = free[:, list(self.plane.states)] * self.plane.radius
+        expansion = constraint.functionals.response.propagator.expansion
+        if expansion is not None:
+            sizes = added_up(self.plane.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
+            h = h + (SHARE + expansion.slack) * sizes.reshape(h.shape)
         return np.concatenate([G, columns.reshape(*G.shape[:2], 2)], axis=2), h
 
 

@@ -62,7 +62,12 @@ def _added(model: Transcription, result: Result) -> float:
     if not rows:
         return 0.0
     multipliers, times, directions, parameters = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
-    free, weights, on_noise = model.response.weights(times, directions, parameters.reshape(len(rows), -1))
+    return float(multipliers @ added_up(model, times, directions, parameters.reshape(len(rows), -1))) + besides
+
+
+def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:
+    """The numbers ``(k,)`` that are added up to rows ``c'x(t)``, ``directions (k, d)``, at their largest."""
+    free, weights, on_noise = model.response.weights(times, directions, parameters)
     sizes = np.abs(free) @ np.abs(model.response.initial_state)
     if model.problem.initial_set is not None:
         sizes += np.abs(free) @ _far(model.problem.initial_set)
@@ -73,7 +78,7 @@ def _added(model: Transcription, result: Result) -> float:
         lengths = functionals.execution.lengths(times, directions)
         sizes += lengths @ np.repeat(_far(model.problem.control), model.control.pieces)
     sizes += _disturbing(model, on_noise, times, directions)
-    return float(multipliers @ sizes) + besides
+    return np.asarray(sizes)
 
 
 def _disturbing(model: Transcription, on_noise: Array, times: Array, directions: Array) -> Array:

@@ -74,8 +74,13 @@ def initial_states(
             got="true",
         )
     if isinstance(model.problem.system, VaryingSystem):
-        expected = "a system that stays the same with time: of another one no set of initial states is proven yet"
-        raise InputError(path="problem.system", expected=expected, got="one in t")
+        refused = {
+            "policy.name": ("open_loop", model.feedback is not None, "a policy that answers"),
+            "problem.terminal": ("a set with an interior", bool(model.problem.terminal_equalities), "fixed values"),
+        }
+        for path, (expected, given, got) in refused.items():
+            if given:
+                raise InputError(path=path, expected=f"{expected}, where the system changes with time", got=got)
     if model.problem.execution is not None:
         expected = "none: with errors of execution no set of initial states is proven yet"
         raise InputError(

@@ -238,7 +238,7 @@ class InitialStatesSearch:
         for number, z in enumerate(points):
             try:
                 self._tell("cost", number + 1, len(points))
-                result = Exchange(tolerance=self.tolerance).solve(self.plane.at(z), self.tools)
+                result = self.plane.rounded(z, Exchange(tolerance=self.tolerance).solve(self.plane.at(z), self.tools))
                 self.tools.deadline.check()
             except KeyboardInterrupt as pressed:
                 self._interrupt(pressed)
