@@ -276,8 +276,8 @@ def everywhere(bound: ConvexSet, corners: Sequence[Array]) -> list[ConvexSet]:
     makes one of a set: one polytope, or where the set is curved as many as there are corners."""
     flat, d = bound.halfspaces(), bound.dimension
     if flat is None:
-        apart = {(one[:, d:] + 0.0).tobytes(): one[:, d:] for one in corners}  # -0.0 is 0.0
-        return [oblique(bound, slopes) for slopes in apart.values()]
+        found = [oblique(bound, one[:, d:]) for one in corners]
+        return [*{np.asarray(one.slopes).tobytes(): one for one in found}.values()]
     H, h = at_corners(corners, *flat)
     return [Polytope(H, h[:, 0])]
 
