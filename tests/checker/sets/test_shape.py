@@ -300,6 +300,24 @@ def test_a_cylinder_is_its_base_and_free_beyond_it():
             shape.bound(np.ones((1, 4)), np.zeros((1, 4)))
 
 
+def test_an_oblique_cylinder_is_its_base_of_sums_of_coordinates():
+    base, slopes = SETS["ellipsoid"], np.array([[1.0, 0.0], [0.0, -1.0]])
+    shape = known(Cylinder(base, 4, slopes))
+    with ctx.workprec(96):
+        assert shape.spanned == 2
+        assert shape.gauge(balls([0.125, 0.5, 0.25, 0.25])).overlaps(known(base).gauge(balls([0.375, 0.25])))
+        assert shape.holds(balls([5.0, 7.0, 0.1 - 5.0, 7.0 + 0.2]))
+        assert not shape.holds(balls([0.1, -0.2, 3.0, 0.0]))
+        assert shape.support(balls([1.0, 0.3, 1.0, -0.3])).overlaps(known(base).support(balls([1.0, 0.3])))
+        for beside in ([1.0, 0.3], [1.0, np.nextafter(-0.3, 0.0)], [0.0, 0.0]):
+            with pytest.raises(Broken):
+                shape.support(balls([1.0, 0.3, *beside]))
+        assert shape.lifted(np.eye(2)).tolist() == [[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, -1.0]]
+        for unknown in (0.5 * slopes, np.ones((2, 2)), np.full((2, 2), np.nan), slopes[:1]):
+            with pytest.raises(Unchecked):
+                known(Cylinder(base, 4, unknown))
+
+
 def test_a_set_that_is_not_known_is_not_believed():
     class Flattering(Box):
         def support(self, direction):

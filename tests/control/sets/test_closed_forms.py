@@ -20,6 +20,7 @@ from sparserob_core.control.sets.sets import (
     Zonotope,
     cylinder,
     intersection,
+    oblique,
 )
 from sparserob_core.errors import InputError
 
@@ -200,7 +201,7 @@ def test_a_sum_of_segments_is_the_hull_of_its_corners():
     assert Zonotope(np.zeros(2), np.random.default_rng(5).normal(size=(501, 2))).halfspaces() is None
 
 
-@pytest.mark.parametrize("member", [*CURVED, Cylinder(OBLONG, 3)])
+@pytest.mark.parametrize("member", [*CURVED, Cylinder(OBLONG, 3), oblique(OBLONG, np.array([[0.0], [-1.0]]))])
 def test_directions_are_measured_by_how_far_the_set_reaches_along_them(member):
     b, rng = member.frame.shape[0], np.random.default_rng(6)
     z = rng.uniform(-1, 1, size=(40, b))
@@ -285,6 +286,43 @@ def test_a_cylinder_is_its_base_in_the_first_coordinates():
     units = np.array([2.0, 0.5, 3.0, 7.0])
     assert tall.in_units(units).gauge(x / units) == pytest.approx(tall.gauge(x))
     assert tall.frame.shape == (2, 4) and not tall.frame[:, 2:].any()
+
+
+LEANING = np.array([[1.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+
+
+@pytest.mark.parametrize("base", CURVED)
+def test_an_oblique_cylinder_holds_what_is_seen_in_its_base(base):
+    leaning, rng = oblique(base, LEANING), np.random.default_rng(8)
+    x = rng.normal(size=(200, 5))
+    seen = x[:, :2] + x[:, 2:] @ LEANING.T
+    np.testing.assert_array_equal(leaning.gauge(x), base.gauge(seen))
+    np.testing.assert_array_equal(leaning.violation(x), base.violation(seen))
+    z = rng.normal(size=(30, 2))
+    c = leaning.along(z)
+    np.testing.assert_array_equal(c[:, 2:], c[:, :2] @ LEANING)
+    np.testing.assert_allclose(c, z @ leaning.frame, rtol=1e-14)
+    heights = (c @ x.T)[:, base.contains(seen)]
+    assert heights.shape[1] > 10
+    assert (heights <= leaning.support(c)[:, None] + 1e-12).all()
+    points = leaning.support_point(c)
+    np.testing.assert_allclose((points * c).sum(axis=1), leaning.support(c))
+    assert leaning.contains(points, 1e-9).all()
+    assert np.isinf(leaning.support(c + 1e-9 * np.eye(5)[3])).all()  # not by more than rounding
+    units = np.array([2.0, 0.5, 4.0, 8.0, 0.25])
+    np.testing.assert_allclose(leaning.in_units(units).gauge(x / units), leaning.gauge(x))
+    np.testing.assert_array_equal(leaning.in_units(units).frame, leaning.frame * units)
+    assert leaning.scaled(2.0).gauge(x) == pytest.approx(base.scaled(2.0).gauge(seen))
+    assert leaning.kind == base.kind
+
+
+def test_an_oblique_cylinder_over_a_cylinder_and_beside_more_coordinates():
+    over = oblique(Cylinder(OBLONG, 3), np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
+    x = np.random.default_rng(9).normal(size=(20, 6))
+    seen = x[:, :2] + x[:, 3:5]
+    np.testing.assert_allclose(over.gauge(x[:, :5]), OBLONG.gauge(seen))
+    np.testing.assert_allclose(cylinder(over, 6).gauge(x), OBLONG.gauge(seen))
+    assert cylinder(over, 6).frame.shape == (2, 6)
 
 
 @pytest.mark.parametrize(
