@@ -40,7 +40,7 @@ class MinimumAttention(sr.LinearKeys):
         plain = self.system.build(self.horizon)
         d, m = plain.states, plain.controls
         path = [_extended_window(item, m) for item in self.windows(d)]
-        ends = [_extended(end, m) for end in self.ends(d)]
+        ends = [sr.cylinder(end, d + m) for end in self.ends(d)]
         listed = self.disturbances(plain, below=m)
         width = sum(one.set.dimension for one in listed) if listed else plain.disturbances
         free = sr.OptimalControlProblem(
@@ -177,12 +177,6 @@ def _integral(where: str, item: sr.IntegralConstraint, d: int, m: int) -> sr.Int
     count = max((len(matrix) for matrix in rows.values()), default=0)
     both = [rows.get(key, np.zeros((count, width))) for key, (_, width, _) in given.items()]
     return replace(item, H=np.hstack(both) if count else None, G=None)
-
-
-def _extended(end: sr.ConvexSet | sr.Equality, m: int) -> sr.ConvexSet | sr.Equality:
-    if isinstance(end, sr.Equality):
-        return sr.Equality(np.append(end.values, np.full(m, np.nan)))
-    return sr.cylinder(end, end.dimension + m)
 
 
 @sr.hookimpl

@@ -24,6 +24,7 @@ from sparserob_core.brief import noun
 from sparserob_core.control.problem.expression import Entries, beside
 from sparserob_core.control.problem.system import LinearSystem, Matrix, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Product, product
+from sparserob_core.control.term import SAME_TIME
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
@@ -31,8 +32,6 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
 DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
 Classes: TypeAlias = DisturbanceClass | tuple[DisturbanceClass, ...]
 Breakpoints: TypeAlias = tuple[Array | None, ...]
-SHORTEST = 1e-12  # of the horizon: ten times more and windows are lost that a clock can tell apart; ten times less and
-# ends that are sums of steps make pieces of the system that are rounding
 
 
 @final
@@ -90,26 +89,19 @@ def joined(
         _checked(f"disturbance.{i}.set", one.set, one.entering(f"disturbance.{i}", first))
         for i, one in enumerate(every)
     ]
-    pieces: list[tuple[float, LinearSystem]] = []
-    begins: list[float] = []
+    pieces: list[tuple[float, float, LinearSystem]] = []
     for begin, until, mode in legs(system, {time for window in windows for time in window}, horizon):
         columns = []
         for i, (one, (start, stop)) in enumerate(zip(every, windows, strict=True)):
             E = _columns(one.entering(f"disturbance.{i}", mode))
-            acts = start < until - SHORTEST * horizon and begin + SHORTEST * horizon < stop
+            acts = start < until - SAME_TIME * horizon and begin + SAME_TIME * horizon < stop
             columns.append(E if acts else np.zeros((mode.states, sets[i].dimension)))
-        begins.append(begin)
-        pieces.append((until, replace(mode, E=reduce(beside, columns))))
+        pieces.append((begin, until, replace(mode, E=reduce(beside, columns))))
     kinds = tuple(one.kind for one in every)
     together: tuple[ConvexSet, Classes] = (product(sets), kind)
     if len(set(kinds)) > 1 or grids is not None:
         together = Product(tuple(sets)), kinds if len(set(kinds)) > 1 else kind
-    if isinstance(system, VaryingSystem):
-        laws = [(begin, law) for begin, (_, law) in zip(begins, pieces, strict=True)]
-        return system.lawful(laws), *together, grids
-    if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
-        return pieces[0][1], *together, grids
-    return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay), *together, grids
+    return of_legs(system, pieces), *together, grids
 
 
 def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
@@ -141,8 +133,8 @@ def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: fl
             got="some",
         )
     times = as_bound("breakpoints", one.breakpoints)
-    fit = times.ndim == 1 and times.size > 1 and times[0] == 0.0 and abs(times[-1] - horizon) <= SHORTEST * horizon
-    if not fit or not (np.diff(times) > SHORTEST * horizon).all():
+    fit = times.ndim == 1 and times.size > 1 and times[0] == 0.0 and abs(times[-1] - horizon) <= SAME_TIME * horizon
+    if not fit or not (np.diff(times) > SAME_TIME * horizon).all():
         raise InputError(
             path=f"{where}.breakpoints",
             expected=f"times that increase from 0 to {horizon:g} (the horizon), apart by more than rounding",
@@ -157,7 +149,7 @@ def _nothing(dimension: int) -> ConvexSet:
 
 def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:
     start, stop = float(one.start), horizon if one.stop is None else float(one.stop)
-    if not (0.0 <= start <= stop - SHORTEST * horizon and stop <= horizon):
+    if not (0.0 <= start <= stop - SAME_TIME * horizon and stop <= horizon):
         raise InputError(
             path=where,
             expected=f"0 <= from < to <= {horizon:g} (the horizon), apart by more than rounding",
@@ -175,12 +167,21 @@ def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[tu
         switches, modes = system.switches, list(system.modes)
     ends = [*switches, horizon]
     for time in sorted(cuts):
-        if min(abs(time - end) for end in (0.0, *ends)) > SHORTEST * horizon:
+        if min(abs(time - end) for end in (0.0, *ends)) > SAME_TIME * horizon:
             ends.append(time)
     begin = 0.0
     for until in sorted(ends):
         yield begin, until, modes[bisect_right(switches, begin)]
         begin = until
+
+
+def of_legs(system: System, pieces: Sequence[tuple[float, float, LinearSystem]]) -> System:
+    """A system whose `legs` became these."""
+    if isinstance(system, VaryingSystem):
+        return system.lawful([(begin, law) for begin, _, law in pieces])
+    if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
+        return pieces[0][2]
+    return SwitchedSystem([(until, replace(one, delay=0.0)) for _, until, one in pieces], system.delay)
 
 
 def _columns(system: LinearSystem) -> Entries:

@@ -222,6 +222,11 @@ class OptimalControlProblem(Term):
         return [end for end in self.terminal if not isinstance(end, Equality)]
 
     @property
+    def ends(self) -> list[ConvexSet]:
+        """Those sets, and what fixes values as sets."""
+        return [*self.terminal_sets, *(end.box for end in self.terminal_equalities)]
+
+    @property
     def terminal_equalities(self) -> list[Equality]:
         """What fixes values of the final state."""
         return [end for end in self.terminal if isinstance(end, Equality)]

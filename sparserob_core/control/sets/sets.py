@@ -108,6 +108,12 @@ class Equality:
         return Equality(self.values / units)
 
     @property
+    def box(self) -> Box:
+        """All points at which it holds."""
+        free = np.isnan(self.values)
+        return Box(np.where(free, -np.inf, self.values), np.where(free, np.inf, self.values))
+
+    @property
     def bounds(self) -> ConvexSet:
         """None that a factor enlarges: raises `InputError`."""
         raise InputError("fixes final values, which no factor enlarges; expected a set")

@@ -15,7 +15,6 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.integral import Accumulated
 from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.response.reference import Reference
-from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.adversary import find_adversaries
 from sparserob_core.control.studies.answer import Tube, supports, tube
 from sparserob_core.control.transcription.record import Transcription
@@ -288,14 +287,8 @@ def _limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array
         limit = Limit(name=printable(name), normals=normals, times=times, bounds=bounds + off @ normals.T)
         if len(normals):
             yield replace(limit, is_wall=not limit.moves and entry.start <= 0.0 and stop >= end)
-    for terminal in problem.terminal:
-        if isinstance(terminal, Equality):
-            fixed = [state for state in terminal.fixed.tolist() if state in pair]
-            axes = np.array([[float(state == one) for one in pair] for state in fixed]).reshape(-1, 2)
-            values = np.asarray(terminal.values)[fixed]
-            normals, bounds = np.vstack([axes, -axes]), np.concatenate([values, -values])
-        else:
-            normals, bounds = _lines(terminal, pair, around)
+    for terminal in problem.ends:
+        normals, bounds = _lines(terminal, pair, around)
         if len(normals):
             yield Limit(name="terminal", normals=normals, times=np.array([end]), bounds=bounds[None], is_final=True)
 
@@ -336,20 +329,8 @@ def _walls(model: Transcription) -> Iterator[Wall]:
                     lower_end=wall.lower + last,
                     upper_end=wall.upper + last,
                 )
-    for terminal in problem.terminal:
-        if isinstance(terminal, Equality):
-            yield from (
-                Wall(
-                    state=int(state),
-                    lower=float(terminal.values[state]),
-                    upper=float(terminal.values[state]),
-                    start=end,
-                    end=end,
-                )
-                for state in terminal.fixed
-            )
-        else:
-            yield from _sides(terminal, end, end)
+    for terminal in problem.ends:
+        yield from _sides(terminal, end, end)
 
 
 def _sides(bounds: ConvexSet, start: float, end: float) -> Iterator[Wall]:

@@ -8,12 +8,13 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_core.control.problem.disturbances import SHORTEST, legs
+from sparserob_core.control.problem.disturbances import legs, of_legs
 from sparserob_core.control.problem.names import Names, measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem, System
 from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
 from sparserob_core.control.sets.sets import Polytope, cylinder
+from sparserob_core.control.term import SAME_TIME
 from sparserob_core.control.transcription.terms.larger import larger
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -107,17 +108,12 @@ def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -
 def _system(system: System, running: list[Running], horizon: float) -> System:
     """The system beside what is integrated of it; of pieces where one of the integrals begins later than at 0, or ends
     before it is looked at."""
-    slack, pieces, begins = SHORTEST * horizon, list[tuple[float, LinearSystem]](), list[float]()
+    slack, pieces = SAME_TIME * horizon, list[tuple[float, float, LinearSystem]]()
     for begin, until, mode in legs(system, {time for one in running for time in (one.start, one.stop)}, horizon):
         acts = np.array([[one.start <= begin + slack and until <= one.stop + slack] for one in running])
         h, g = np.stack([one.h for one in running]), np.stack([one.g for one in running])
-        begins.append(begin)
-        pieces.append((until, mode.accumulating(acts * h, acts * g)))
-    if isinstance(system, VaryingSystem):
-        return system.lawful([(begin, law) for begin, (_, law) in zip(begins, pieces, strict=True)])
-    if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
-        return pieces[0][1]
-    return SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay)
+        pieces.append((begin, until, mode.accumulating(acts * h, acts * g)))
+    return of_legs(system, pieces)
 
 
 def _names(names: Names, states: int, running: list[Running]) -> Names:
