@@ -35,8 +35,12 @@ NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "sec
 ANSWERS = ("gains", "observer")  # how a decision answers what is measured, where it does: states, or outputs
 SAME = 1e-9  # of the largest number of an array, how far it may be from what follows from another
 LARGEST_TEXT = 2**27
-"""Bytes of one JSON file, at most: read, it takes 25 times as much memory where it is nothing but empty lists. The
-largest that runs write have some 10 million; with ten times as many a file could take all of a machine."""
+"""Bytes of one JSON file, at most. The largest that runs write have some 10 million; with ten times as many a file
+could take all of a machine."""
+MOST_ENTRIES, MOST_LISTS = 2**23, 2**21
+"""Commas and brackets in one JSON file, at most, which are told before it is read: a number takes some 50 bytes, a list
+or an object 200. The largest that runs write have a million of either; a file of nothing but empty lists would take 25
+times its size, and the time to make them is not a check's own, which ends when it is told to."""
 LARGE = re.compile(r"[eE]\+?[0-9]{3}|[0-9]{99}")
 """Without one of these, a number with a point or an exponent is finite."""
 IMPOSED = {"multipliers": "f", "times": "f", "indices": "f", "rows": "i", "families": "U"}
@@ -317,6 +321,12 @@ def _read(file: Path) -> tuple[object, bool]:
     if size > LARGEST_TEXT:
         raise InputError(f"{file}: cannot be read: expected at most {LARGEST_TEXT} bytes, got {size}")
     text = file.read_text(encoding="utf-8")
+    for what, count, most in (
+        ("entries", text.count(","), MOST_ENTRIES),
+        ("lists and objects", text.count("[") + text.count("{"), MOST_LISTS),
+    ):
+        if count > most:
+            raise InputError(f"{file}: cannot be read: expected at most {most} {what}, got {count}")
 
     def whole(digits: str) -> int:
         odd.extend([digits] if len(digits) > sys.float_info.max_10_exp else [])

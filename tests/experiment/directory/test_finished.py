@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.directory import finished
 from sparserob_core.experiment.directory.finished import StoredRun, read_arrays, read_finished, read_json
 from sparserob_core.experiment.figures.active import stored_active
 from sparserob_core.experiment.run.drawing import draw_run
@@ -241,6 +242,23 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path: Path) -
     file.write_text("{}")
     os.truncate(file, 2**33)
     with pytest.raises(sr.InputError, match="expected at most 134217728 bytes, got 8589934592"):
+        read_json(file)
+
+
+@pytest.mark.parametrize(
+    ("entry", "most", "said"),
+    [("[]", 9, "9 lists and objects"), ("{}", 9, "9 lists and objects"), ("1", 21, "20 entr")],
+)
+def test_text_with_too_many_parts_is_refused_before_lists_are_made_of_it(
+    entry: str, most: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(finished, "MOST_LISTS", 9)
+    monkeypatch.setattr(finished, "MOST_ENTRIES", 20)
+    file, around = tmp_path / "x.json", 2 if most == 9 else 0  # an object and a list hold them
+    file.write_text(f'{{"a": [{", ".join([entry] * (most - around))}]}}')
+    assert len(read_json(file)["a"]) == most - around
+    file.write_text(f'{{"a": [{", ".join([entry] * (most - around + 1))}]}}')
+    with pytest.raises(sr.InputError, match=f"expected at most {said}.*, got {most + 1 - (around == 0)}"):
         read_json(file)
 
 
