@@ -12,7 +12,7 @@ from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.jets import kepler_root
-from sparserob_core.checker.claims import cells, constraints
+from sparserob_core.checker.claims import case, cells, constraints
 from sparserob_core.checker.claims.answers import _chords, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
@@ -21,6 +21,7 @@ from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets import flat
+from sparserob_core.control.policies import policy
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Cylinder, Equality, NormBall, Polytope
@@ -196,3 +197,22 @@ def test_disturbances_with_breakpoints_of_their_own_are_on_one_grid() -> None:
     assert lasting is not None and [one.tolist() for _, one in lasting.parts] == [[0, 2], [0, 1, 2]]
     assert [columns for columns, _ in lasting.parts] == [slice(0, 1), slice(1, 2)]
     assert Lasting.of(kind("known").case().problem, [0.0]) is None
+
+
+def test_what_so_many_pieces_may_answer_is_no_array(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A million pieces, as a config may say in a few bytes, would be a terabyte of truth values."""
+    for most in (3, policy.MOST_ANSWERING):
+        monkeypatch.setattr(policy, "MOST_ANSWERING", most)
+        monkeypatch.setattr(case, "MOST_ANSWERING", most)
+        ends = np.arange(most + 2.0)
+        with pytest.raises(sr.InputError, match=f"at most {most} pieces of a control that answers, got {most + 1}"):
+            policy.answers_of(AffinePolicy(), ends)
+        assert not policy.answers_of(policy.OpenLoop(), ends).size
+        assert not policy.answers_of(None, ends).size
+        said = {"policy": {"cost": "peak", "answers": [[] for _ in ends[1:]]}}
+        with pytest.raises(Broken, match=f"expected at most {most}"):
+            case.written_policy(said, most + 1)
+    monkeypatch.setattr(policy, "MOST_ANSWERING", 3)
+    monkeypatch.setattr(case, "MOST_ANSWERING", 3)
+    assert policy.answers_of(AffinePolicy(), np.arange(4.0)).shape == (3, 3)
+    assert case.written_policy({"policy": {"cost": "peak", "answers": [[], [], [[0, 1]]]}}, 3).mask.sum() == 2

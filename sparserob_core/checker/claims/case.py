@@ -27,7 +27,7 @@ from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.known import known
-from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
+from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -517,6 +517,8 @@ def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy
         raise Broken(f"policy: the cost is {said_of_cost!r}, expected one of {', '.join(get_args(Cost))}")
     if len(rows) != pieces:
         raise Broken(f"policy: answers of {len(rows)} pieces, expected {pieces}")
+    if pieces > MOST_ANSWERING:
+        raise Broken(f"policy: {pieces} pieces that answer, expected at most {MOST_ANSWERING}")
     mask = np.zeros((pieces, pieces), dtype=bool)
     for k, ranges in enumerate(rows):
         for said in ranges if isinstance(ranges, list) else [ranges]:

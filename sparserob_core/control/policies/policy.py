@@ -16,6 +16,10 @@ from sparserob_core.sip.convex_set import Array
 Quantity: TypeAlias = Literal["state", "disturbance", "parameters"]
 Cost: TypeAlias = Literal["nominal", "peak", "worst"]
 
+MOST_ANSWERING = 2**13
+"""Pieces of a control that answers what is measured: what each of them may answer are so many squared, 67 million, of
+which a program has a variable each for every state."""
+
 
 @final
 @dataclass(frozen=True)
@@ -97,9 +101,16 @@ class WrittenPolicy(Policy):
 
 def answers_of(policy: Policy | None, breakpoints: Array, measured: Measurements | None = None) -> np.ndarray:
     """The truth values ``(K, K)`` of a policy, none of them of no policy, and of what is ``measured`` those of what is
-    known by then. Raises `InputError` where they are no such
-    array, or where something is answered before it is measured, or without being known."""
+    known by then; of more than `MOST_ANSWERING` pieces an empty array where nothing is answered. Raises `InputError`
+    where they are no such array, of so many pieces, or where something is answered before it is measured, or without
+    being known."""
     K = len(breakpoints) - 1
+    if K > MOST_ANSWERING:
+        if policy is None or isinstance(policy, OpenLoop):
+            return np.zeros((0, 0), dtype=bool)
+        raise InputError(
+            path="policy.name", expected=f"at most {MOST_ANSWERING} pieces of a control that answers", got=f"{K}"
+        )
     if policy is None:
         return np.zeros((K, K), dtype=bool)
     mask: object = policy.answers(np.array(breakpoints, dtype=float))
