@@ -47,7 +47,7 @@ def test_the_exponential_of_a_number_that_depends_on_a_parameter_is_held_to_all_
 
 
 def test_exponentials_that_are_products_of_one_another_hold_the_exact_ones_and_hardly_grow():
-    """``exp((a + b delta) s)`` at ticks in any order, and up to half a tick beside them."""
+    """``exp((a + b delta) s)`` at ticks in any order, and up to a tick beside them."""
     known, (a, b), tick = Monomials(1, 4), (-1.7, 0.3), 2.0**-40
     rng = np.random.default_rng(3)
     with ctx.workprec(96):
@@ -60,7 +60,7 @@ def test_exponentials_that_are_products_of_one_another_hold_the_exact_ones_and_h
             at, near = every.at(int(ticks)), every.at(int(ticks)) * every.around(1)
             for part, beside, k in zip(at.parts, near.parts, range(5), strict=True):
                 with ctx.workprec(300):
-                    for found, off in ((part, 0.0), (beside, 0.5), (beside, -0.5)):
+                    for found, off in ((part, 0.0), (beside, 0.99), (beside, -0.99)):
                         time = arb(tick) * (arb(int(ticks)) + arb(off))
                         assert found[0, 0].contains((arb(a) * time).exp() * (arb(b) * time) ** k / arb(k).fac())
                 assert float(part[0, 0].rad()) < 2.0**-70

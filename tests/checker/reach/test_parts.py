@@ -562,3 +562,21 @@ def test_a_series_leaves_out_no_more_than_its_precision_resolves():
             float(a.rad()) < 1e-30 * abs(float(b.mid())) for a, b in zip(found.entries(), truth.entries(), strict=True)
         )
         assert all(a.overlaps(b) for a, b in zip(found.entries(), truth.entries(), strict=True))
+
+
+def test_parts_of_pieces_hold_what_a_system_does_wherever_it_is_within_a_tick():
+    """``x' = p x + u``, with a tick of a hundredth: a part of a piece is a whole number of them, give or take one."""
+    system = LinearSystem(
+        parse_matrix("A", [["p1"]], ("p1",)), np.ones((1, 1)), parameters=Box([0.9], [1.1]), names=("p1",)
+    )
+    control, none = indicators([0.0, 1.0, 2.0]), uniform(1, 2.0)
+    with ctx.workprec(96):
+        tube, centre, _ = tube_of(system, control, none, None, 3, np.ones(2), np.ones(1))
+        tube.scene.__dict__["tick"] = 0.01
+        for start in (0.3, 0.304, 0.2961):
+            moved, driven = tube._since(0, start)
+            for time in (start - 0.0049, start, start + 0.0049):
+                growth = (arb(float(centre[0])) * time).exp()
+                assert moved.parts[0][0, 0].contains(growth.mid())
+                assert driven.parts[0][0, 0].contains(((growth - 1) / arb(float(centre[0]))).mid())
+            assert float(moved.parts[0][0, 0].rad()) < 0.03
