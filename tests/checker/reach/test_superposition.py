@@ -1,0 +1,147 @@
+"""Guards checker/reach/superposition: seen at the deviations of any parameters, the larger system is the problem's at
+these parameters, corners hold the box exactly, and what is not affine is refused."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.superposition import Parts, parted
+from sparserob_core.control.problem.cost import Quadratic
+from sparserob_core.control.problem.expression import parse_matrix
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box, NormBall
+
+BOX, NAMES = Box([-0.1, 0.3, 2.0], [0.7, 0.8, 2.0]), ("p", "q", "r")
+A = [["-t", "0", "0"], ["p * (1 - t) + q / 2", "0", "0"], ["1 + 2*t - (3*t + q)", "3", "cos(t) ^ 2"]]
+B = [["0"], ["2 - p / exp(t) + q"], ["t * (1 + 3 * p)"]]
+E = [["0", "0"], ["q * t", "+p"], ["-(p + q)", "1"]]
+C = ["0", "q - p", "sqrt(1 + t) * q"]
+
+
+def problem_of(system: sr.VaryingSystem, **more: Any) -> sr.OptimalControlProblem:
+    return sr.OptimalControlProblem(
+        **{
+            "system": system,
+            "horizon": 2.0,
+            "initial_state": [1.0, -1.0, 0.5],
+            "control": Box([-1.0], [1.0]),
+            "disturbance": Box([-0.1, -0.1], [0.1, 0.1]),
+            **more,
+        }
+    )
+
+
+def plant() -> tuple[sr.VaryingSystem, Parts]:
+    system = sr.VaryingSystem.of(A, B, 2.0, E, C, parameters=BOX, names=NAMES)
+    return system, Parts(system, tuple(BOX.interior_point().tolist()))
+
+
+def matrix(law: Any, name: str, p: list[float]) -> np.ndarray:
+    entry = law.entry(name)
+    return np.asarray(entry(np.array(p)) if callable(entry) else entry, dtype=float)
+
+
+def test_seen_at_any_parameters_the_larger_system_is_the_one_at_these() -> None:
+    rng, (system, parts) = np.random.default_rng(2), plant()
+    larger = parted(problem_of(system)).system
+    assert isinstance(larger, sr.VaryingSystem)
+    ((_, _, law),), ((_, _, big),) = system.laws, larger.laws
+    assert parts.moved == [[1, 2], [1, 2], []]
+    assert parts.scales == [0.5, 0.5, 0.0]
+    for _ in range(5):
+        p, t, z = rng.uniform(BOX.lower, BOX.upper), float(rng.uniform(0.0, 2.0)), rng.normal(size=parts.size)
+        shares = [(v - m) / s if s else 0.0 for v, m, s in zip(p.tolist(), parts.middle, parts.scales, strict=True)]
+        seen, here = parts.seen(tuple(shares)), [t, *p.tolist()]
+        np.testing.assert_allclose(
+            seen @ matrix(big, "A", [t]) @ z, matrix(law, "A", here) @ seen @ z, rtol=1e-13, atol=1e-13
+        )
+        for name in ("B", "E", "c"):
+            np.testing.assert_allclose(seen @ matrix(big, name, [t]), matrix(law, name, here), rtol=1e-13, atol=1e-13)
+
+
+def test_corners_hold_the_box_exactly() -> None:
+    """0.3 - 0.55 and 0.8 - 0.55 are no numbers; of what moves nothing one corner suffices."""
+    _, parts = plant()
+    corners = list(parts.corners())
+    assert len(corners) == 4 == len({*corners})
+    for j in range(2):
+        held = [Fraction(parts.middle[j]) + Fraction(corner[j]) * Fraction(parts.scales[j]) for corner in corners]
+        low, high = Fraction(float(BOX.lower[j])), Fraction(float(BOX.upper[j]))
+        assert min(held) <= low and high <= max(held)
+        assert float(low - min(held)) < 1e-16 and float(max(held) - high) < 1e-16
+    assert {corner[2] for corner in corners} == {0.0}
+
+
+def test_rows_are_those_of_every_corner_and_what_begins_is_certain_of_the_new_coordinates() -> None:
+    system, parts = plant()
+    H, G, h = np.array([[1.0, 2.0, 0.0], [0.0, 0.0, 1.0]]), np.array([[0.5], [0.25]]), np.array([3.0, 4.0])
+    wide = Box([-9.0, -8.0, -np.inf], [9.0, 7.0, np.inf])
+    made: Any = parted(
+        problem_of(
+            system,
+            initial_set=Box([-0.1, 0.0, -0.2], [0.1, 0.0, 0.3]),
+            path=[
+                sr.PathConstraint(wide, relative_to=[[0, 1, 2, 3], [2, 0, 0, 0]]),
+                sr.MixedConstraint(H, G, h),
+            ],
+            terminal=[Box([-1.0, -2.0, -3.0], [1.0, 2.5, 3.0])],
+            integral=[sr.IntegralConstraint(H[:1], G[:1], upper=[5.0])],
+            cost=sr.Cost(final=Quadratic(np.eye(3), np.array([0.0, 1.0, 0.0]))),
+        )
+    )
+    seen = [parts.seen(corner) for corner in parts.corners()]
+    walls, mixed = made.path
+    (end,), (total,) = made.terminal, made.integral
+
+    def same(found: Any, blocks: list[np.ndarray]) -> None:
+        wanted = {tuple(row) for block in blocks for row in block.tolist()}
+        assert {tuple(row) for row in np.column_stack(found).tolist()} == wanted
+
+    for shape, bound in ((walls.set, wide), (end, Box([-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]))):
+        flat = bound.halfspaces()
+        assert flat is not None
+        same(shape.halfspaces(), [np.column_stack([flat[0] @ one, flat[1]]) for one in seen])
+    same((mixed.H, mixed.G, mixed.h), [np.column_stack([H @ one, G, h]) for one in seen])
+    same(
+        (total.H, total.G, total.lower, total.upper),
+        [np.column_stack([H[:1] @ one, G[:1], [-np.inf], [5.0]]) for one in seen],
+    )
+    np.testing.assert_array_equal(walls.relative_to, [[0, 1, 2, 3, 0, 0, 0, 0], [2, 0, 0, 0, 0, 0, 0, 0]])
+    np.testing.assert_array_equal(made.initial_state, [1.0, -1.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(made.initial_set.lower, [-0.1, 0.0, -0.2, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(made.initial_set.upper, [0.1, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(made.cost.final.Q, np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
+    round_: Any = parted(problem_of(system, initial_set=NormBall(2.0, 0.1, dimension=3))).initial_set
+    assert [part.dimension for part in round_.parts] == [3, 4]
+
+
+@pytest.mark.parametrize(
+    "entry",
+    ["p * q", "p ^ 2", "1 / p", "t / (1 + q)", "sin(p)", "exp(p * t)", "2 ^ p", "p * p", "(p + t) * (q - t)", "t ^ p"],
+)
+def test_entries_that_are_not_affine_are_refused(entry: str) -> None:
+    system, _ = plant()
+    with pytest.raises(Unchecked, match="affinely"):
+        Parts(system, tuple(BOX.interior_point().tolist())).tables(parse_matrix("B", [[entry]], ("t", *NAMES)), 1.5)
+
+
+@pytest.mark.parametrize(
+    ("place", "entry"), [((0, 1), "p"), ((2, 2), "q"), ((1, 2), "1 + p"), ((0, 2), "1"), ((1, 1), "q * t")]
+)
+def test_a_parameter_that_meets_a_state_that_depends_on_one_is_refused(place: tuple[int, int], entry: str) -> None:
+    """Where the first state depends on the third, its own parameters meet what depends on them."""
+    system, _ = plant()
+    rows = [list(row) for row in A]
+    rows[place[0]][place[1]] = entry
+    law = system.laws[0][2]
+    other = LinearSystem(parse_matrix("A", rows, ("t", *NAMES)), law.B, law.E, law.parameters, ("t", *NAMES), law.c)
+    made = object.__new__(sr.VaryingSystem)
+    made.__dict__.update(system.__dict__ | {"law": other})
+    with pytest.raises(Unchecked, match="affinely"):
+        assert Parts(made, tuple(BOX.interior_point().tolist())).moved
