@@ -16,6 +16,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
+from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
@@ -33,10 +34,12 @@ Sense: TypeAlias = Literal["sup", "inf"]
 
 OUTPUT, STATE = "output", "state"  # what rows are called that no constraint asks for
 LEAST = 1e-3  # of the largest value of a row that is met: the enclosure of one that is near 0 is as wide as one of that
+NOTHING = 1e-12  # of a row's unit: one that is nowhere larger is 0 but for rounding, and is enclosed to its unit
 LOOKS = 65  # times at which values of a row are looked at first
 BINS = 240  # equal parts of a window, on each of which both sides are told: the width of a figure in half points
 TERMS = 4  # of a row, at most, that are spelt out
 LOST = 2e-11  # of a row's largest value: by so much both sides are told wider, for the rounding of whoever checks them
+SUMMED = 2e-12  # of the terms that make it, which is more where they cancel: rounding was seen to be a twentieth of that
 
 
 @final
@@ -163,7 +166,8 @@ def bound_row(
     deadline: Deadline | None = None,
 ) -> BoundedRow:
     """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it, or to `LEAST`
-    of the largest value that the row has anywhere in its window. Dictionaries are those of control and disturbance."""
+    of the largest value that the row has anywhere in its window, or of its unit where that is 0 but for rounding.
+    Dictionaries are those of control and disturbance."""
     known = followed(problem, dictionaries, theta, row)
     if known is not None:
         return _of_known(known, row, tolerance, notify, deadline)
@@ -294,7 +298,10 @@ def _of_program(
     middle = (family.index_set.lower + family.index_set.upper) / 2
     times = np.linspace(family.index_set.lower[0], family.index_set.upper[0], LOOKS)
     looked = family.violations(decision, np.hstack([times[:, None], np.tile(middle[1:], (LOOKS, 1))]))
-    size = float(np.abs(looked).max())
+    parameter = model.parameters.clamp(middle[None, 1:])
+    added = _added(model.functionals, theta, row.direction[:d], times * units[0], parameter)
+    met = float(np.abs(looked).max())
+    size = met if max(met, added / unit) > NOTHING else 1.0
     try:
         found = supremum(family, decision, tolerance, LEAST * size, notify, deadline=deadline)
     except NotEnclosable as error:
@@ -319,7 +326,7 @@ def _of_program(
     for p in (found.index[1:], middle[1:]):
         tried = np.hstack([(middles / units[0])[:, None], np.tile(p, (middles.size, 1))])
         low = np.maximum(low, family.violations(decision, tried)[:, 0] if middles.size else low)
-    lost = LOST * max(size, abs(found.lower))
+    lost = max(LOST * max(size, abs(found.lower)), SUMMED * added / unit)
     own_edges = edges / units[0]
     return BoundedRow(
         row,
@@ -336,6 +343,16 @@ def _of_program(
         found.cells,
         found.reason,
     )
+
+
+def _added(functionals: WorstCase, theta: Array, state: Array, times: Array, parameter: Array) -> float:
+    """The largest sum of the sizes of what a row ``state (d,)`` is made of beside the disturbance, at ``times (k,)`` and
+    ``parameter (1, nu)``: so much is rounded where the row itself is near 0."""
+    at = times, np.tile(state, (times.size, 1)), np.repeat(parameter, times.size, axis=0)
+    known, response = functionals.response.weights(*at), functionals.response
+    begun = np.abs(known.free) @ np.abs(response.initial_state)
+    driven = np.einsum("klm,ml->k", np.abs(known.control), np.abs(functionals.on_grid(theta.ravel())))
+    return float((begun + driven).max())
 
 
 Told: TypeAlias = Callable[[str, int, int], None]

@@ -186,6 +186,35 @@ def test_an_integral_is_bounded_and_checked(tmp_path: Path) -> None:
     assert sr.check(tmp_path / "out").status == "verified"
 
 
+IN_TIME = {"A": [[0, 1], ["-1 - 0.3 * sin(t)", -0.2]], "B": [[0], ["exp(-t / 20)"]], "E": [[0], [1]]}
+LATER = {"until": 8.0, "A": [[0, 1], [-1, -0.1]], "B": [[0], [1]], "E": [[0], [1]]}
+TWICE = {"pieces": [LATER | {"until": 4.0}, LATER]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", [IN_TIME, TWICE])
+def test_rows_whose_terms_cancel_and_rows_that_are_0_are_bounded_and_checked(tmp_path: Path, system: dict) -> None:
+    """What the control leaves of x1(8) is a hundred thousandth of what it is made of; nothing is commanded at first."""
+    stated = config(
+        8,
+        system=system,
+        horizon=8.0,
+        disturbance={"box": 0.05},
+        terminal=[{"box": {"lower": [-1, -1], "upper": [1e-5, 1]}}],
+        integral=[{"G": [[1]], "from": 0, "to": 1, "upper": 0.0, "lower": 0.0, "name": "fuel"}],
+    )
+    assert sr.run(stated, out=tmp_path / "run", quiet=True, figures=False).result.status == "certified"
+    found = sr.bound(tmp_path / "run", out=tmp_path / "out")
+    at_end = next(row for row in found.rows if row.constraint == "terminal" and row.sense == "sup")
+    assert at_end.lower == pytest.approx(1e-5, rel=1e-3)
+    assert sr.check(tmp_path / "out").status == "verified"
+    free = sr.bound(stated)
+    assert free.status == "certified"
+    for row in free.rows:
+        if row.constraint == "fuel":
+            assert_encloses(row, 0.0)
+
+
 def test_round_sets_have_witnesses_inside(tmp_path: Path) -> None:
     """|w| <= 0.1 and |x(0) - (1, 0)| <= 0.1: x1(2) of the double integrator is 1 + 0.1 (sqrt 5 + sqrt 8) at most."""
     ball = {"norm": {"p": 2, "radius": 0.1}}
