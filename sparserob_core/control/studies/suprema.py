@@ -39,7 +39,7 @@ LOOKS = 65  # times at which values of a row are looked at first
 BINS = 240  # equal parts of a window, on each of which both sides are told: the width of a figure in half points
 TERMS = 4  # of a row, at most, that are spelt out
 LOST = 2e-11  # of a row's largest value: by so much both sides are told wider, for the rounding of whoever checks them
-SUMMED = 2e-12  # of the terms that make it, which is more where they cancel: rounding was seen to be a twentieth of that
+SUMMED = 2e-12  # of the terms that make it, which are more where they cancel: rounding was a twentieth of that
 
 
 @final
@@ -346,7 +346,7 @@ def _of_program(
 
 
 def _added(functionals: WorstCase, theta: Array, state: Array, times: Array, parameter: Array) -> float:
-    """The largest sum of the sizes of what a row ``state (d,)`` is made of beside the disturbance, at ``times (k,)`` and
+    """The largest sum of the sizes of what makes a row ``state (d,)`` beside the disturbance, at ``times (k,)`` and
     ``parameter (1, nu)``: so much is rounded where the row itself is near 0."""
     at = times, np.tile(state, (times.size, 1)), np.repeat(parameter, times.size, axis=0)
     known, response = functionals.response.weights(*at), functionals.response
