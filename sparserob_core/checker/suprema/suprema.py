@@ -60,6 +60,7 @@ def check_suprema(case: Case) -> list[Finding]:
         found.append(judged("rows", every))
         for asked, entry in entries:
             name = f"{asked.window.name}: {_sense(asked)} {entry.get('quantity')}"
+            name += f" at {entry['corner']}" if entry.get("corner") else ""
             found.append(judged(name, lambda asked=asked, entry=entry: _enclosed(case, asked, entry)))  # type: ignore[misc]
         return found
 

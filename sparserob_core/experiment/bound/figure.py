@@ -34,7 +34,7 @@ def draw_bound(found: Bound) -> Figure:
     """A panel for every quantity that has a window of some length, `MOST` at most: the largest and the smallest value
     over all uncertainty, each as a band between the side that is reached and the one that is proven, and the walls."""
     panels: dict[tuple[str, bool], list[WorstCase]] = {}
-    for row in found.rows:
+    for row in found.over_parameters:
         if row.edges.size:
             panels.setdefault((row.quantity, row.direction.size > row.deviation.size), []).append(row)
     shown = list(panels.values())[:MOST]

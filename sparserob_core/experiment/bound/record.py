@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.brief import brief
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.studies.suprema import BoundedRow, Sense
+from sparserob_core.control.studies.suprema import BoundedRow, Corners, Sense
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array
@@ -31,6 +31,8 @@ class WorstCase:
 
     ``edges (n + 1,)``: parts of the window, on each of which the worst case lies between ``low`` and ``high (n,)``.
     ``cells``: how many were examined; ``reason``: what hindered the two sides from being as close as was asked for.
+    ``corner``: of parameters beside the time the one corner that this is about, such as ``gain = 0.1``, and ``stated``
+    the direction without what they add to the states: the worst of all corners is `Bound.over_parameters`.
     """
 
     constraint: str
@@ -54,6 +56,8 @@ class WorstCase:
     edges: Array = field(repr=False)
     low: Array = field(repr=False)
     high: Array = field(repr=False)
+    corner: str = ""
+    stated: Array | None = field(default=None, repr=False)
 
     __repr__ = brief
 
@@ -71,7 +75,7 @@ class WorstCase:
         return self.upper if self.sense == "sup" else self.lower
 
 
-def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
+def worst_case(problem: OptimalControlProblem, found: BoundedRow, corners: Corners | None = None) -> WorstCase:
     """A bounded row in the user's terms: of a row that bounds a quantity from below, its infimum."""
     row, sign = found.row, found.row.sign
     sides = [sign * found.lower, sign * found.upper]
@@ -81,7 +85,7 @@ def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
     wall = sign * row.wall if np.isfinite(row.wall) else None
     return WorstCase(
         constraint=row.constraint,
-        quantity=row.quantity(problem),
+        quantity=row.quantity(problem, corners),
         unit=row.unit(problem),
         sense=row.sense,
         lower=sides[0],
@@ -101,6 +105,25 @@ def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
         edges=found.edges,
         low=bands[0],
         high=bands[1],
+        corner="" if corners is None else corners.at(row.direction),
+        stated=None if corners is None else corners.without(row.direction),
+    )
+
+
+def _worst_of(rows: list[WorstCase]) -> WorstCase:
+    """The worst case of one quantity over all corners of the parameters: its witness is that of the worst of them."""
+    largest = rows[0].sense == "sup"
+    most, far = (max, np.maximum) if largest else (min, np.minimum)
+    worst = most(rows, key=lambda row: row.reached)
+    return replace(
+        worst,
+        lower=most(row.lower for row in rows),
+        upper=most(row.upper for row in rows),
+        margin=None if worst.margin is None else min(row.margin for row in rows if row.margin is not None),
+        cells=sum(row.cells for row in rows),
+        reason="; ".join(dict.fromkeys(row.reason for row in rows if row.reason)),
+        low=far.reduce([row.low for row in rows]),
+        high=far.reduce([row.high for row in rows]),
     )
 
 
@@ -128,6 +151,15 @@ class Bound:
 
     __repr__ = brief
 
+    @property
+    def over_parameters(self) -> tuple[WorstCase, ...]:
+        """The ``rows`` over all corners of parameters beside the time, of which `rows` has each."""
+        alike: dict[tuple[object, ...], list[WorstCase]] = {}
+        for row in self.rows:
+            stated = row.direction if row.stated is None else row.stated
+            alike.setdefault((row.constraint, row.wall, row.start, row.stop, stated.tobytes()), []).append(row)
+        return tuple(_worst_of(rows) for rows in alike.values())
+
 
 ENVELOPE = ("edges", "low", "high")
 
@@ -146,7 +178,10 @@ def _plain(value: Any) -> Any:
 
 
 def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
-    """What a user wants to know of every worst case, as rows of a table."""
+    """What a user wants to know of every worst case, as rows of a table; over all corners of parameters beside the
+    time, with the one at which it is reached."""
+    rows = found.over_parameters
+    cornered = any(row.corner for row in rows)
 
     def number(value: float | None, towards: float = 0.0) -> str:
         if value is None or not np.isfinite(value):
@@ -165,12 +200,14 @@ def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
             f"{row.time:.6g}",
             number(row.wall),
             "-" if row.margin is None or not np.isfinite(row.margin) else f"{row.margin:.4g}",
+            *([row.corner or "-"] if cornered else []),
         )
-        for row in found.rows
+        for row in rows
     ]
 
 
 def columns_told(found: Bound) -> tuple[str, ...]:
     """The names of the columns of `bound_rows_told`."""
     time = f"at t [{found.time_unit}]" if found.time_unit else "at t"
-    return "constraint", "worst case", "at least", "at most", time, "wall", "margin"
+    at = ("at parameters",) if any(row.corner for row in found.rows) else ()
+    return "constraint", "worst case", "at least", "at most", time, "wall", "margin", *at

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.control.studies.suprema import Corners, rows_of
+from sparserob_core.control.transcription.terms.accumulated import accumulated
 from sparserob_core.experiment.bound.record import bound_rows_told, columns_told
 from tests.support.places import matrices, needs_plants
 
@@ -172,8 +174,44 @@ def test_entries_in_the_time_are_bounded_and_checked(tmp_path: Path) -> None:
     for exact in (2.2, 0.8):
         (row,) = (row for row in found.rows if row.lower - 1e-6 < exact < row.upper + 1e-6)
         assert_encloses(row, exact)
+    assert [(row.sense, row.quantity, row.corner) for row in found.over_parameters] == [
+        ("sup", "x1", "p = 0.5"),
+        ("inf", "x1", "p = 0"),
+    ]
+    for row, exact in zip(found.over_parameters, (2.2, 0.8), strict=True):
+        assert_encloses(row, exact)
+    assert [told[1:2] + told[-1:] for told in bound_rows_told(found)] == [("sup x1", "p = 0.5"), ("inf x1", "p = 0")]
     for run in ("constant", "measurable", "uncertain"):
         assert sr.check(tmp_path / run).status == "verified"
+
+
+def test_rows_at_corners_of_parameters_beside_the_time_are_told_as_one_quantity() -> None:
+    """x1(t) + x2(t) is p and (1 + q) t more than at first: p acts on x2 alone, q on both; r on nothing."""
+    stated = sr.OptimalControlProblem(
+        system=sr.VaryingSystem.of(
+            [["0", "0"], ["0", "0"]],
+            [["1 + q"], ["q"]],
+            1.0,
+            c=["0 * t", "p"],
+            parameters=sr.Box([0.0, -0.5, 1.0], [2.0, 0.5, 2.0]),
+            names=["p", "q", "r"],
+        ),
+        horizon=1.0,
+        initial_state=[0, 0],
+        control=sr.Box([-1], [1]),
+        terminal=[sr.Polytope([[1.0, 0.0], [1.0, 1.0]], [5.0, 5.0])],
+    )
+    corners, larger = Corners.of(stated), accumulated(stated)
+    assert corners is not None
+    told = [(row.quantity(larger, corners), corners.at(row.direction)) for row in rows_of(larger)]
+    assert told == [
+        ("x1", "q = -0.5"),
+        ("x1 + x2", "p = 0, q = -0.5"),
+        ("x1", "q = 0.5"),
+        ("x1 + x2", "p = 0, q = 0.5"),
+        ("x1 + x2", "p = 2, q = -0.5"),
+        ("x1 + x2", "p = 2, q = 0.5"),
+    ]
 
 
 def test_an_integral_is_bounded_and_checked(tmp_path: Path) -> None:
