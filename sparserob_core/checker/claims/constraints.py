@@ -97,9 +97,9 @@ def is_followed(case: Case, window: Window) -> bool:
 def follows(case: Case) -> bool:
     """Whether rows of the system, which is known and has many states, are followed by their adjoints."""
     system = case.problem.system
-    if not isinstance(system, LinearSystem) or system.parameter_count or system.states < FOLLOWED:
+    if case.answering or not case.alike or case.execution is not None or len(case.grid) > MOST_PIECES:
         return False
-    return not case.answering and case.alike and case.execution is None and len(case.grid) <= MOST_PIECES
+    return isinstance(system, LinearSystem) and not system.parameter_count and system.states >= FOLLOWED
 
 
 def _along_rows(case: Case, window: Window) -> Proven:
