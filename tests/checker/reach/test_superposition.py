@@ -65,17 +65,20 @@ def test_seen_at_any_parameters_the_larger_system_is_the_one_at_these() -> None:
             np.testing.assert_allclose(seen @ matrix(big, name, [t]), matrix(law, name, here), rtol=1e-13, atol=1e-13)
 
 
-def test_corners_hold_the_box_exactly() -> None:
-    """0.3 - 0.55 and 0.8 - 0.55 are no numbers; of what moves nothing one corner suffices."""
-    _, parts = plant()
-    corners = list(parts.corners())
-    assert len(corners) == 4 == len({*corners})
-    for j in range(2):
-        held = [Fraction(parts.middle[j]) + Fraction(corner[j]) * Fraction(parts.scales[j]) for corner in corners]
-        low, high = Fraction(float(BOX.lower[j])), Fraction(float(BOX.upper[j]))
-        assert min(held) <= low and high <= max(held)
-        assert float(low - min(held)) < 1e-16 and float(max(held) - high) < 1e-16
-    assert {corner[2] for corner in corners} == {0.0}
+def test_corners_hold_the_box_exactly_and_no_more_than_rounding() -> None:
+    """What an end deviates by from the middle is no number most times; of what moves nothing one corner suffices."""
+    assert {corner[2] for corner in plant()[1].corners()} == {0.0}
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        low, high = -rng.uniform(size=2) * 10.0 ** rng.integers(-9, 1, 2), rng.uniform(1.0, 2.0, size=2)
+        system = sr.VaryingSystem.of([["0"]], [["p + q"]], 2.0, parameters=Box(low, high), names=("p", "q"))
+        parts = Parts(system, tuple(rng.uniform(0.3, 0.9, size=2).tolist()))
+        corners = list(parts.corners())
+        assert len(corners) == 4 == len({*corners})
+        for j, (least, most) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
+            ends = [Fraction(parts.middle[j]) + Fraction(corner[j]) * Fraction(parts.scales[j]) for corner in corners]
+            assert min(ends) <= Fraction(least) < min(ends) + Fraction(3e-16)
+            assert max(ends) >= Fraction(most) > max(ends) - Fraction(3e-16)
 
 
 def test_rows_are_those_of_every_corner_and_what_begins_is_certain_of_the_new_coordinates() -> None:
@@ -123,7 +126,24 @@ def test_rows_are_those_of_every_corner_and_what_begins_is_certain_of_the_new_co
 
 @pytest.mark.parametrize(
     "entry",
-    ["p * q", "p ^ 2", "1 / p", "t / (1 + q)", "sin(p)", "exp(p * t)", "2 ^ p", "p * p", "(p + t) * (q - t)", "t ^ p"],
+    [
+        "p * q",
+        "p ^ 2",
+        "1 / p",
+        "t / (1 + q)",
+        "sin(p)",
+        "exp(p * t)",
+        "2 ^ p",
+        "p * p",
+        "(p + t) * (q - t)",
+        "t ^ p",
+        "p * q * t",
+        "p ^ 2 / 2",
+        "-(p * q)",
+        "1 + p * q",
+        "p - sin(q)",
+        "cos(p * q)",
+    ],
 )
 def test_entries_that_are_not_affine_are_refused(entry: str) -> None:
     system, _ = plant()
@@ -145,3 +165,55 @@ def test_a_parameter_that_meets_a_state_that_depends_on_one_is_refused(place: tu
     made.__dict__.update(system.__dict__ | {"law": other})
     with pytest.raises(Unchecked, match="affinely"):
         assert Parts(made, tuple(BOX.interior_point().tolist())).moved
+
+
+@pytest.mark.parametrize("name", ["A", "B", "E", "c"])
+def test_all_that_is_downstream_of_an_entry_with_a_parameter_depends_on_it(name: str) -> None:
+    """A chain of five states; the parameter stands where the second one is driven, in one of the matrices."""
+    chain: dict[str, list[Any]] = {
+        "A": [["t" if i == j + 1 else "0" for j in range(5)] for i in range(5)],
+        "B": [["1"], *[["0"]] * 4],
+        "E": [["t"], *[["0"]] * 4],
+        "c": ["1", *["0"] * 4],
+    }
+    for other in chain:
+        entries = {key: [list(row) if isinstance(row, list) else row for row in rows] for key, rows in chain.items()}
+        if name == "c":
+            entries["c"][1] = "p"
+        else:
+            entries[name][1][0] = "p + t"
+        if other != name:  # the other parameter, elsewhere
+            entries[other][2] = "q" if other == "c" else ["q", *entries[other][2][1:]]
+        system = sr.VaryingSystem.of(
+            entries["A"],
+            entries["B"],
+            2.0,
+            entries["E"],
+            entries["c"],
+            parameters=Box([-1.0, -1.0], [1.0, 1.0]),
+            names=("p", "q"),
+        )
+        assert Parts(system, (0.0, 0.0)).moved == [[1, 2, 3, 4], [2, 3, 4] if other != name else []]
+
+
+@pytest.mark.parametrize(
+    ("entry", "steady", "slope"),
+    [
+        ("sin(t) + p * cos(t)", np.sin(1.5), np.cos(1.5)),
+        ("tan(t) - exp(t) * p", np.tan(1.5), -np.exp(1.5)),
+        ("log(t) * (2 - p)", 2 * np.log(1.5), -np.log(1.5)),
+        ("(p + 3) / tanh(t)", 3 / np.tanh(1.5), 1 / np.tanh(1.5)),
+        ("sqrt(t) + 2 ^ t * p", np.sqrt(1.5), 2**1.5),
+        ("t ^ 3 - (1 - p)", 1.5**3 - 1, 1.0),
+        ("+kepler(t, 0)", 1.5, 0.0),
+    ],
+)
+def test_entries_are_split_into_what_is_steady_and_what_a_parameter_multiplies(
+    entry: str, steady: float, slope: float
+) -> None:
+    system, _ = plant()
+    parts = Parts(system, (0.25, 0.5, 2.0))
+    first, by_p, *rest = (float(one[0, 0]) for one in parts.tables(parse_matrix("B", [[entry]], ("t", *NAMES)), 1.5))
+    assert first == pytest.approx(steady + 0.25 * slope, rel=1e-14)
+    assert by_p == pytest.approx(0.5 * slope, rel=1e-14)
+    assert rest == [0.0, 0.0]
