@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from math import ceil
 from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 STEPS = 16  # of the horizon, after which the norms of the transition's coefficients are looked at anew
+STEPS_WITHIN = 16  # of a piece of the grid, to the next of which the norms of what is left out are followed
 STATES_KEPT = 20_000  # enclosures of the state, per box of parameters
 MANY = 1000  # pieces of the grid, from which none has a ball of a duration that also holds others: balls add up
 
@@ -79,6 +81,7 @@ class Tube:
     _inside: dict[tuple[int, int], Series] = field(default_factory=dict)
     _parts: dict[tuple[int, int], tuple[Series, Series]] = field(default_factory=dict)
     _exponentials: dict[int, Exponentials] = field(default_factory=dict)
+    _grown: dict[tuple[int, int, int], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
     _states: dict[tuple[int, float, int], Enclosed] = field(default_factory=dict)
 
     @property
@@ -302,10 +305,10 @@ class Tube:
 
         if not self.remainders:
             return np.zeros(z.shape[0])
-        offset, length = arb(start) - arb(self.scene.grid[piece]), self.scene.duration(ticks)
         leg = self.scene.leg(piece)
         rest, u = self.remainders[leg], self.scene.control[min(piece, len(self.scene.control) - 1)]
-        growth, driven = held(rest.growth, rest.control, up_to(offset + length))
+        end = arb(start) - arb(self.scene.grid[piece]) + self.scene.duration(ticks)
+        growth, driven = self._grown_by(leg, self._spans[piece], end)
         last = upper((growth * self.norms[piece] + driven * _absolute(u))[rest.growth.nrows() - 1, 0])
         pushed = arb(0) if self.scene.disturbance is None else self._supports_out[leg]
         per_size = float((last + pushed).upper()) * OUTWARD
@@ -313,6 +316,20 @@ class Tube:
         terms = rounding(sum(self.basis.shape)) * np.abs(z) @ (np.abs(self.basis) @ np.abs(rest.transform))
         answer: Array = per_size * (np.linalg.norm(z @ table, axis=1) + np.linalg.norm(terms, axis=1)) * OUTWARD
         return answer
+
+    def _grown_by(self, leg: int, span: int, end: arb) -> tuple[arb_mat, arb_mat]:
+        """How norms have grown at most at every time up to the ``end`` of a part of a piece, which is looked at in
+        `STEPS_WITHIN` of the piece: a little later is a bound too, and many cells end in one of these."""
+        from flint import arb
+
+        length = upper(self._lengths[span])
+        steps = ceil(float(upper(end / length * STEPS_WITHIN)) * OUTWARD)
+        if (leg, span, steps) not in self._grown:
+            rest = self.remainders[leg]
+            self._grown[leg, span, steps] = held(
+                rest.growth, rest.control, up_to(upper(length * arb(steps) / STEPS_WITHIN))
+            )
+        return self._grown[leg, span, steps]
 
     @cached_property
     def _supports_out(self) -> list[arb]:

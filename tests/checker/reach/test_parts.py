@@ -23,7 +23,7 @@ from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.outcome import LOOKED, Broken, Clock, Unchecked
 from sparserob_core.checker.reach import disturbance_support
 from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.flow import Flow, OwnUnits, balanced, flows, stacked
+from sparserob_core.checker.reach.flow import Flow, OwnUnits, balanced, flows, held, stacked
 from sparserob_core.checker.reach.measurable import Kernel
 from sparserob_core.checker.reach.tube import Polynomial, Tube
 from sparserob_core.checker.sets.known import known
@@ -580,3 +580,24 @@ def test_parts_of_pieces_hold_what_a_system_does_wherever_it_is_within_a_tick():
                 assert moved.parts[0][0, 0].contains(growth.mid())
                 assert driven.parts[0][0, 0].contains(((growth - 1) / arb(float(centre[0]))).mid())
             assert float(moved.parts[0][0, 0].rad()) < 0.03
+
+
+def test_norms_within_a_piece_are_those_of_no_earlier_time():
+    """``x' = p x``: norms grow by ``e^{mu t}``; what is kept for a sixteenth of a piece holds every time in it."""
+    names = ("p1",)
+    system = LinearSystem(
+        parse_matrix("A", [["p1"]], names), np.ones((1, 1)), parameters=Box([0.5], [1.5]), names=names
+    )
+    control, none = indicators([0.0, 0.7, 2.0]), uniform(1, 2.0)
+    with ctx.workprec(96):
+        tube, *_ = tube_of(system, control, none, None, 2, np.ones(2), np.ones(1))
+        tube.nodes  # noqa: B018  # every duration is known
+        rest = tube.remainders[0]
+        for piece, end in itertools.product((0, 1), (1e-9, 0.1, 0.7 / 16, 0.35, 0.7)):
+            growth, driven = tube._grown_by(0, tube._spans[piece], arb(end))
+            there, pushed = held(rest.growth, rest.control, arb(end))
+            length, last = float(np.diff(tube.scene.grid)[piece]), rest.growth.nrows() - 1
+            later, more = held(rest.growth, rest.control, arb(end + length / 16))
+            assert there[last, last].upper() <= growth[last, last].upper() <= later[last, last].upper() * 1.001
+            assert pushed[last, 0].upper() <= driven[last, 0].upper() <= more[last, 0].upper() * 1.001
+        assert len(tube._grown) < 10
