@@ -102,7 +102,8 @@ def precision_of(case: Case) -> int:
         parts = [part for mode in problem.system.modes for part in mode.matrices(middle)]
     except InputError:  # not finite there
         return PRECISION
-    entries = np.concatenate([np.ravel(part) for part in parts]) * problem.horizon
+    with np.errstate(over="ignore"):  # what is not finite does not count
+        entries = np.concatenate([np.ravel(part) for part in parts]) * problem.horizon
     sizes = np.abs(entries[np.isfinite(entries) & (entries != 0.0)])
     apart = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
     spare = VARYING if isinstance(problem.system, VaryingSystem) else 0

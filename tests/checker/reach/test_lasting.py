@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from flint import arb
 
-from sparserob_core.checker.reach.lasting import Lasting, summed
+import sparserob_core as sr
+from sparserob_core.checker.reach.lasting import Lasting, on_one_grid, summed
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box, Product
 
 CHANGES = [0.0, 0.4, 1.0, 1.7, 2.0]
 LASTING = Lasting(CHANGES, ((slice(0, 1), np.array([0, 2])), (slice(1, 3), np.array([0, 1, 4]))))
@@ -44,6 +47,28 @@ def test_balls_are_summed_too():
     assert [float(one[1]) for one in found] == [10.0, 36.0, 0.0, 0.0, 14.0]
     assert float(weights[1][0]) == 1.0  # what is given stays
     assert summed(None, weights) == weights
+    turned = summed(LASTING, [[-w if k % 2 else w for w in one] for k, one in enumerate(weights)])
+    assert [float(one[0]) for one in turned] == [-1.0, 0.0, 3.0, 0.0, 0.0]
+    assert [float(one[1]) for one in turned] == [10.0, -12.0, 0.0, 0.0, 14.0]
+
+
+def test_breakpoints_are_one_where_they_differ_by_rounding_alone():
+    """Those of the dictionary where a disturbance has none."""
+    one = Box([-1.0], [1.0])
+    problem = sr.OptimalControlProblem(
+        system=LinearSystem(np.zeros((1, 1)), np.ones((1, 1)), E=np.ones((1, 3))),
+        horizon=2.0,
+        initial_state=[0.0],
+        control=one,
+        disturbance=Product((one, one, one)),
+        disturbance_breakpoints=(np.array([0.0, 0.5, 0.501, 2.0]), np.array([0.0, 0.5 + 1e-14, 0.5001, 2.0]), None),
+    )
+    known, joint = on_one_grid(problem, sr.Dictionary.indicators([0.0, 1.0, 2.0]))
+    assert joint.breakpoints.tolist() == [0.0, 0.5, 0.5001, 0.501, 1.0, 2.0]
+    assert [list(one) for one in known.disturbance_breakpoints or ()][2] == [0.0, 1.0, 2.0]
+    lasting = Lasting.of(known, joint.breakpoints[:-1].tolist())
+    assert lasting is not None
+    assert [firsts.tolist() for _, firsts in lasting.parts] == [[0, 1, 3], [0, 1, 2], [0, 4]]
 
 
 def test_a_component_may_jump_where_a_piece_of_its_own_begins():
