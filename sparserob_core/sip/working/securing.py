@@ -155,8 +155,7 @@ def _secure(
     """
     program, margin, imposed = ledger.program, working.margin, 0
     near: tuple[Answer, Found] | None = None  # of which a glance left cells open, and no search finds a violation
-    tiny = np.finfo(float).tiny
-    cells, dear = GLANCE, DEAR * abs(program.cost(answer.solution.x)) / max(working.priced(answer), tiny)
+    cells, dear = GLANCE, _dear(abs(program.cost(answer.solution.x)), working.priced(answer))
     for _ in range(SECURED):
         cost, price = abs(program.cost(answer.solution.x)), working.priced(answer)
         fresh = working.impose(violated)
@@ -190,6 +189,11 @@ def _secure(
     if near is not None:
         ledger.prove(*near, prover(near[0].solution.x, CLOSER * GLANCE))
     return imposed > 0
+
+
+def _dear(cost: float, price: float) -> float:
+    """The distance that is paid for with the share `DEAR` of a ``cost``; finite where a ``price`` is almost 0."""
+    return float(DEAR * cost / max(price, max(cost, 1.0) * np.finfo(float).tiny))
 
 
 def _farther(working: Working, ledger: Ledger, answer: Answer, margin: float, more: float) -> Answer | None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.sip.working.securing import DEAR, _dear
 
 
 @pytest.mark.parametrize("pieces", [50, 250])
@@ -22,3 +24,10 @@ def test_a_round_in_which_a_decision_is_secured_begins_with_what_is_known(pieces
     result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": pieces})
     assert result.status == "certified"
     assert result.counts["solver_calls"] == 0  # closed forms, and Newton's method from a guess, answered all
+
+
+def test_a_distance_that_costs_next_to_nothing_is_a_number() -> None:
+    for price in (0.0, 5e-324, np.finfo(float).tiny):
+        for cost in (1e-3, 100.0, 1e12):
+            assert np.isfinite(_dear(np.float64(cost), np.float64(price)))
+    assert _dear(2.0, 0.5) == DEAR * 4.0
