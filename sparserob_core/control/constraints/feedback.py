@@ -21,9 +21,7 @@ from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
 
 KEPT = 64  # separated times for each row and round
-# Samples around a maximum, and how often they are drawn so many times closer: what a smooth maximum is missed by falls
-# to 16^-9 of what the first samples miss, 1e-11. Three times fewer leave violations of 1e-8 to the proof.
-ZOOMED, ZOOMS, CLOSER = 9, 9, 4.0
+ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often they are drawn so many times closer
 NEAR, FEW = 1e-3, 4  # maxima that are so near to their limit are refined, and so many in any case
 HALVINGS, HALVED = 14, 200  # how often samples are drawn closer, and how many intervals at a time
 HIDDEN, SHARE = 2e-10, 0.2  # a violation that samples may miss; the share of the largest that they may

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 from sparserob_core.brief import shortened
-from sparserob_core.checker.outcome import Clock, Finding
+from sparserob_core.checker.outcome import Clock, Finding, Unchecked
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.check.files import compared
 from sparserob_core.experiment.config.run_config import digest
@@ -84,19 +84,21 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
             f"{path}: expected the run of a control problem; certificates of other programs cannot be checked"
         )
     control, disturbance = dictionaries_of(loaded, problem.horizon)
-    case = Case(
-        problem,
-        control,
-        disturbance,
-        data,
-        clock,
-        *counting(loaded),
-        _policy(loaded, data, control, problem.measurements),
-    )
+    policy = _policy(loaded, data, control, problem.measurements)
+    title = loaded.config.title or path.name
+    try:
+        case = Case(problem, control, disturbance, data, clock, *counting(loaded), policy)
+    except Unchecked as gap:
+        return _of_no_case(title, gap, started)
     derived = derive(case, gap_tolerance(loaded))
     files = compared(replace(stored, largest=_largest(path, case)), loaded, case, summary)
     claims = (_config(loaded, data, summary), *derived, *files.claims)
-    return Check(loaded.config.title or path.name, claims, time.perf_counter() - started, files.not_compared)
+    return Check(title, claims, time.perf_counter() - started, files.not_compared)
+
+
+def _of_no_case(title: str, gap: Unchecked, started: float) -> Check:
+    """Of a problem that the checker cannot state."""
+    return Check(title, (Finding("problem", "not checked", str(gap)),), time.perf_counter() - started)
 
 
 def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, started: float) -> Check:
@@ -114,14 +116,14 @@ def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, starte
     decision = data.get("decision")
     if decision is None:  # without any control
         data = {**data, "decision": [[0.0] * control.functions for _ in range(problem.system.controls)]}
-    claims = check_suprema(Case(problem, control, disturbance, data, clock))
+    title = loaded.config.title or path.name
+    try:
+        case = Case(problem, control, disturbance, data, clock)
+    except Unchecked as gap:
+        return _of_no_case(title, gap, started)
+    claims = check_suprema(case)
     rest = tuple(name for name in ("envelopes.npz", "bound.png") if (path / name).is_file())
-    return Check(
-        loaded.config.title or path.name,
-        (_config(loaded, data, data), *claims),
-        time.perf_counter() - started,
-        rest,
-    )
+    return Check(title, (_config(loaded, data, data), *claims), time.perf_counter() - started, rest)
 
 
 def _policy(

@@ -59,15 +59,9 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
     from sparserob_core.checker.claims.claims import derived_bound
     from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 
-    case = Case(
-        experiment.problem,
-        experiment.control,
-        experiment.disturbance,
-        finite(data),
-        Clock(SECONDS),
-        policy=experiment.transcription.policy,
-    )
+    given = experiment.problem, experiment.control, experiment.disturbance
     try:
+        case = Case(*given, finite(data), Clock(SECONDS), policy=experiment.transcription.policy)
         derived = derived_bound(case)
     except (Broken, Unchecked, ZeroDivisionError):
         return safe

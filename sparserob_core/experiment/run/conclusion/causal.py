@@ -105,8 +105,8 @@ def proven(model: Transcription, problem: OptimalControlProblem, stated: CausalB
 
     assert model.feedback is not None
     policy, none = model.feedback.policy, stated.lower == np.inf
-    case = Case(problem, model.control, model.disturbance, {}, Clock(SECONDS), policy=policy)
     try:
+        case = Case(problem, model.control, model.disturbance, {}, Clock(SECONDS), policy=policy)
         derived = derived_causal_bound(case, finite(causal_data(stated)), priced=not none)
     except (Broken, Unchecked, ZeroDivisionError):
         return None
