@@ -32,12 +32,14 @@ SEARCH = ["watch", "configs/experiment1_literal.yaml", "maximiser.budget=2500"]
 FEEDBACK = ["watch", "configs/experiment1_feedback.yaml"]
 INFEASIBLE = ["watch", "configs/experiment2_repaired.yaml", "problem.path.0.from=1.0"]
 STUDY = ["sweep", "configs/double_integrator.yaml", "problem.horizon=3:6:7", "problem.control.box=0.6:1.6:6"]
+RENDEZVOUS = ["watch", "configs/atv_box.yaml"]
 MARGIN = ["margin", "configs/experiment1_repaired.yaml", "--curve", "10"]
 RUNS: dict[str, tuple[list[str], dict[str, str]]] = {
     "exchange": (EXCHANGE, {"Overview": "exchange", "Exchange": "exchange_tab"}),
     "search": (SEARCH, {"Overview": "search", "Search": "search_tab", "Landscape as a surface": "surface"}),
     "feedback": (FEEDBACK, {"Feedback": "feedback"}),
     "infeasible": (INFEASIBLE, {"Overview": "infeasible"}),
+    "rendezvous": (RENDEZVOUS, {"Overview": "rendezvous"}),
     "study": (STUDY, {"Study": "study"}),
     "margin": (MARGIN, {"Study": "margin"}),
 }

@@ -17,6 +17,7 @@ pytest.importorskip("rerun")
 import rerun as rr
 import rerun.blueprint as rrb
 
+from sparserob_core.experiment.figures.drawing import figure_data
 from sparserob_core.experiment.run.replay import stored_result, stored_run
 from sparserob_rerun.drawing.canvas import Axes, Drawing
 from sparserob_rerun.exchange import rounds
@@ -25,9 +26,10 @@ from sparserob_rerun.exchange.clash import draw_clash, extent
 from sparserob_rerun.exchange.rounds import Rounds, Worst, told_by_result
 from sparserob_rerun.physics import physics
 from sparserob_rerun.physics.pages import heading, pages
+from sparserob_rerun.physics.phase import moved
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
-from sparserob_rerun.recording.layout import Shown, layout
+from sparserob_rerun.recording.layout import PHASE, Shown, layout
 from tests.support.places import CONFIGS
 
 SIX: dict[str, Any] = {
@@ -427,3 +429,29 @@ def test_decades_are_whole_and_a_search_that_gains_nothing_more_has_numbers_that
         none = np.full(3, np.nan)
         numbers = [f"{one:.7g}" for one in ticks(*_limits(np.full(3, value), none, np.full(3, value), []), 3)]
         assert len(set(numbers)) == len(numbers) > 0 and max(map(len, numbers)) <= 6
+
+
+def test_a_system_in_a_plane_is_drawn_there_with_the_arcs_on_which_its_control_acts() -> None:
+    """One unit is as long upwards as across, what is drawn is in the panel, and everything has one name beside it."""
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(np.eye(4, k=2), np.eye(4)[:, 2:]),
+        horizon=4.0,
+        initial_state=[0.0, 0.0, 0.0, 0.0],
+        control=sr.Box([-1, -1], [1, 1]),
+        disturbance=None,
+        path=[sr.PathConstraint(sr.Box([-np.inf] * 4, [5.5, np.inf, np.inf, np.inf]))],
+        terminal=[sr.Equality([2.0, 0.5, 0.0, 0.0])],
+        names=sr.Names(states=["x", "y", "vx", "vy"], state_units=["m", "m", "m/s", "m/s"], plane=["x", "y"]),
+    )
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 8})
+    data = figure_data(result.experiment, result.decision, None, (), None)
+    drawing = moved(data, {})
+    (curve, _, _), *_ = drawing.strips["curve"]
+    assert np.ptp(curve[:, 0]) / np.ptp(curve[:, 1]) == pytest.approx(np.ptp(data.path[:, 0]) / np.ptp(data.path[:, 1]))
+    acts = (np.abs(result.control.values) > 1e-6).any(axis=0)
+    assert len(drawing.strips["arcs"]) == int((np.diff([0, *acts.astype(int)]) > 0).sum()) > 0
+    left, right, top, bottom = PHASE
+    for places in [*(points for layer in drawing.strips.values() for points, _, _ in layer)]:
+        assert (places >= (left, top)).all() and (places <= (right, bottom)).all()
+    said = [words for _, words, _ in drawing.labels]
+    assert {"terminal set", "thick: the control acts", "dot: x(0)"} <= {*said} and "worst case" not in said

@@ -126,17 +126,19 @@ class Drawing:
             self.line(layer, np.stack([one, other]), colour, width)
 
     def hatched(self, layer: str, axes: Axes, x: tuple[float, float], y: tuple[float, float], colour: Colour) -> None:
-        """A forbidden box: strokes from lower left to upper right, and its outline on the side that can be reached."""
-        (left, bottom), (right, top) = axes.at(x[0], y[0])[0], axes.at(x[1], y[1])[0]
-        if right - left < 1.0 or bottom - top < 1.0:
+        """A forbidden box."""
+        self.forbidden(layer, axes, axes.at(np.array([x[0], x[1], x[1], x[0]]), np.repeat(y, 2)), colour)
+
+    def forbidden(self, layer: str, axes: Axes, corners: Floats, colour: Colour) -> None:
+        """A forbidden convex polygon, of pixels ``(k, 2)`` in their order: strokes from lower left to upper right."""
+        if np.ptp(corners, axis=0).min() < 1.0:
             return
-        step = axes.width / HATCHES
-        for start in np.arange(left - (bottom - top), right, step):
-            first, last = max(start, left), min(start + (bottom - top), right)
-            if last > first:
-                self.line(
-                    layer, np.array([[first, bottom - (first - start)], [last, bottom - (last - start)]]), colour, 1.0
-                )
+        along = corners.sum(axis=1)  # downwards is positive: a stroke is where this is the same
+        others, theirs = np.roll(corners, -1, axis=0), np.roll(along, -1)
+        for place in np.arange(along.min(), along.max(), axes.width / HATCHES)[1:]:
+            sides = np.flatnonzero((along > place) != (theirs > place))
+            share = ((place - along[sides]) / (theirs[sides] - along[sides]))[:, None]
+            self.line(layer, corners[sides] + share * (others[sides] - corners[sides]), colour, 1.0)
 
     def log(self, rr: Any, stream: Any, path: str, static: bool = False, layers: Sequence[str] = ()) -> None:
         """Log everything below ``path``, later ``layers`` above earlier ones, and take away what the drawing before had

@@ -1,4 +1,5 @@
-"""The state space: a plane for two states, space for three; the first states of more."""
+"""Where the system moves: the plane that its problem names, or else its state space, a plane for two states, space
+for three; the first states of more."""
 
 from __future__ import annotations
 
@@ -13,23 +14,89 @@ from sparserob_rerun.drawing.canvas import Axes, Drawing
 
 if TYPE_CHECKING:
     import sparserob_core as sr
-    from sparserob_rerun.drawing.palette import Floats
+    from sparserob_rerun.drawing.palette import Colour, Floats
 
 SIDE = 420.0
+FLAT, LENGTH = 0.4, 640.0  # a plane that is flatter is drawn that long, and what it shows is said below it
 SLICES = 36
 ROOM = 2.0  # the panel is half as large as the drawing
+POINT = 8.0  # pixels: a goal that is smaller is drawn as a square of that size
+LAYERS = ("hatch", "slices", "frame", "worst", "curve", "arcs", "wall")
 LINE, ENTRY = 30.0, 300.0  # of words from one to the next, and how wide the longest are that say what is drawn
 
 
 def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
     """The nominal trajectory, the worst ones, slices of the tube and the terminal set below ``/physics/phase``; nothing
     for a single state."""
-    if len(data.state) == 2:
-        _plane(data, worst).log(
-            rr, stream, "physics/phase", layers=("hatch", "slices", "frame", "worst", "curve", "wall")
-        )
+    if data.plane is not None:
+        moved(data, worst).log(rr, stream, "physics/phase", layers=LAYERS)
+    elif len(data.state) == 2:
+        _plane(data, worst).log(rr, stream, "physics/phase", layers=LAYERS)
     elif len(data.state) > 2:
         _space(rr, stream, data, worst)
+
+
+def pair_of(problem: sr.OptimalControlProblem) -> tuple[int, int] | None:
+    """The two states that are drawn across and upwards; ``None`` where there are more, in space."""
+    return problem.names.in_plane or ((0, 1) if problem.system.states == 2 else None)
+
+
+def moved(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
+    """The path in the plane as it is, one unit as long upwards as across, and where the control acts on it."""
+    plane = data.plane
+    assert plane is not None
+    (low, high), (across, up) = plane.view(data.path), plane.states
+    wide = bool(high[1] - low[1] <= FLAT * (high[0] - low[0]))
+    scale = (LENGTH if wide else SIDE) / float((high - low).max())
+    width, height = (scale * (high - low)).tolist()
+    axes = Axes(60.0, 0.0, width, height, (low[0], high[0]), (low[1], high[1]))
+    drawing, drawn = Drawing(), [("dot: x(0)", ink.INK)]
+    drawing.frame(axes, "", data.names.state(across), room=ROOM)
+    frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    if (data.tube_upper > data.tube_lower)[[across, up]].any():
+        for place in plane.places[np.unique(np.linspace(0, data.times.size - 1, SLICES).astype(int))]:
+            drawing.line("slices", axes.at(*np.vstack([place, place[:1]]).T), ink.TUBE, 1.0)
+        drawn.append(("worst case", ink.SKY))
+    drawn += [entry for limit in plane.limits for entry in _limited(drawing, axes, limit, frame)]
+    for path in worst.get("states", ()):
+        drawing.line("worst", axes.at(path[across], path[up]), ink.ORANGE, 1.2)
+    if len(worst.get("states", ())):
+        drawn.append(("worst cases", ink.ORANGE))
+    drawing.line("curve", axes.at(*data.path.T), ink.SKY, 2.0)
+    for arc in data.arcs:
+        drawing.line("arcs", axes.at(*arc.T), ink.SKY, 6.0)
+    if data.arcs:
+        drawn.append(("thick: the control acts", ink.SKY))
+    drawing.dot(axes.at(*data.path[0]), ink.INK, 5.0)
+    _named(drawing, axes, drawn, wide)
+    return drawing
+
+
+def _limited(drawing: Drawing, axes: Axes, limit: Any, frame: Floats) -> list[tuple[str, Colour]]:
+    """Hatch what is always forbidden, outline what holds for a while, and the goal; returns what to say of it."""
+    if limit.is_wall:
+        for corners in limit.beyond(frame):
+            drawing.forbidden("hatch", axes, axes.at(*corners.T), ink.HATCH)
+        return []
+    allowed = limit.allowed(frame)
+    if limit.moves or not len(allowed):
+        return []
+    places = axes.at(*np.vstack([allowed, allowed[:1]]).T)
+    if np.ptp(places, axis=0).max() < POINT:  # a mark around a goal that is too small to be seen
+        places = places.mean(axis=0) + POINT / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    drawing.line("wall", places, ink.VERMILLION, 2.0 if limit.is_final else 1.0)
+    return [("terminal set" if limit.is_final else limit.name, ink.VERMILLION)]
+
+
+def _named(drawing: Drawing, axes: Axes, drawn: list[tuple[str, Colour]], below: bool = False) -> None:
+    """What is drawn, beside the plot or ``below`` it, where no curve is."""
+    left, top = axes.left + axes.width, 0.0
+    if below:
+        left, top = axes.left, axes.top + axes.height + ROOM * LINE
+    columns = int(axes.width // ENTRY) if below else 1
+    for entry, (words, colour) in enumerate(dict.fromkeys(drawn)):
+        across, line = left + ENTRY * (entry % columns), entry // columns
+        drawing.text(across + ENTRY / 2, top + ROOM * LINE * (line + 0.5), words, colour)
 
 
 def _slices(data: sr.FigureData) -> Floats:
@@ -53,8 +120,7 @@ def _plane(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
         drawn.append(("worst cases", ink.ORANGE))
     drawing.line("curve", axes.at(data.state[0], data.state[1]), ink.SKY, 2.0)
     drawing.dot(axes.at(data.state[0, 0], data.state[1, 0]), ink.INK, 5.0)
-    for line, (words, colour) in enumerate(drawn):  # beside the plot, where no curve is
-        drawing.text(axes.left + axes.width + ENTRY / 2, ROOM * LINE * (line + 0.5), words, colour)
+    _named(drawing, axes, drawn)
     return drawing
 
 

@@ -10,6 +10,7 @@ from sparserob_rerun.drawing.canvas import view
 from sparserob_rerun.exchange import bounds, rounds
 from sparserob_rerun.physics import feedback, physics
 from sparserob_rerun.physics.pages import heading, pages
+from sparserob_rerun.physics.phase import pair_of
 from sparserob_rerun.search import views as search
 
 if TYPE_CHECKING:
@@ -112,8 +113,11 @@ def _log(rrb: Any, shown: Shown) -> Any:
 
 
 def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
-    if problem.system.states == 2:
-        return view("/physics/phase", f"Phase plane: {problem.names.state(1)} over {problem.names.state(0)}", PHASE)
+    pair = pair_of(problem)
+    if pair is not None:
+        kind = "Phase plane" if problem.names.in_plane is None else "Plane"
+        across, up = (problem.names.state(one) for one in pair)
+        return view("/physics/phase", f"{kind}: {up} over {across}", PHASE)
     states = problem.system.states
     name = (
         "State space"

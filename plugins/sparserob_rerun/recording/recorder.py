@@ -257,8 +257,10 @@ class Recorder:
                 left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
                 self.draw(LANDSCAPE, explorer.finish, left, 16, COARSE)  # any level is one
             self.mark()
-            if self.shown.answers and self.shown.landscape and self.terrain.known is None and self.shown.clash is None:
-                self.say(f"no landscape: {PATIENT if self.answerable else KEPT}")
+            none = self.shown.landscape and self.terrain.known is None and self.shown.clash is None
+            if none and (self.shown.answers or explorer.wrong):
+                if not explorer.wrong:
+                    self.say(f"no landscape: {PATIENT if self.answerable else KEPT}")
                 self.shown = replace(self.shown, landscape=False)
                 self.draw("the arrangement", self.stream.send_blueprint, layout(self.shown))
         if explorer.wrong:

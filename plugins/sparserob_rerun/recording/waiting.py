@@ -9,6 +9,7 @@ from sparserob_rerun.drawing.canvas import Drawing
 from sparserob_rerun.exchange import bounds, clash, rounds
 from sparserob_rerun.physics import physics
 from sparserob_rerun.physics.pages import pages
+from sparserob_rerun.physics.phase import pair_of
 from sparserob_rerun.recording.layout import PHASE, Shown
 from sparserob_rerun.search import climb, views
 
@@ -29,7 +30,7 @@ class Waiting:
             for page in pages(shown.problem):
                 words = f"the control and the states are drawn when {first}"
                 self._write(CONTROL, page.path, physics.extent(len(page.plots)), words)
-            if shown.problem.system.states == 2:
+            if pair_of(shown.problem) is not None:
                 self._write(CONTROL, "physics/phase", PHASE, f"drawn when {first}")
         if shown.landscape:
             tuples = "the first tuple is evaluated" if shown.searches else "the first constraints are active"

@@ -26,13 +26,12 @@ from sparserob_core.experiment.figures.active import Active
 from sparserob_core.experiment.figures.figure_data import (
     MOST_STATES,
     FigureData,
-    Limit,
     Outputs,
-    Plane,
     Wall,
     plain,
     telling,
 )
+from sparserob_core.experiment.figures.plane import Limit, Plane
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished

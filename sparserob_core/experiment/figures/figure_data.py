@@ -10,11 +10,13 @@ import numpy as np
 
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.figures.plane import Plane
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 
 MOST_STATES = 12  # drawn in one figure
+IDLE = 1e-7  # of the largest control: less than that is no action but rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,35 +51,6 @@ class Wall:
     def moves(self) -> bool:
         """Whether a bound is another at the end."""
         return any(first != last for first, last in self.sides)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Limit:
-    """What a constraint that is called ``name`` says of the place alone: ``normals (r, 2) y <= bounds (k, r)`` at
-    ``times (k,)``, between which the bounds go in straight lines; of the final place (``is_final``) one time.
-    ``is_wall``: it holds all the time, and stands still."""
-
-    name: str
-    normals: Array
-    times: Array
-    bounds: Array
-    is_final: bool = False
-    is_wall: bool = False
-
-    @property
-    def moves(self) -> bool:
-        """Whether a bound changes."""
-        return bool((self.bounds != self.bounds[0]).any())
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Plane:
-    """Where a system moves in a plane: the two ``states`` that are its place, drawn to the right and upwards; a polygon
-    ``places (T, q, 2)`` for every time, that contains wherever the worst case may bring it; and the ``limits``."""
-
-    states: tuple[int, int]
-    places: Array
-    limits: tuple[Limit, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -170,6 +143,27 @@ class FigureData:
         """The states that figures show, in their order: all that are known, or `MOST_STATES` of them, `telling`."""
         reach = self.tube_upper.max(axis=1) - self.tube_lower.min(axis=1)
         return tuple(sorted(one for one in telling(reach, self.walls)[:MOST_STATES] if not np.isnan(reach[one])))
+
+    @property
+    def path(self) -> Array:
+        """Where the system is at the ``times``, ``(T, 2)``, of one that moves in a plane."""
+        assert self.plane is not None
+        return np.asarray(self.state[list(self.plane.states)].T)
+
+    @property
+    def arcs(self) -> list[Array]:
+        """The parts of the path on which the control acts, ``(k, 2)`` each, where there are others."""
+        size, path = np.abs(self.control), self.path
+        acts = (size > IDLE * np.maximum(size.max(axis=1, initial=0.0), np.finfo(float).tiny)[:, None]).any(axis=0)
+        if acts.all():
+            return []
+        turns, found = np.diff(np.concatenate([[False], acts, [False]]).astype(int)), []
+        begun, ended = (self.breakpoints[np.flatnonzero(turns == sign)] for sign in (1, -1))
+        for begin, end in zip(begun, ended, strict=True):
+            inside = self.times[(self.times > begin) & (self.times < end)]
+            times = np.unique(np.concatenate([[begin, end], inside]))
+            found.append(np.stack([np.interp(times, self.times, coordinate) for coordinate in path.T], axis=1))
+        return found
 
     def active_on(self, component: int) -> Array:
         """When a constraint on a state is active."""

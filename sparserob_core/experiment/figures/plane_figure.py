@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.figure_data import FigureData, Limit, plain
+from sparserob_core.experiment.figures.figure_data import FigureData, plain
+from sparserob_core.experiment.figures.plane import Limit, clipped
 from sparserob_core.experiment.figures.style import draw_legend
 
 if TYPE_CHECKING:
@@ -16,14 +17,8 @@ if TYPE_CHECKING:
 
     from sparserob_core.sip.convex_set import Array
 
-MARGIN = (
-    0.08  # of the larger side of what is drawn, around it: nothing hides what is beside, ten times leaves no picture
-)
-SLIM = 0.25  # of the larger side, the smaller one at least: of a tenth nothing is seen, at 1 all is a square
-NEAR = 0.3  # of the larger side: a wall that is nearer to the path is within the view; of all walls one sees no path
 PALE = "#BEE1F6"  # SKY at 45 % on white
 POINT = 0.01  # of the larger side: a smaller goal is drawn as a mark; at a tenth boxes that one sees become marks
-IDLE = 1e-7  # of the largest control: less than that is no action but rounding
 BESIDE = 0.08  # of the width: a mark nearer to an earlier one has its time below; of a tenth of it both are one blot
 MARKS = 4  # parts of the horizon whose ends are marked
 
@@ -36,8 +31,8 @@ def draw_plane(data: FigureData) -> Figure:
 
     plane = data.plane
     assert plane is not None
-    path, places = data.state[list(plane.states)].T, plane.places
-    low, high = _view(path, places, plane.limits)
+    path, places = data.path, plane.places
+    low, high = plane.view(path)
     sides = high - low
     tall = float(np.clip(look.WIDTH * sides[1] / sides[0], 2.0, 7.0))
     figure = Figure(figsize=(look.WIDTH, tall + 1.1), layout="constrained")
@@ -65,53 +60,15 @@ def draw_plane(data: FigureData) -> Figure:
         for number, place in enumerate(places):  # they overlap: one opaque colour, that of the tube of a state
             ax.fill(*place.T, color=PALE, linewidth=0.4, zorder=2, label="" if number else said)
     ax.plot(*path.T, color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
-    _arcs(ax, data, path)
+    for number, arc in enumerate(data.arcs):
+        ax.plot(*arc.T, color=look.ORANGE, linewidth=4.0, zorder=3.5, solid_capstyle="round",
+                label="" if number else "the control acts")  # fmt: skip
     _marks(ax, data, path)
     ax.set_xlabel(data.state_label(plane.states[0]))
     ax.set_ylabel(data.state_label(plane.states[1]))
     ax.set_title(data.title)
     draw_legend(figure, [ax])
     return figure
-
-
-def clipped(polygon: Array, normals: Array, bounds: Array) -> Array:
-    """A convex polygon ``(k, 2)`` without what is beyond one of the lines ``normals (r, 2) x = bounds (r,)``
-    (Sutherland and Hodgman 1974)."""
-    kept = np.asarray(polygon, dtype=float)
-    for normal, bound in zip(normals, bounds, strict=True):
-        heights, corners = kept @ normal - bound, []
-        for k in range(len(kept)):
-            a, b = heights[k - 1], heights[k]
-            if (a > 0.0) != (b > 0.0):
-                corners.append(kept[k - 1] + (kept[k] - kept[k - 1]) * a / (a - b))
-            if b <= 0.0:
-                corners.append(kept[k])
-        kept = np.array(corners).reshape(-1, 2)
-    return kept
-
-
-def _view(path: Array, places: Array, limits: tuple[Limit, ...]) -> tuple[Array, Array]:
-    """The corners of what is shown: the path, its places, the goal, and walls that are near."""
-    points = np.vstack([path, places.reshape(-1, 2)])
-    size = float(np.ptp(points, axis=0).max()) or 1.0
-    low, high = points.min(axis=0) - size, points.max(axis=0) + size
-    wide = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-    shown = [points]
-    for limit in limits:
-        if limit.is_final:
-            goal = clipped(wide, limit.normals, limit.bounds[-1])
-            shown.append(goal[((goal > low) & (goal < high)).all(axis=1)])  # of a side that is free no corner counts
-            continue
-        for normal, bounds in zip(limit.normals, limit.bounds.T, strict=True):
-            gaps = (bounds.min() - path @ normal) / (normal @ normal)
-            nearest = int(np.abs(gaps).argmin())
-            if abs(gaps[nearest]) * np.linalg.norm(normal) <= NEAR * size:
-                shown.append((path[nearest] + gaps[nearest] * normal)[None])
-    points = np.vstack(shown)
-    low, high = points.min(axis=0), points.max(axis=0)
-    size = float((high - low).max()) or 1.0
-    missing = np.maximum(SLIM * size - (high - low), 0.0) / 2 + MARGIN * size
-    return low - missing, high + missing
 
 
 def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
@@ -152,21 +109,6 @@ def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, frame: Array, c
         here = np.stack([np.interp(limit.times, data.times, coordinate) for coordinate in path.T], axis=1)
         beside = here + ((bounds - here @ normal) / (normal @ normal))[:, None] * normal
         ax.plot(*beside.T, color=colour, linewidth=1.1, zorder=1.5)
-
-
-def _arcs(ax: Axes, data: FigureData, path: Array) -> None:
-    """The parts of the path on which the control acts, where there are others."""
-    size = np.abs(data.control)
-    acts = (size > IDLE * np.maximum(size.max(axis=1, initial=0.0), np.finfo(float).tiny)[:, None]).any(axis=0)
-    if acts.all() or not acts.any():
-        return
-    turns = np.diff(np.concatenate([[False], acts, [False]]).astype(int))
-    burns = zip(data.breakpoints[np.flatnonzero(turns > 0)], data.breakpoints[np.flatnonzero(turns < 0)], strict=True)
-    for number, (begin, end) in enumerate(burns):
-        times = np.unique(np.concatenate([[begin, end], data.times[(data.times > begin) & (data.times < end)]]))
-        arc = [np.interp(times, data.times, coordinate) for coordinate in path.T]
-        ax.plot(*arc, color=look.ORANGE, linewidth=4.0, zorder=3.5, solid_capstyle="round",
-                label="" if number else "the control acts")  # fmt: skip
 
 
 def _marks(ax: Axes, data: FigureData, path: Array) -> None:

@@ -13,8 +13,7 @@ import sparserob_core as sr
 from sparserob_core.control.studies.answer import supports
 from sparserob_core.experiment.figures.active import Active
 from sparserob_core.experiment.figures.drawing import CORNERS, figure_data
-from sparserob_core.experiment.figures.figure_data import Limit
-from sparserob_core.experiment.figures.plane_figure import clipped
+from sparserob_core.experiment.figures.plane import Limit, clipped
 from sparserob_core.experiment.figures.style import ORANGE
 from sparserob_core.experiment.run.drawing import switching
 

@@ -1,0 +1,93 @@
+"""Where a system moves in a plane: its places, what limits them, and how much of it is worth showing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+
+MARGIN = 0.08  # of the larger side of what is drawn, around it; ten times as much leaves no picture
+SLIM = 0.25  # of the larger side, the smaller one at least: of a tenth nothing is seen, at 1 all is a square
+SAME = 1e-12  # of coordinates, what is rounding: with 0 a goal that is a point is empty, 1e9 times as much is seen
+NEAR = 0.3  # of the larger side: a wall that is nearer to the path is within the view; of all walls one sees no path
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Limit:
+    """What a constraint that is called ``name`` says of the place alone: ``normals (r, 2) y <= bounds (k, r)`` at
+    ``times (k,)``, between which the bounds go in straight lines; of the final place (``is_final``) one time.
+    ``is_wall``: it holds all the time, and stands still."""
+
+    name: str
+    normals: Array
+    times: Array
+    bounds: Array
+    is_final: bool = False
+    is_wall: bool = False
+
+    @property
+    def moves(self) -> bool:
+        """Whether a bound changes."""
+        return bool((self.bounds != self.bounds[0]).any())
+
+    def allowed(self, frame: Array) -> Array:
+        """What of a convex polygon ``(k, 2)`` is within it, at its last time."""
+        return clipped(frame, self.normals, self.bounds[-1])
+
+    def beyond(self, frame: Array) -> list[Array]:
+        """What of a convex polygon ``(k, 2)`` is beyond each of its sides, at its last time."""
+        sides = zip(-self.normals, -self.bounds[-1], strict=True)
+        return [part for normal, bound in sides if len(part := clipped(frame, normal[None], bound[None]))]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plane:
+    """Where a system moves in a plane: the two ``states`` that are its place, drawn to the right and upwards; a polygon
+    ``places (T, q, 2)`` for every time, that contains wherever the worst case may bring it; and the ``limits``."""
+
+    states: tuple[int, int]
+    places: Array
+    limits: tuple[Limit, ...] = ()
+
+    def view(self, path: Array) -> tuple[Array, Array]:
+        """The lower and the upper corner of what is shown: a ``path (T, 2)``, its places, the goal, and walls that are
+        near."""
+        points = np.vstack([path, self.places.reshape(-1, 2)])
+        size = float(np.ptp(points, axis=0).max()) or 1.0
+        low, high = points.min(axis=0) - size, points.max(axis=0) + size
+        wide = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+        shown = [points]
+        for limit in self.limits:
+            if limit.is_final:
+                goal = clipped(wide, limit.normals, limit.bounds[-1])
+                shown.append(goal[((goal > low) & (goal < high)).all(axis=1)])  # no corner of a side that is free
+                continue
+            for normal, bounds in zip(limit.normals, limit.bounds.T, strict=True):
+                gaps = (bounds.min() - path @ normal) / (normal @ normal)
+                nearest = int(np.abs(gaps).argmin())
+                if abs(gaps[nearest]) * np.linalg.norm(normal) <= NEAR * size:
+                    shown.append((path[nearest] + gaps[nearest] * normal)[None])
+        points = np.vstack(shown)
+        low, high = points.min(axis=0), points.max(axis=0)
+        size = float((high - low).max()) or 1.0
+        missing = np.maximum(SLIM * size - (high - low), 0.0) / 2 + MARGIN * size
+        return low - missing, high + missing
+
+
+def clipped(polygon: Array, normals: Array, bounds: Array) -> Array:
+    """A convex polygon ``(k, 2)`` without what is beyond one of the lines ``normals (r, 2) x = bounds (r,)``
+    (Sutherland and Hodgman 1974)."""
+    kept = np.asarray(polygon, dtype=float)
+    for normal, bound in zip(normals, bounds, strict=True):
+        heights, corners = kept @ normal - bound, []
+        heights[np.abs(heights) <= SAME * (np.abs(kept) @ np.abs(normal))] = 0.0  # of a side that was cut before
+        for k in range(len(kept)):
+            a, b = heights[k - 1], heights[k]
+            if (a > 0.0) != (b > 0.0):
+                corners.append(kept[k - 1] + (kept[k] - kept[k - 1]) * a / (a - b))
+            if b <= 0.0:
+                corners.append(kept[k])
+        kept = np.array(corners).reshape(-1, 2)
+    return kept
