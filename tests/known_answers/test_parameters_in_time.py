@@ -523,3 +523,37 @@ def test_a_final_value_that_a_parameter_reaches_is_not_fixed(problem: Config, sa
     config["problem"].update(problem)
     with pytest.raises(sr.InputError, match=said):
         assemble(load_config(config))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_a_plant_whose_parameters_and_integrals_nothing_couples_is_certified_in_any_unit(
+    size: float, tmp_path: Path
+) -> None:
+    """The integral of the control and what a parameter adds stand beside states that are a million times smaller."""
+    costs = []
+    for s in (1.0, size):
+        system = {
+            "A": [[0, 1], ["-1 - 0.3 * sin(t)", -0.2]],
+            "B": [[0], [f"{s!r} * exp(-t / 20) * (1 + gain)"]],
+            "c": [0, f"{s!r} * drift * cos(t)"],
+            "parameters": {"gain": [-0.05, 0.05], "drift": [-0.02, 0.02]},
+        }
+        stated = {
+            "problem": {
+                "name": "linear",
+                "system": system,
+                "horizon": 8.0,
+                "initial_state": [s, 0],
+                "control": {"box": 1.0},
+                "path": [{"box": [1.3 * s, 3.0 * s]}],
+                "integral": [{"G": [[1]], "from": 0, "to": 4, "upper": 1.0, "lower": -3.0}],
+                "terminal": [{"box": [0.2 * s, 0.25 * s]}],
+            },
+            "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 12}},
+            "observers": [],
+        }
+        result = sr.run(stated, out=tmp_path / f"{s:g}", quiet=True, figures=False).result
+        assert result.status == "certified"
+        costs.append(result.upper_bound)
+    assert costs[1] == pytest.approx(costs[0], rel=1e-6)

@@ -308,7 +308,7 @@ class ClosedLoop:
         """What the transitions of a system that changes with time may be off by, on every piece, ``(L, d)``."""
         nodes, inputs = self.path(x)
         radii = np.concatenate([[1.0], self.spread.radii])
-        return motion.left_out(np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii))
+        return motion.left_out(np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii)[:, None])
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
         """A deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""

@@ -849,7 +849,8 @@ class VaryingExecution(Execution):
         channels that are ``asked (m, q)``."""
         m, units, columns = self.shares.size, self.motion.expansion.units, self.columns
         sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which])
-        lost = (np.abs(rows) @ units * kernel.error[which])[:, None] * kernel.sizes[which][:, columns]
+        lost = np.einsum("qd,qdm->qm", np.abs(rows) * units, kernel.sizes[which][..., columns])
+        lost = lost * kernel.error[which, None]
         lost = lost + rounding(rows.shape[1] + 2 * kernel.terms.shape[1] + HALVINGS) * sizes
         bounds = np.zeros((which.size, m, 2))
         for j, share in enumerate(self.shares):
@@ -909,7 +910,8 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     def neglected(self) -> Array:
         """What is off in the transitions, on every piece: ``(r, K)``."""
         motion = self.motion
-        total = motion.left_out(self._at_marks[:-1], motion.flow.sizes[:, self.execution.columns] * self._sizing)
+        pushed = motion.flow.sizes[..., self.execution.columns] * self._sizing[:, None]
+        total = motion.left_out(self._at_marks[:-1], pushed)
         return product(np.abs(self.rows), total.T)
 
     @cached_property

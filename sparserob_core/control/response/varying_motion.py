@@ -170,31 +170,33 @@ class VaryingMotion:
         """`Motion.along`."""
         inputs, path = np.abs(self.grid.inputs(control)), np.abs(self.nodes(control)[:-1, 0])
         m = inputs.shape[0]
-        left_out = self.left_out(path, self.flow.sizes[:, :m] * inputs.T)
+        left_out = self.left_out(path, self.flow.sizes[:, :, :m] * inputs.T[:, None])
         begun = path + self.grid.lengths[:, None] * np.einsum("kim,mk->ki", self.most[:, :, self._columns(m)], inputs)
         sizes = self.grown(self.every, self.grid.lengths, begun)
         return np.asarray(product(rows, left_out.T) + product(others, sizes.T))
 
     def left_out(self, sizes: Array, pushed: Array) -> Array:
         """What states that are at most ``sizes (K, d)`` at the beginning of every piece, and are driven by at most
-        ``pushed (K, ...)`` in the norm of the units, may be off by on it, entry by entry, ``(K, d)``: twice, since
-        both a chord and the state itself are looked at; and what that makes of the second and third derivative."""
-        lost, lengths, d = self._lost(sizes, pushed.sum(axis=1)), self.grid.lengths[:, None], self.states
+        ``pushed (K, d, ...)`` in the norm of the units of what is coupled with each, may be off by on it, entry by
+        entry, ``(K, d)``: twice, since both a chord and the state itself are looked at; and what that makes of the
+        second and third derivative."""
+        lost, lengths, d = self._lost(sizes, pushed.sum(axis=2)), self.grid.lengths[:, None], self.states
         second = np.einsum("kij,kj->ki", self.second[:, :, :d], lost)
         third = np.einsum("kij,kj->ki", self.third[:, :, :d], self.grown(self.every, lengths[:, 0], lost))
         return np.asarray((2.0 * lost + lengths**2 / 8 * (second + lengths * third)) * OUTWARD)
 
     def _lost(self, sizes: Array, pushed: Array) -> Array:
-        """Every step misses a share of what it begins with, and of what drives it; that is carried on by the
-        transitions from there, and within the piece."""
+        """Every step misses a share of what it begins with, and of what drives it, of states that are coupled with one
+        another; that is carried on by the transitions from there, and within the piece."""
         units, steps = self.expansion.units, self.flow.state
-        begun = (sizes / units).max(axis=1)
+        begun = self.expansion.over_parts((sizes / units)[:, :, None])[:, :, 0]
         ahead = (np.abs(steps) / units[:, None] * units).sum(axis=2).max(axis=1)
         rounded = rounding(self.states + self.inputs.shape[2])
-        here = self.flow.error * (begun + pushed) + rounded * (ahead + self.flow.error) * (begun + pushed)
-        before = np.concatenate([[TINY], np.cumsum(here)[:-1]])  # not 0, which times no bound is no number
-        carried = units * self._carries[:-1] * before[:, None]
-        return np.asarray((self.grown(self.every, self.grid.lengths, carried) + units * here[:, None]) * OUTWARD)
+        here = (self.flow.error + rounded * (ahead + self.flow.error))[:, None] * (begun + pushed)
+        none = np.full((1, units.size), TINY)  # not 0, which times no bound is no number
+        before = np.concatenate([none, np.cumsum(here, axis=0)[:-1]])
+        carried = units * self._carries[:-1] * before
+        return np.asarray((self.grown(self.every, self.grid.lengths, carried) + units * here) * OUTWARD)
 
     @cached_property
     def _carries(self) -> Array:
@@ -222,9 +224,10 @@ class VaryingMotion:
         for n in range(1, GROWN):
             term = np.einsum("kij,kj->ki", most, term) * (width / n)[:, None]
             total = total + term
-        rest = (term / units).max(axis=1) * (pace / GROWN) / np.maximum(1.0 - pace / (GROWN + 1), 0.1)
-        rest = np.where(pace < 0.8 * GROWN, rest, np.inf)
-        return np.asarray((total + units * rest[:, None]) * OUTWARD)
+        shares = (pace / GROWN) / np.maximum(1.0 - pace / (GROWN + 1), 0.1)
+        rest = self.expansion.over_parts((term / units)[:, :, None])[:, :, 0] * shares[:, None]
+        rest = np.where(pace[:, None] < 0.8 * GROWN, rest, np.inf)
+        return np.asarray((total + units * rest) * OUTWARD)
 
     def place(self, times: Array) -> np.ndarray:
         """The mark at or before each time."""
@@ -386,7 +389,8 @@ class VaryingSupport:
     def neglected(self) -> Array:
         """What is off in the transitions, and rounded in the sums over the blocks, on every piece: ``(r, K)``."""
         motion, sums = self.motion, self._sizes
-        pushed = motion.flow.sizes[:, -self.far.size :] * self.far if self.lasts else np.zeros((sums.shape[0] - 1, 1))
+        pushed = motion.flow.sizes[..., -self.far.size :] * self.far
+        pushed = pushed if self.lasts else np.zeros((sums.shape[0] - 1, 1, 1))
         total = motion.left_out(sums[:-1], pushed) + rounding(self.effect[0, 0].size) * self.reached
         return product(np.abs(self.rows), total.T)
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary, ref
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
@@ -44,7 +45,8 @@ class Flow(NamedTuple):
     ``control (k, d, m)`` and ``disturbance (k, d, mw)``.
 
     ``error (k,)``: bound of what they are off by, in the norm of largest row sums in the coordinates of
-    `Expansion.units`; of the columns of inputs times ``sizes (k, m + mw)``, what drives them at most.
+    `Expansion.units`; of the columns of inputs times ``sizes (k, d, m + mw)``, what drives the states that ``A``
+    couples with each one at most.
     """
 
     state: Array
@@ -58,8 +60,8 @@ class Kernel(NamedTuple):
     """What inputs at any time ``s`` on ``k`` intervals make of the state at the end: ``Phi(end, s) F(s)`` times the
     length, as polynomials of the share of the interval that is left at ``s``, ``terms (k, p + 1, d, m + mw)``.
 
-    ``error (k,)``: bound of what its columns are off by, in the norm of largest entries in the coordinates of
-    `Expansion.units`, times ``sizes (k, m + mw)``.
+    ``error (k,)``: bound of what its entries are off by in the coordinates of `Expansion.units`, times
+    ``sizes (k, d, m + mw)``.
     """
 
     terms: Array
@@ -69,7 +71,7 @@ class Kernel(NamedTuple):
 
 class Majorant(NamedTuple):
     """How far the series of a flow is summed, ``terms`` of it with ``degree`` of the system's; what it is off by then,
-    ``error (k,)``; what drives inputs, ``sizes (k, m + mw)``; and the factor by which states grow, ``growth (k,)``."""
+    ``error (k,)``; what drives states, ``sizes (k, d, m + mw)``; and by what factor they grow, ``growth (k,)``."""
 
     terms: int
     degree: int
@@ -174,7 +176,7 @@ class Expansion:
         d, (m, mw) = self.units.size, self.channels
         state = np.tile(np.eye(d), (starts.size, 1, 1))
         inputs, error = np.zeros((starts.size, d, m + mw)), np.zeros(starts.size)
-        sizes, grown = np.zeros((starts.size, m + mw)), np.ones(starts.size)
+        sizes, grown = np.zeros((starts.size, d, m + mw)), np.ones(starts.size)
         segments = self.segment_of(starts)
         active, at = np.flatnonzero(stops > starts), starts.copy()
         while active.size:
@@ -217,13 +219,13 @@ class Expansion:
         law, bulk = self._recentred(segments, stops, -length, length)
         A, F, scale = law[..., :d], law[..., d:], self.units / self.units[:, None]
         sizes, full = ((np.abs(one[..., :d]) * scale).sum(axis=3).max(axis=2) for one in (law, bulk))
-        pushes, fuller = ((np.abs(one[..., d:]) / self.units[:, None]).max(axis=2) for one in (law, bulk))
-        inputs = pushes.sum(axis=1)
-        most = np.where(inputs > 0.0, inputs, np.inf)
-        shares = (pushes / most[:, None]).max(axis=2, initial=0.0)
+        pushes, fuller = (self._driven(one[..., d:]) for one in (law, bulk))
         rest = self.remainder[segments] * length[:, None, None]
+        lost = self._driven(rest[..., d:])
+        inputs, most = _totals(pushes, lost)
+        shares = (pushes / most[:, None]).max(axis=(2, 3), initial=0.0)
         r = (rest[..., :d] * scale).sum(axis=2).max(axis=1)
-        lost = ((rest[..., d:] / self.units[:, None]).max(axis=1) / most).max(axis=1, initial=0.0)
+        lost = (lost / most).max(axis=(1, 2), initial=0.0)
         orders, terms, tail = np.arange(DEGREE + 1.0), TERMS, np.zeros(length.size)
         for terms in (*(one for one in FEWER if one < TERMS), TERMS):
             tail = np.full(length.size, np.inf)
@@ -239,7 +241,7 @@ class Expansion:
             found.append(sum((back[n - k] @ F[:, k] for k in range(1, last + 1)), back[n] @ F[:, 0]))
             back.append(sum((back[n - k] @ A[:, k] for k in range(1, last + 1)), back[n] @ A[:, 0]) / (n + 1))
         a, a_full = sizes.sum(axis=1), full.sum(axis=1)
-        forced = (fuller.sum(axis=1) / most).max(axis=1, initial=0.0)
+        forced = (fuller.sum(axis=1) / most).max(axis=(1, 2), initial=0.0)
         rounded = rounding((DEGREE + 1) * (d + 4)) * (2.0 + a_full) * np.exp(a_full) * forced
         error = tail + (r + lost * (1.0 + r)) * np.exp(a + r) + rounded
         return Kernel(np.stack(found, axis=1), error * (1.0 + 1e-9), inputs)
@@ -295,16 +297,15 @@ class Expansion:
         d = self.units.size
         scale = self.units / self.units[:, None]
         sizes = (np.abs(law[..., :d]) * scale).sum(axis=3).max(axis=2)
-        pushes = (np.abs(law[..., d:]) / self.units[:, None]).max(axis=2)
-        inputs = pushes.sum(axis=1)
-        most = np.where(inputs > 0.0, inputs, np.inf)
-        shares = (pushes / most[:, None]).max(axis=2, initial=0.0)
+        rest = self.remainder[segments] * length[:, None, None]
+        pushes, lost = self._driven(law[..., d:]), self._driven(rest[..., d:])
+        inputs, most = _totals(pushes, lost)
+        shares = (pushes / most[:, None]).max(axis=(2, 3), initial=0.0)
         seen = (np.maximum(sizes, shares) > IDLE * np.maximum(sizes.sum(axis=1), 1e-300)[:, None]).any(axis=0)
         degree = int(np.flatnonzero(seen).max(initial=0))
-        a, rest = sizes.sum(axis=1), self.remainder[segments] * length[:, None, None]
+        a = sizes.sum(axis=1)
         r = (rest[..., :d] * scale).sum(axis=2).max(axis=1) + sizes[:, degree + 1 :].sum(axis=1)
-        lost = (rest[..., d:] / self.units[:, None]).max(axis=1)
-        share = (lost / most).max(axis=1, initial=0.0) + shares[:, degree + 1 :].sum(axis=1)
+        share = (lost / most).max(axis=(1, 2), initial=0.0) + shares[:, degree + 1 :].sum(axis=1)
         orders = np.arange(1.0, DEGREE + 2)
         terms, tail = TERMS, np.zeros(length.size)
         for terms in (*(one for one in FEWER if one < TERMS), TERMS):
@@ -317,17 +318,49 @@ class Expansion:
             if (tail <= IDLE).all():
                 break
         fuller = (bulk[..., :d] * scale).sum(axis=(1, 3)).max(axis=1)
-        fuller += ((bulk[..., d:] / self.units[:, None]).max(axis=2).sum(axis=1) / most).max(axis=1, initial=0.0)
+        fuller += (self._driven(bulk[..., d:]).sum(axis=1) / most).max(axis=(1, 2), initial=0.0)
         growth = np.exp(a + r)
         rounded = rounding((degree + 1) * d + terms) * np.minimum(a, 1.0) + rounding(DEGREE) * fuller
         error = tail + (r + share) * growth + (rounded * (1.0 + a) + EPSILON) * growth
         return Majorant(terms, degree, error * (1.0 + 1e-9), inputs, growth * (1.0 + 1e-9))
 
     @cached_property
+    def together(self) -> list[np.ndarray]:
+        """The states of every part that ``A`` couples with nothing else: what is off in one is so in no other."""
+        d = self.units.size
+        return _coupled(np.abs(self.coefficients[..., :d]).max(axis=(0, 1)) + self.remainder[..., :d].max(axis=0))
+
+    def over_parts(self, entries: Array) -> Array:
+        """The largest of the ``entries (..., d, n)`` of states that belong together, for each of them."""
+        if len(self.together) == 1:
+            return np.broadcast_to(entries.max(axis=-2, keepdims=True), entries.shape)
+        found = np.empty(entries.shape)
+        for part in self.together:
+            found[..., part, :] = entries[..., part, :].max(axis=-2, keepdims=True)
+        return found
+
+    def _driven(self, entries: Array) -> Array:
+        """What ``entries (..., d, m + mw)`` of ``[B E]`` make of every part at most, in own units, state by state."""
+        return self.over_parts(np.abs(entries) / self.units[:, None])
+
+    @cached_property
     def slack(self) -> float:
         """The errors of the flows over all segments, one after another: how much of what is added up to a state at the
         end of the horizon is not resolved."""
         return float(self.flow(self.ends[:-1], self.ends[1:]).error.sum())
+
+
+def _coupled(A: Array) -> list[np.ndarray]:
+    """The numbers of the states that ``A (d, d)`` couples with one another, part by part."""
+    count, part = connected_components(A != 0.0, directed=False)
+    return [np.flatnonzero(part == k) for k in range(count)]
+
+
+def _totals(pushes: Array, lost: Array) -> tuple[Array, Array]:
+    """The sums over orders of ``pushes (k, p, d, n)``, and at least so much that what is ``lost (k, d, n)`` is a share
+    of `BLUNTEST` of it, also where they cancel; and what to divide by."""
+    inputs = np.maximum(pushes.sum(axis=1), lost / BLUNTEST)
+    return inputs, np.where(inputs > 0.0, inputs, np.inf)
 
 
 def _sharpness(coefficients: Array, rest: Array, units: Array, size: float) -> tuple[float, float]:
@@ -338,6 +371,9 @@ def _sharpness(coefficients: Array, rest: Array, units: Array, size: float) -> t
     here = float((largest[:, :d] * scale).sum(axis=1).max())
     off = float((rest[:, :d] * scale).sum(axis=1).max()) / max(here, size, np.finfo(float).tiny)
     most = np.where(rest[:, d:] > 0.0, largest[:, d:].max(axis=0), np.inf)
+    for part in _coupled(largest[:, :d] + rest[:, :d]):
+        mine = largest[part, d:].max(axis=0)
+        most[part] = np.where(mine > 0.0, np.minimum(most[part], mine), most[part])
     return max(off, float((rest[:, d:] / most).max(initial=0.0))), here
 
 

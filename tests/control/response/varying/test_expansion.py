@@ -18,6 +18,9 @@ from tests.support.integration import mathieu
 
 FADING = VaryingSystem.of([["-1/(1 + t)"]], [["t", 1]], 3.0, [["exp(-t)"]])
 TURNING = VaryingSystem.of([[0, "1 + t"], ["-(1 + t)", 0]], [[0], [1]], 4.0)
+BESIDE = VaryingSystem.of(
+    [["-1/(1 + t)", 0], [0, "0*t"]], [["t*2^-20", "2^-20"], [1, 1]], 3.0, E=[["2^-20*exp(-t)"], [1]]
+)
 SHARP = 1e-12  # the error of a flow that nothing was left out of
 STARTS, STOPS = np.array([0.0, 0.5, 1.9, 0.0, 2.0]), np.array([0.1, 1.75, 2.0, 3.0, 2.0])
 
@@ -28,7 +31,7 @@ def fading(starts: Array, stops: Array) -> Flow:
     control = np.stack([(right**3 - left**3) / 3 - (right**2 - left**2) / 2, (right**2 - left**2) / 2], axis=1)
     pushed = -np.exp(-stops) * (2 + stops) + np.exp(-starts) * (2 + starts)
     exact = (left / right)[:, None, None], control[:, None] / right[:, None, None], (pushed / right)[:, None, None]
-    return Flow(*exact, np.zeros_like(left), np.zeros_like(left))
+    return Flow(*exact, np.zeros_like(left), np.zeros((left.size, 1, 2)))
 
 
 def test_a_flow_is_the_closed_form() -> None:
@@ -71,7 +74,30 @@ def test_the_error_holds_what_is_left_out(name: str, value: int, monkeypatch: py
     driven = np.abs(np.concatenate([found.control - exact.control, found.disturbance - exact.disturbance], axis=2))[
         :, 0
     ]
-    assert (driven <= found.error[:, None] * found.sizes + 1e-15).all()
+    assert (driven <= found.error[:, None] * found.sizes[:, 0] + 1e-15).all()
+
+
+def test_what_nothing_couples_is_bounded_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error of a state is a share of what drives it, not of what drives one that is a million times larger."""
+    monkeypatch.setattr(varying, "TERMS", 6)
+    small, one, both = 2.0**-20, Expansion._made(FADING), Expansion._made(BESIDE)
+    assert [part.tolist() for part in both.together] == [[0], [1]]
+    alone, found, exact = one.flow(STARTS, STOPS), both.flow(STARTS, STOPS), fading(STARTS, STOPS)
+    sizes = found.sizes * both.units[:, None]
+    np.testing.assert_allclose(sizes[:, 0], small * alone.sizes[:, 0] * one.units, rtol=1e-12)
+    np.testing.assert_allclose(sizes[:, 1], np.tile((STOPS - STARTS)[:, None], 3), rtol=1e-12)
+    off = np.abs(found.control[:, 0] - small * exact.control[:, 0])
+    assert off.max() > 1e-7 * small, "nothing was left out"
+    assert (off <= found.error[:, None] * sizes[:, 0, :2] + 1e-15 * small).all()
+
+
+def test_a_remainder_of_what_drives_nothing_is_held_too() -> None:
+    """``sin(t) - sin(t)`` beside 1: no coefficient is left of it, only what they may be off by."""
+    expansion = Expansion._made(VaryingSystem.of([[0, 0], [0, 0]], [["sin(t) - sin(t)"], [1]], 2.0))
+    flow = expansion.flow(np.zeros(1), np.array([2.0]))
+    lost = float((expansion.remainder[:, 0, 2] * np.diff(expansion.ends)).sum())
+    assert 0.0 < lost <= flow.error[0] * flow.sizes[0, 0, 0] * expansion.units[0]
+    assert flow.error[0] <= 1e-9
 
 
 @pytest.mark.parametrize(
