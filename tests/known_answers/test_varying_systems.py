@@ -415,7 +415,7 @@ def test_random_analytic_coefficients_are_integrated_in_any_unit_of_time_and_len
     off[:, :d] *= u
     missed = np.abs(found - again) / u[:, None]  # by the integrator
     missed[:, :d] *= u
-    allowed = flow.error[0] * np.hstack([np.ones((d, d)), flow.sizes[0]])
+    allowed = flow.error[0] * np.hstack([np.ones((d, d)), flow.sizes[0, :, :1]])
     assert missed.max() <= 1e-14 * max(1.0, float((np.abs(again) / u[:, None]).max()))
     assert (off <= allowed + 2 * missed).all()
     Phi, Gamma, _ = VaryingFlow(system, horizon).over(0.0, horizon)
