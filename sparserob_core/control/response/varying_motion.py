@@ -389,8 +389,9 @@ class VaryingSupport:
     def neglected(self) -> Array:
         """What is off in the transitions, and rounded in the sums over the blocks, on every piece: ``(r, K)``."""
         motion, sums = self.motion, self._sizes
-        pushed = motion.flow.sizes[..., -self.far.size :] * self.far
-        pushed = pushed if self.lasts else np.zeros((sums.shape[0] - 1, 1, 1))
+        pushed = np.zeros((sums.shape[0] - 1, 1, 1))
+        if self.lasts:
+            pushed = motion.flow.sizes[..., -self.far.size :] * self.far
         total = motion.left_out(sums[:-1], pushed) + rounding(self.effect[0, 0].size) * self.reached
         return product(np.abs(self.rows), total.T)
 
