@@ -16,7 +16,6 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary, ref
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
@@ -352,6 +351,8 @@ class Expansion:
 
 def _coupled(A: Array) -> list[np.ndarray]:
     """The numbers of the states that ``A (d, d)`` couples with one another, part by part."""
+    from scipy.sparse.csgraph import connected_components
+
     count, part = connected_components(A != 0.0, directed=False)
     return [np.flatnonzero(part == k) for k in range(count)]
 
