@@ -91,6 +91,11 @@ class Explanation(ABC):
         """What it asks for, without remarks."""
         return self.text
 
+    @property
+    def alike(self) -> str:
+        """What it asks for, where other rows of its family ask for the same in another case; empty elsewhere."""
+        return ""
+
     def beyond(self, amount: float) -> str:
         """No decision enters the constraint, and it is violated by ``amount``."""
         return self.out_of_reach(amount, 0.0)

@@ -113,6 +113,10 @@ class TimedExplanation(Explanation):
     def short(self) -> str:
         return f"{self.statement}{self._at}"
 
+    @property
+    def alike(self) -> str:
+        return "" if self.names.corners is None else self.statement
+
     def from_any_state(self) -> TimedExplanation:
         """The same where the initial state is free: at time 0 without what the given one says."""
         return replace(self, text=self.statement) if self.time == 0.0 else self
@@ -145,7 +149,7 @@ class TimedExplanation(Explanation):
         allowed = self.sign * self.limit + share * other.sign * other.limit
         moved = self.sigma + share * other.sigma
         if rest.any():
-            return self._uncontrollable(other, rest, share, allowed, moved) + self._at
+            return self._uncontrollable(other, rest, share, allowed, moved)
         if moved > 0:
             more, less = told_apart(moved / 2 / self.scale, allowed / 2 / self.scale)
             verb = "move" if " and " in self.cause else "moves"
@@ -164,11 +168,23 @@ class TimedExplanation(Explanation):
         unit = measured_in(rest, self.names)
         taken = f" less {moved:.4g}{unit} for the worst {self.cause}s" if moved > 0 and side > 0 else ""
         taken = f" and {moved:.4g}{unit} more for the worst {self.cause}s" if moved > 0 and side < 0 else taken
-        quantity = combination(side * rest, self.names, f"({self.time:.6g})")
+        stated, corner = _stated(rest, self.names)
+        quantity, at = combination(side * stated, self.names, f"({self.time:.6g})"), self._at
+        asking = f"{self.statement} and {other.statement} ask"
+        if self.names.corners is not None and corner is None:  # the two are about different corners
+            first, second = sorted([self._share(side), other._share(side * share)], key=lambda one: one[0] == "-")
+            single = second[0] == "-" and not any(joint in second for joint in (" + ", " - "))
+            quantity, at = f"{first} less {second[1:]}" if single else f"{first} plus {second}", ""
+            asking = f"{self.short()}, and {other.short()}, ask"
         return (
             f"the control cannot move {quantity}, which is {side * free:.6g}{unit}, "
-            f"but {self.statement} and {other.statement} ask for {most} {side * allowed:.6g}{unit}{taken}"
+            f"but {asking} for {most} {side * allowed:.6g}{unit}{taken}{at}"
         )
+
+    def _share(self, share: float) -> str:
+        """So much of the quantity that is bounded, in words, with the parameters that it is about."""
+        told = share / self.scale * _stated(self.direction, self.names)[0]
+        return combination(told, self.names, f"({self.time:.6g})") + (f" at {self.where}" if self.where else "")
 
     def out_of_reach(self, amount: float, needed: float) -> str:
         if not self.quantity:
@@ -221,7 +237,8 @@ def explanation(
     direction, system = H[row], functionals.response.system
     gain = None if mixed is None else mixed[0][row]
     normal = direction if gain is None else np.concatenate([direction, gain])
-    sign = -1.0 if np.count_nonzero(normal) == 1 and normal.sum() < 0 else 1.0
+    stated, corner = _stated(normal, functionals.names)
+    sign = -1.0 if np.count_nonzero(stated) == 1 and stated.sum() < 0 else 1.0
     parts = functionals.parts(time, direction, parameter)
     sigma = parts.sigma
     free, limit = sign * parts.free + 0.0, sign * float(h[row]) + 0.0  # no negative zeros
@@ -232,8 +249,8 @@ def explanation(
     ]
     cause = " and ".join(names) or "disturbance"
     quantity, where = (
-        combination(sign * normal / scale, functionals.names, f"({time:.6g})", direction.size),
-        system.describe(parameter) if parameter.size else "",
+        combination(sign * stated / scale, functionals.names, f"({time:.6g})", direction.size),
+        system.describe(parameter) if parameter.size else corner or "",
     )
     unit = measured_in(normal, functionals.names, direction.size)
     remarks = [f"the initial state gives {free / scale:.6g}{unit}"] if time <= 0 else []
@@ -258,7 +275,7 @@ def explanation(
         cause,
         quantity=quantity,
         bound=_bound(
-            combination(sign * normal / scale, functionals.names, states=direction.size),
+            combination(sign * stated / scale, functionals.names, states=direction.size),
             limit / scale,
             None if opposite is None else opposite / scale,
             sign,
@@ -274,6 +291,13 @@ def explanation(
         gain=gain,
         piece=None if mixed is None else mixed[1],
     )
+
+
+def _stated(normal: Array, names: Names) -> tuple[Array, str | None]:
+    """A normal on the states that were stated, and the corner of the parameters beside the time that it is about;
+    itself, and ``None``, where it is about several at once."""
+    corner = None if names.corners is None else names.corners.at(normal)
+    return (normal, None) if names.corners is None or corner is None else (names.corners.without(normal), corner)
 
 
 def combination(direction: Array, names: Names, suffix: str = "", states: int | None = None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -12,8 +12,38 @@ import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
 
 KINDS = {"states": "x", "controls": "u", "disturbances": "w"}
+ROUNDING = 1e-12  # of the largest entry of a direction: products that are added up in another order differ by less
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """The corners of the parameters beside the time, one row of the larger problem each (`at_corners`), with the
+    ``values (k, nu)`` of the parameters called ``names``."""
+
+    rows: list[Array]
+    values: Array
+    names: Sequence[str]
+
+    def without(self, direction: Array) -> Array:
+        """A direction without what the parameters add to the states."""
+        d, size = self.rows[0].shape
+        return np.concatenate([direction[:d], np.zeros(size - d), direction[size:]])
+
+    def at(self, direction: Array) -> str | None:
+        """The parameters whose corner a direction is about, such as ``gain = 0.1``; empty where it is about all,
+        ``None`` where it is about none alone."""
+        d, size = self.rows[0].shape
+        added, far = np.array([direction[:d] @ one[:, d:] for one in self.rows]), np.abs(direction).max()
+        mine = np.abs(added - direction[d:size]).max(axis=1, initial=0.0) <= ROUNDING * far
+        if not mine.any():
+            return None
+        values = self.values[mine]
+        same = (values == values[:1]).all(axis=0) & (self.values != values[:1]).any(axis=0)
+        return ", ".join(f"{name} = {v:.6g}" for name, v, told in zip(self.names, values[0], same, strict=True) if told)
 
 
 @final
@@ -24,8 +54,9 @@ class Names:
     ``states``, ``controls``, ``disturbances``: one name each, or nothing: then they are ``x1``, ``u1``, ``w1`` and
     so on; ``state_units``, ``control_units``, ``disturbance_units``: one unit each, such as ``m/s`` (empty:
     none is known), and ``time`` the unit of time. ``plane``: the two states that are a place, first the one that is
-    drawn to the right, then the one upwards, for a figure of where the system moves. Raises `InputError` for a name
-    that is empty or occurs twice, and for a plane that is none.
+    drawn to the right, then the one upwards, for a figure of where the system moves. ``corners``: of a problem that
+    parameters beside the time made larger, by which its rows are told as those of the stated one. Raises `InputError`
+    for a name that is empty or occurs twice, and for a plane that is none.
     """
 
     states: Sequence[str] = ()
@@ -36,6 +67,7 @@ class Names:
     disturbance_units: Sequence[str] = ()
     time: str = ""
     plane: Sequence[str] = ()
+    corners: Corners | None = field(default=None, repr=False, compare=False)
 
     __repr__ = noun
 

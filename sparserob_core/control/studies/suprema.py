@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import Literal, TypeAlias, final
 
 import numpy as np
@@ -13,7 +13,7 @@ from sparserob_core.brief import brief
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.response.functional import WorstCase
@@ -21,7 +21,6 @@ from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal
-from sparserob_core.control.transcription.terms.superposed import at_corners
 from sparserob_core.control.transcription.transcribe import prepare, windows_of
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import sealed
@@ -71,10 +70,10 @@ class Row:
         """What the quantity is of the row."""
         return 1.0 if self.sense == "sup" else -1.0
 
-    def quantity(self, problem: OptimalControlProblem, corners: Corners | None = None) -> str:
+    def quantity(self, problem: OptimalControlProblem) -> str:
         """The row in words, with the sign that its sense says, of the states that were stated: what parameters beside
         the time add is told by `Corners.at`."""
-        d, names = problem.system.states, problem.names
+        d, names, corners = problem.system.states, problem.names, problem.names.corners
         used = np.flatnonzero(self.direction if corners is None else corners.without(self.direction)).tolist()
         if len(used) > TERMS:
             return f"a combination of {len(used)} states"
@@ -90,47 +89,6 @@ class Row:
     def unit(self, problem: OptimalControlProblem) -> str:
         """The unit of the row, empty where none is known."""
         return measured_in(self.direction, problem.names, problem.system.states).strip()
-
-
-ROUNDING = 1e-12  # of the largest entry of a direction: products that are added up in another order differ by less
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Corners:
-    """The corners of the parameters beside the time, one row of the larger problem each (`at_corners`), with the
-    ``values (k, nu)`` of the parameters called ``names``."""
-
-    rows: list[Array]
-    values: Array
-    names: Sequence[str]
-
-    @staticmethod
-    def of(problem: OptimalControlProblem) -> Corners | None:
-        """Those of a problem as it is stated; ``None`` where it has no parameters beside the time."""
-        system, rows = problem.system, at_corners(problem)
-        if rows is None or not isinstance(system, VaryingSystem) or system.parameters is None:
-            return None
-        box, reached = system.parameters, system.dependence.reached
-        ends = [
-            sorted({low, high}) if any(one) else [low]
-            for low, high, one in zip(box.lower.tolist(), box.upper.tolist(), reached, strict=True)
-        ]
-        return Corners(rows, np.array(list(product(*ends))), system.names)
-
-    def without(self, direction: Array) -> Array:
-        """A direction without what the parameters add to the states."""
-        d, size = self.rows[0].shape
-        return np.concatenate([direction[:d], np.zeros(size - d), direction[size:]])
-
-    def at(self, direction: Array) -> str:
-        """The parameters whose corner a direction is about, such as ``gain = 0.1``; empty where it is about all."""
-        d, size = self.rows[0].shape
-        added, far = np.array([direction[:d] @ one[:, d:] for one in self.rows]), np.abs(direction).max()
-        mine = np.abs(added - direction[d:size]).max(axis=1, initial=0.0) <= ROUNDING * far
-        values = self.values[mine]
-        same = (values == values[:1]).all(axis=0) & (self.values != values[:1]).any(axis=0)
-        return ", ".join(f"{name} = {v:.6g}" for name, v, told in zip(self.names, values[0], same, strict=True) if told)
 
 
 def rows_of(problem: OptimalControlProblem) -> list[Row]:
@@ -409,14 +367,13 @@ def bound_rows(
     told: Told,
     notify: Notify = ignore,
     deadline: Deadline | None = None,
-    corners: Corners | None = None,
 ) -> list[BoundedRow]:
     """`bound_row` of all `rows_of` a problem; ``told`` what is bounded next, its number, and of how many."""
-    rows, found = rows_of(problem), []
+    rows, found, corners = rows_of(problem), [], problem.names.corners
     for i, row in enumerate(rows):
         at = "" if corners is None else corners.at(row.direction)
         told(
-            f"{row.constraint}: {row.sense} of {row.quantity(problem, corners)}" + (f" at {at}" if at else ""),
+            f"{row.constraint}: {row.sense} of {row.quantity(problem)}" + (f" at {at}" if at else ""),
             i,
             len(rows),
         )

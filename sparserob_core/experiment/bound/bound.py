@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.control.policies.policy import answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.studies.suprema import Corners, bound_rows
+from sparserob_core.control.studies.suprema import bound_rows
 from sparserob_core.control.transcription.terms.accumulated import accumulated
 from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import build, dictionaries_of, name_of, problem_of
@@ -69,7 +69,7 @@ def bound(
             "config: expected a control problem, whose rows have worst cases, got a semi-infinite program of another"
             " kind"
         )
-    dictionaries, corners = dictionaries_of(loaded, problem.horizon), Corners.of(problem)
+    dictionaries = dictionaries_of(loaded, problem.horizon)
     problem, shape = accumulated(problem), (problem.system.controls, dictionaries[0].functions)
     if given is not None:
         _require_fitting(given, shape, loaded, _answers(loaded, problem, dictionaries[0]))
@@ -85,10 +85,10 @@ def bound(
     def found() -> Bound:
         theta = np.zeros(shape) if given is None else given
         try:
-            every = bound_rows(problem, dictionaries, theta, float(tolerance), told, notify, deadline, corners)
+            every = bound_rows(problem, dictionaries, theta, float(tolerance), told, notify, deadline)
         except InputError as error:
             raise loaded.located(("problem",), error) from error
-        rows = tuple(worst_case(problem, one, corners) for one in every)
+        rows = tuple(worst_case(problem, one) for one in every)
         return Bound(
             loaded.config.title or name_of(loaded),
             "undecided" if any(row.reason for row in rows) else "certified",

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.brief import brief
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.studies.suprema import BoundedRow, Corners, Sense
+from sparserob_core.control.studies.suprema import BoundedRow, Sense
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array
@@ -75,9 +75,9 @@ class WorstCase:
         return self.upper if self.sense == "sup" else self.lower
 
 
-def worst_case(problem: OptimalControlProblem, found: BoundedRow, corners: Corners | None = None) -> WorstCase:
+def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
     """A bounded row in the user's terms: of a row that bounds a quantity from below, its infimum."""
-    row, sign = found.row, found.row.sign
+    row, sign, corners = found.row, found.row.sign, problem.names.corners
     sides = [sign * found.lower, sign * found.upper]
     bands = [sign * found.low, sign * found.high]
     if row.sense == "inf":
@@ -85,7 +85,7 @@ def worst_case(problem: OptimalControlProblem, found: BoundedRow, corners: Corne
     wall = sign * row.wall if np.isfinite(row.wall) else None
     return WorstCase(
         constraint=row.constraint,
-        quantity=row.quantity(problem, corners),
+        quantity=row.quantity(problem),
         unit=row.unit(problem),
         sense=row.sense,
         lower=sides[0],
@@ -105,7 +105,7 @@ def worst_case(problem: OptimalControlProblem, found: BoundedRow, corners: Corne
         edges=found.edges,
         low=bands[0],
         high=bands[1],
-        corner="" if corners is None else corners.at(row.direction),
+        corner="" if corners is None else corners.at(row.direction) or "",
         stated=None if corners is None else corners.without(row.direction),
     )
 

@@ -45,7 +45,7 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
         "gap": result.gap if result.status in PROVEN else None,
         "cost_scale": result.cost_scale,
         "stopped": result.stopped,
-        "worst": _witness(result.worst),
+        "worst": _witness(result.worst, None if model is None else model.stated.system.states),
         **({"units": units} if units else {}),
         **({"parameters": list(parameters)} if parameters else {}),
         "tolerances": {proof.family: _tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
@@ -86,7 +86,7 @@ def units_of(model: Transcription, result: Result) -> dict[str, Any]:
     effort = model.problem.cost_unit
     return {
         "time": names.time,
-        "states": list(names.state_units),
+        "states": list(names.state_units)[: model.stated.system.states],
         "cost": effort if result.sparsest is None else names.time,
         "J": effort,
         "rows": rows,
@@ -104,14 +104,15 @@ def _tolerance(proof: Proof) -> dict[str, Any]:
     }
 
 
-def _witness(worst: WorstConstraint | None) -> dict[str, Any]:
+def _witness(worst: WorstConstraint | None, states: int | None) -> dict[str, Any]:
+    """The worst constraint; an initial state has so many ``states`` as were stated, which are the first ones."""
     return {
         "violation": None if worst is None else worst.violation,
         "constraint": None if worst is None else worst.constraint,
         "time": worst.time if isinstance(worst, Witness) else None,
         "parameter": worst.parameter if isinstance(worst, Witness) else None,
         **(
-            {"initial_state": worst.initial_state}
+            {"initial_state": worst.initial_state[:states]}
             if isinstance(worst, Witness) and worst.initial_state is not None
             else {}
         ),

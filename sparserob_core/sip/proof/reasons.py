@@ -14,7 +14,7 @@ from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.duality import dual_bound
 from sparserob_core.sip.inner.vertex import simplex
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.program import ConstraintFamily, Explanation, SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import Rows
 
 Kind: TypeAlias = Literal["beyond every decision", "nothing between", "out of reach"]
@@ -28,25 +28,30 @@ DENSE = 200  # rows judged one by one where the image is not the decision itself
 @dataclass(frozen=True, eq=False)
 class Reason:
     """Rows that nothing satisfies, with multipliers ``(r,)`` that prove it, and the sentence that says so. ``amount``:
-    the sum's violation."""
+    the sum's violation; ``about``: the same for all reasons of which the worst says enough."""
 
     kind: Kind
     rows: Rows
     multipliers: Array
     amount: float
     text: str
+    about: tuple[str, ...]
 
 
 def reasons(program: SemiInfiniteProgram) -> list[Reason]:
     """What is impossible at the corners and centres of every family's cells, at most one reason for every row of a
-    family."""
+    family, and of rows that ask for the same in several cases the worst."""
     found = [
         reason
         for family in program.families
         if family.uncertain is None
         for reason in _of_family(program.finite, family.reduced or family)
     ]
-    return list({reason.text: reason for reason in reversed(found)}.values())[::-1]  # none is told twice
+    worst: dict[tuple[str, ...], Reason] = {}
+    for reason in found:  # none is told twice
+        if reason.about not in worst or reason.amount > worst[reason.about].amount:
+            worst[reason.about] = reason
+    return list(worst.values())
 
 
 def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason]:
@@ -149,14 +154,19 @@ def _reason(
     )
     rows = Rows(G[at, which], h[at, which], cuts)
     amount = float(-multipliers @ rows.h) if amount is None else amount
-    return Reason(kind, rows, multipliers, amount, sentence(kind, family, rows, multipliers, amount))
+    text, alike = sentence(kind, family, rows, multipliers, amount), [_told(family, cut).alike for cut in cuts]
+    return Reason(kind, rows, multipliers, amount, text, (kind, *alike) if all(alike) else (text,))
+
+
+def _told(family: ConstraintFamily, cut: Cut) -> Explanation:
+    return family.explanation(cut.index, cut.row)
 
 
 def sentence(kind: Kind, family: ConstraintFamily, rows: Rows, multipliers: Array, amount: float) -> str:
     """The reason for people, as far as the family can tell it: in the user's units."""
     units = [family.row_unit(cut.row) for cut in rows.cuts]
     amount = amount * units[0]
-    told = [family.explanation(cut.index, cut.row) for cut in rows.cuts]
+    told = [_told(family, cut) for cut in rows.cuts]
     if kind == "beyond every decision":
         return told[0].beyond(amount)
     if kind == "nothing between":

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.studies.suprema import Corners, rows_of
+from sparserob_core.control.studies.suprema import rows_of
 from sparserob_core.control.transcription.terms.accumulated import accumulated
 from sparserob_core.experiment.bound.record import bound_rows_told, columns_told
 from tests.support.places import matrices, needs_plants
@@ -201,9 +201,10 @@ def test_rows_at_corners_of_parameters_beside_the_time_are_told_as_one_quantity(
         control=sr.Box([-1], [1]),
         terminal=[sr.Polytope([[1.0, 0.0], [1.0, 1.0]], [5.0, 5.0])],
     )
-    corners, larger = Corners.of(stated), accumulated(stated)
+    larger = accumulated(stated)
+    corners = larger.names.corners
     assert corners is not None
-    told = [(row.quantity(larger, corners), corners.at(row.direction)) for row in rows_of(larger)]
+    told = [(row.quantity(larger), corners.at(row.direction)) for row in rows_of(larger)]
     assert told == [
         ("x1", "q = -0.5"),
         ("x1 + x2", "p = 0, q = -0.5"),

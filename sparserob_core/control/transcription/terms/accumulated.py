@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.control.problem.disturbances import legs, of_legs
-from sparserob_core.control.problem.names import Names, measured_in
+from sparserob_core.control.problem.names import Corners, Names, measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, System
 from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
@@ -81,8 +81,7 @@ def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: st
     assert stop is not None
     end = min(stop + delay, problem.horizon) if G.any() else stop
     found = []
-    for row, (h, g) in enumerate(zip(H, G, strict=True)):
-        called = name if len(H) == 1 else f"{name} {row + 1}"
+    for called, h, g in zip(_called(name, H, G, problem.names.corners), H, G, strict=True):
         unit = _unit(measured_in(np.append(h, g), problem.names, h.size).strip(), problem.names.time)
         if delay == 0.0 or not g.any():
             found.append([Running(h, g, start, stop, called, unit)])
@@ -91,6 +90,22 @@ def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: st
         early = Running(h, np.zeros_like(g), start, stop, f"{called} of states", unit)
         found.append([early, replace(late, name=f"{called} of controls")] if h.any() else [late])
     return found, end
+
+
+def _called(name: str, H: Array, G: Array, corners: Corners | None) -> list[str]:
+    """What the rows of an integral are called: by their numbers where there are several, and by the parameters beside
+    the time at whose corner they are; by their numbers alone where that does not tell them apart."""
+    numbered = [name] if len(H) == 1 else [f"{name} {row + 1}" for row in range(len(H))]
+    if corners is None:
+        return numbered
+    rows = np.hstack([np.array([corners.without(h) for h in H]), G])
+    _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(np.argsort(first))[which.ravel()].tolist()
+    told = [
+        (name if first.size == 1 else f"{name} {number + 1}") + (f" at {at}" if (at := corners.at(h)) else "")
+        for number, h in zip(order, H, strict=True)
+    ]
+    return told if len(set(told)) == len(told) else numbered
 
 
 def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -> ConvexSet:

@@ -9,7 +9,7 @@ from itertools import product as every_choice
 import numpy as np
 
 from sparserob_core.control.enclosures.dependence import PARTS, Dependence, Superposed
-from sparserob_core.control.problem.names import Names
+from sparserob_core.control.problem.names import Corners, Names
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import TIME, LinearSystem, VaryingSystem
 from sparserob_core.control.problem.terms.windows import everywhere
@@ -46,7 +46,7 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
             for one in ([cylinder(end, depends.states)] if isinstance(end, Equality) else everywhere(end, rows))
         ],
         integral=[entry.everywhere(rows) for entry in problem.integral],
-        names=_names(problem.names, system, depends),
+        names=replace(_names(problem.names, system, depends), corners=corners_of(problem)),
     )
 
 
@@ -57,6 +57,19 @@ def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return None
     return [system.dependence.rows(corner) for corner in _corners(system.dependence)]
+
+
+def corners_of(problem: OptimalControlProblem) -> Corners | None:
+    """The corners of a problem as it is stated; ``None`` where it has no parameters beside the time."""
+    system, rows = problem.system, at_corners(problem)
+    if rows is None or not isinstance(system, VaryingSystem) or system.parameters is None:
+        return None
+    box, reached = system.parameters, system.dependence.reached
+    ends = [
+        sorted({low, high}) if any(one) else [low]
+        for low, high, one in zip(box.lower.tolist(), box.upper.tolist(), reached, strict=True)
+    ]
+    return Corners(rows, np.array(list(every_choice(*ends))), system.names)
 
 
 def _corners(depends: Dependence) -> list[Array]:
