@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -17,21 +16,6 @@ from sparserob_core.sip.convex_set import Array
 # share of entries below which products with a matrix are those of its entries: they take some ten times as long each
 SPARSE = 0.1
 LAST = 1e-17  # relative size of the first term of the series that is left out: less than its rounding
-# Numbers of the vectors that go through the series at once (0.4 MB), so that a term of it stays near the processor.
-NEAR = 50_000
-# States up to which the series is a table of matrices, one product for all rows. Without it a move of an annealing walk
-# (two states, a row) takes twice as long; matrices of more states are dearer than the series on the row.
-FEW_STATES, TERMS = 8, 20  # and the terms of it: 1 / 20! is below 1e-18
-
-
-class Exponentials(Protocol):
-    """``e^{A r}`` and ``int_0^r e^{A s} ds`` of one matrix ``A (d, d)``, over any durations ``r``."""
-
-    def rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
-        """Both of ``rows (k, d)`` over ``durations (k,)``, ``(k, d)`` each."""
-
-    def transitions(self, durations: Array) -> tuple[Array, Array]:
-        """Both as matrices, for durations ``(k,)``: ``(k, d, d)`` each."""
 
 
 def products(A: Array):  # type: ignore[no-untyped-def]  # an array, or one of scipy's sparse arrays
@@ -70,15 +54,6 @@ class Leaps:
     def _products(self):  # type: ignore[no-untyped-def]
         return products(self.A)
 
-    @cached_property
-    def _table(self) -> Array:
-        """Coefficients ``(TERMS, 2 d^2)`` of ``e^{A r}`` and ``int_0^r e^{A s} ds / r`` in powers of the share of the
-        short time that ``r`` is."""
-        terms = [np.eye(self.A.shape[0])]
-        for order in range(1, TERMS):
-            terms.append(terms[-1] @ (self.A * self.step) / order)
-        return np.array([[term, term / (order + 1)] for order, term in enumerate(terms)]).reshape(TERMS, -1)
-
     def over(self, count: int) -> list[tuple[Array, Array]]:
         """Transitions and their integrals over 1, 2, 4, ... short times, ``count`` of them."""
         while len(self._doubled) < count:
@@ -90,17 +65,7 @@ class Leaps:
     def rows(
         self, rows: Float[Array, "k d"], durations: Float[Array, " k"]
     ) -> tuple[Float[Array, "k d"], Float[Array, "k d"]]:
-        """`Exponentials.rows`."""
-        count = max(1, NEAR // rows.shape[1])
-        if len(rows) <= count:
-            return self._rows(rows, durations)
-        found = np.empty((2, *rows.shape))
-        for start in range(0, len(rows), count):
-            part = slice(start, start + count)
-            found[0, part], found[1, part] = self._rows(rows[part], durations[part])
-        return found[0], found[1]
-
-    def _rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
+        """Both of ``rows (k, d)`` over ``durations (k,)``."""
         durations = np.maximum(durations, 0.0)  # differences of times may be less by rounding
         whole = np.floor(durations / self.step).astype(int)
         rest = (durations - whole * self.step)[:, None]
@@ -110,25 +75,13 @@ class Leaps:
             if far.size:
                 driven[far] += flown[far] @ integral
                 flown[far] = flown[far] @ flow
-        if self.A.shape[0] <= FEW_STATES:
-            both = ((rest / self.step) ** np.arange(TERMS) @ self._table).reshape(-1, 2, *self.A.shape)
-            moved = (flown[:, None, None] @ both)[:, :, 0]
-            return moved[:, 0], driven + moved[:, 1] * rest
         order, left = 1, 1.0
-        size = float(rest.max(initial=0.0)) / self.step  # |A r| is at most this
         term, driven = flown, driven + rest * flown
-        while left > LAST and size:
+        while left > LAST and rest.any():
             term = np.asarray(term @ self._products) * (rest / order)
             flown, driven = flown + term, driven + term * (rest / (order + 1))
-            left, order = left * size / order, order + 1
+            left, order = left / order, order + 1
         return flown, driven
-
-    @shaped
-    def transitions(self, durations: Float[Array, " k"]) -> tuple[Float[Array, "k d d"], Float[Array, "k d d"]]:
-        """`Exponentials.transitions`, of the rows of the identity: few of them at once are in the making."""
-        d = self.A.shape[0]
-        found = self.rows(np.tile(np.eye(d), (durations.size, 1)), np.repeat(durations, d))
-        return found[0].reshape(-1, d, d), found[1].reshape(-1, d, d)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response.response import Outputs, Propagator, Response, merge_grids
+from sparserob_core.control.response.response import Outputs, Response, merge_grids
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import random_system, uniform, worst_case
 
@@ -62,8 +62,10 @@ def test_rows_by_baby_and_giant_steps_are_the_closed_form(kind, pieces, horizon)
     value, size = exact(system, V, rates, grid, times, directions)
     # what one unit of rounding in a rate, a time or a squaring does: growth is bounded by that of the exponentials
     allowed = 1e-13 * (10.0 + np.abs(rates).max()) * size.max(axis=(1, 2), keepdims=True)
-    found = Response(system, grid, np.zeros(4)).weights(times, directions, np.zeros((times.size, 0)))
-    assert (np.abs(np.concatenate([found.control, found.disturbance], axis=2) - value) <= allowed).all()
+    for most in (0, 10**9):
+        with patch(f"{HOME}.KERNEL", most):
+            found = Response(system, grid, np.zeros(4)).weights(times, directions, np.zeros((times.size, 0)))
+        assert (np.abs(np.concatenate([found.control, found.disturbance], axis=2) - value) <= allowed).all()
 
 
 @settings(max_examples=30, deadline=None)
@@ -75,9 +77,9 @@ def test_rows_by_baby_and_giant_steps_are_those_of_the_plain_recursion(seed, pie
     response = Response(LinearSystem(fast * A / np.linalg.norm(A, 2), B, E), grid, np.zeros(states))
     times = np.concatenate([[0.0, 2.0], rng.choice(ends, 5), rng.uniform(0, 2, 13)])
     given = times, rng.normal(size=(20, states)), np.zeros((20, 0))
-    found = response.weights(*given)
-    with patch.object(Propagator, "aged", lambda *_: False):
+    with patch(f"{HOME}.FEW", 0), patch(f"{HOME}.KERNEL", 0):
         free, gains, B, E = response.adjoint(*given)
+        found = response.weights(*given)
     for one, other in zip(found, (free, gains @ B, gains @ E), strict=True):
         # backward stable: in units of how large the exponential of the norms is, not of what cancels
         scale = np.abs(other).reshape(20, -1).max(axis=1, initial=1e-30)
@@ -156,7 +158,7 @@ def test_rows_of_many_instants_are_those_of_each_alone(together):
     response = Response(system, merge_grids(ends, ends), np.zeros(4))
     times = np.full(9, 1.7) if together else rng.uniform(0, 3.0, 9)
     directions, none = rng.normal(size=(9, 4)), np.zeros((9, 0))
-    with patch("sparserob_core.control.enclosures.flows.NEAR", 8):  # two rows of the series at once
+    with patch(f"{HOME}.AT_ONCE", 8):  # two rows of the series at once
         found = response.weights(times, directions, none)
     for i in range(9):
         alone = response.weights(times[[i]], directions[[i]], none[[i]])
