@@ -11,7 +11,7 @@ import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing
 from sparserob_rerun.drawing.palette import Floats
-from sparserob_rerun.physics.pages import pages
+from sparserob_rerun.physics.pages import drawn, pages
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -73,7 +73,7 @@ class Physics:
             draw_feedback(rr, self.stream, data)
             send_effort(rr, self.stream, data)
         at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
-        channels, states = len(data.control), len(data.state)
+        channels = len(data.control)
         names = [data.names.control(channel) for channel in range(channels)]
         colours = [ink.legible(SHADES[channel % len(SHADES)]) for channel in range(channels)]
         self.stream.log(
@@ -84,7 +84,7 @@ class Physics:
         rows = rr.Scalars.columns(scalars=data.control.T.ravel()).partition([channels] * data.control.shape[1])
         self.stream.send_columns("signals/control", at, rows)
         at = [rr.TimeColumn("t", duration=data.times)]
-        for state in range(states):
+        for state in drawn(self.problem):
             name, colour = data.names.state(state), ink.legible(SHADES[state % len(SHADES)])
             pale = (*colour[:3], 110)
             self.stream.log(
