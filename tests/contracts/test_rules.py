@@ -236,6 +236,7 @@ FAULTS = [
 ]
 
 
+@pytest.mark.first(31)
 @pytest.mark.parametrize(("contract", "kind", "name", "call", "test"), FAULTS)
 def test_the_contract_catches_a_rule_that_is_wrong_on_purpose(contract, kind, name, call, test):
     fails(contract, rule(kind, name, call), test)

@@ -117,6 +117,7 @@ class Broken(Distorted):
 LIARS = (Optimist, Pessimist, Inflated, Numberless, Misshapen, Broken)
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("stride", [4, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("liar", LIARS)
 def test_a_solver_that_lies_is_never_believed(liar, stride):
@@ -283,7 +284,7 @@ def test_the_contract_catches_a_solver_that_is_bad_on_purpose(flawed, test):
     fails(SolverContract, flawed, test)
 
 
-@pytest.mark.first(3)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("flawed", [Optimist, Pessimist, Inflated, NoDuals, Diagonal])
 def test_behind_the_check_too_a_bad_solver_fails_on_programs_that_need_a_solver(flawed):
     """Separable programs are put right by the check itself, and say nothing of a solver."""

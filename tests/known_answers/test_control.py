@@ -160,6 +160,7 @@ def robust_double_integrator(pieces):
     )
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("pieces", [50, 100])
 def test_the_robust_double_integrator_costs_exactly_eight_fifths(run, pieces, solver):
@@ -330,6 +331,7 @@ def test_the_breakpoints_alone_are_not_enough():
     assert lower - 1e-9 <= 0.1757928 <= upper + 1e-9
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_the_experiments_as_printed_are_infeasible(run, number):
     outcome = run(CONFIGS / f"experiment{number}_printed.yaml")

@@ -63,7 +63,7 @@ def certified(outcome: Any) -> float:
     return float(outcome.result.cost)
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("cost", "value"), [(EVERYTHING, 0.983009), (TRACKING, 1.234490)])
 @pytest.mark.parametrize("solver", ["piqp", "clarabel", pytest.param("proxqp", marks=pytest.mark.slow)])
 def test_known_costs_are_reached_with_every_solver(cost, value, solver, tmp_path):

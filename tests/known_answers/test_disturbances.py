@@ -32,7 +32,7 @@ def ran(place, *given, **more):
     return sr.run(config(*given, **more), out=place, quiet=True, figures=False)
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("kind", "policy"),
     [
@@ -135,6 +135,7 @@ def test_every_piece_of_a_system_has_the_columns_of_all():
     assert sr.solve(problem, control=FOUR).cost == pytest.approx(0.6 + 0.1 * (1 + 2) + 0.1 * (3 + 2), rel=1e-6)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(("start", "stop"), [(0.5, 1.5), (0.25, 1.6), (0.0, 1.0), (1.9, None), (1.0, 2.0)])
 def test_in_a_window_a_disturbance_pushes_as_long_as_it_acts(start, stop, tmp_path):
     """``0.6 + 2 * 0.05 + 0.1 * 2 * (stop - start)``, wherever the ends lie among the pieces of the dictionaries."""

@@ -273,7 +273,7 @@ VARIANTS = {
 }  # fmt: skip
 
 
-@pytest.mark.first(5)
+@pytest.mark.first(2)
 @pytest.mark.parametrize("variant", [*VARIANTS, "literal", "sparsest", "execution", "haar"])
 def test_a_disturbance_on_long_pieces_beside_one_that_does_nothing_is_one_on_a_dictionary_of_long_pieces(
     variant, tmp_path

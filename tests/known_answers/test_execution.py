@@ -127,7 +127,7 @@ def test_more_than_can_be_made_up_for_is_proven_to_be_infeasible(tmp_path: Path)
     assert found.status == "verified" and "infeasibility" in {claim.name for claim in found.claims}
 
 
-@pytest.mark.first(3)
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "change",
     [

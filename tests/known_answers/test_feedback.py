@@ -69,7 +69,7 @@ def proven(outcome: sr.Outcome) -> None:
     assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("problem", "pieces", "cost", "value"),
     [
@@ -198,7 +198,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", VARIANTS)
 @pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 def test_grids_and_memory_keep_every_guarantee(name: str, cost: str, tmp_path: Path) -> None:
@@ -214,7 +214,7 @@ SETS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name == "an ellipsoid" else ()) for name in SETS]
 )

@@ -248,7 +248,7 @@ REFUTED: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", REFUTED)
 def test_a_witness_drives_the_loop_out_of_what_stands_beside_the_state(name: str, tmp_path: Path) -> None:
     """What one round leaves violated is named with a disturbance that the checker drives the loop by."""

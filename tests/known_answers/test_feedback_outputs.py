@@ -138,7 +138,7 @@ def test_a_loop_that_is_stepped_by_hand_keeps_every_wall_and_meets_its_worst_cas
     assert (most > 0.1).any()  # the walls are not far from what happens
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
 def test_no_causal_policy_is_cheaper_than_what_its_signals_prove(cost: str, tmp_path: Path) -> None:
     quick = run(SHORT, POSITION, tmp_path / "quick", cost=cost, causal_signals=20)
@@ -370,6 +370,7 @@ def test_outputs_go_with_everything_that_states_go_with(name: str, cost: str, tm
     assert found.uncovered == 0 and all(largest <= most for largest, most in found.constraints.values())
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("unit", [1e-6, 1e3])
 def test_other_units_change_nothing(unit: float, tmp_path: Path) -> None:
     """Lengths in other units, of outputs too."""

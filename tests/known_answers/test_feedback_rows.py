@@ -105,7 +105,7 @@ STATES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("disturbed", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name == "an ellipsoid" else ()) for name in STATES]

@@ -77,6 +77,7 @@ def test_channels_count_by_their_weights_and_ranges(tmp_path: Path) -> None:
     assert interval["upper"] == pytest.approx((1 * 0.9 + 3 * 0.9) / (2 * 4), abs=1e-12)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("control", [{"norm": {"p": 1, "radius": 1.0}}, {"norm": {"p": 2, "radius": 1.0}}])
 def test_a_set_of_controls_counts_by_the_range_of_each_channel(control: dict[str, Any], tmp_path: Path) -> None:
     _, interval = solved(integrator([1.0, -0.55], control), 20, tmp_path / "run")

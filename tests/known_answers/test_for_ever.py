@@ -79,6 +79,7 @@ def test_a_budget_is_one_of_every_period(tmp_path, most, status) -> None:
     assert set(_verdicts(tmp_path / "run").values()) == {"holds"}
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("step", "status"), [(0.51, "certified"), (0.49, "infeasible")])
 def test_steps_across_the_seam_hold_for_all_first_and_all_last_controls(tmp_path, step, status) -> None:
     """Of one piece the last control is the first one, but of another initial state: ``2 |M| <= step``."""

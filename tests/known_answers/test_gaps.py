@@ -160,6 +160,7 @@ def test_squares_that_need_not_be_anything_cost_exactly_nothing(policy, cost, tm
     assert [claim.verdict for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"] == []
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("spare", "status"), [(0.0, "verified"), (1e-6, "certified"), (1e-9, None)])
 def test_squares_that_cancel_are_certified_where_what_is_left_is_no_rounding(spare, status, tmp_path):
     """Along ``u_1 = 7/3 u_2`` the cost ``R`` is 0 but for rounding, and the control has to go there: -7e-19 was written

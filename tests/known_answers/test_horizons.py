@@ -116,6 +116,7 @@ def test_the_shortest_horizon_at_an_uncertain_rate() -> None:
     assert_between(margin({**RATE, "system": system}, tolerance=1e-4), 2.0 * math.log(4.0 / 2.5), 2e-3)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("change", [1.8, 1.0])
 def test_beyond_a_change_of_the_system_horizons_are_looked_at_one_by_one(change: float) -> None:
     """x' = u until the change, x' = u / 2 afterwards: 1.5 to go, from the change on at half the speed."""

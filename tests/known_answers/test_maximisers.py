@@ -162,7 +162,7 @@ EXPECTED = {
 }
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name == "deb5" else ()) for name in EXPECTED]
 )

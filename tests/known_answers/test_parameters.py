@@ -39,7 +39,7 @@ def test_the_oscillator_with_a_worst_parameter_inside_its_interval_is_proven():
     assert np.isclose((upper - lower)[:, 1].sum(), 0.2, rtol=1e-12)
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("share", [0.99, 0.9, 0.0])
 def test_less_control_than_the_worst_parameter_needs_is_refuted_inside_the_interval(share):
     program = sr.transcribe(oscillator(), control=dictionary(100))

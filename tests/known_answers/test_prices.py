@@ -40,6 +40,7 @@ def solved(directory: Path, problem: dict[str, Any], pieces: int = 4, **more: An
     return outcome
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(
     ("weights", "cost"),
     [

@@ -157,12 +157,14 @@ def powers(degree):
     return lambda t: t ** np.arange(degree)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("n", [2, 3, 8, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 5, 6, 7))])
 def test_the_monic_polynomial_of_least_deviation_is_the_one_of_chebyshev(n, solver):
     assert_solved(best_approximation(lambda t: t**n, powers(n)), solver, 2.0 ** (1 - n))
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize(("a", "degree"), [(1.5, 2), (2.0, 4), (3.0, 3)])
 def test_best_approximation_of_a_simple_pole(a, degree, solver):
@@ -203,7 +205,7 @@ def ellipse_tangents(half_axes):
     return family("tangents", [0.0], [2 * np.pi], rows)
 
 
-@pytest.mark.first(6)
+@pytest.mark.first(3)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("half_axes", [(1.0, 1.0), (2.0, 0.5), (0.3, 3.0)])
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (-0.6, 0.8), (1.3, 2.1)])
@@ -263,6 +265,7 @@ def test_the_smallest_disc_around_an_arc(half_angle, squared_radius, solver):
     assert_solved(program, solver, squared_radius)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("radius", [0.1, 0.5, 0.9])
 def test_a_linear_program_with_an_uncertain_row_in_a_disc(radius, solver):
@@ -377,7 +380,7 @@ ANSWERED = {
 }
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ANSWERED)
 def test_any_convex_program_is_answered(name):
     program, truth = ANSWERED[name]
@@ -453,7 +456,7 @@ def test_a_failure_says_once_what_is_wrong_and_what_to_do():
     assert len(parts) == len(set(parts)) <= 3
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("seed", range(12))
 def test_programs_in_numbers_up_to_1e12_have_the_answer_of_a_linear_program_on_a_grid(seed):
     """Variables, rows and prices each in a unit of their own; what lies between the indices of a fine grid is below

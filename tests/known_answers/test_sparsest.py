@@ -23,6 +23,7 @@ def result_of(where: Path) -> dict[str, Any]:
     return dict(json.loads((where / "result.json").read_text()))
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("pieces", "fewest"), [(50, 7), (100, 13)])
 def test_the_mixed_integer_answers_of_the_spring_are_reached_and_proven(
     pieces: int, fewest: int, tmp_path: Path
@@ -46,6 +47,7 @@ def test_letters_are_taken_exactly(tmp_path: Path) -> None:
     assert outcome.status == "certified"
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("start", [0.35, 0.62, 1.0, 1.4])
 def test_branch_and_bound_agrees_with_every_choice_of_pieces(start: float, tmp_path: Path) -> None:
     """Pieces of unequal length, where the convex bound is not attained: all 16 choices."""

@@ -169,7 +169,7 @@ def test_under_a_limit_what_little_would_pay_for_is_proven_at_once(
     assert near + 1 < len(result.history)
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("wall", "uncertain", "feedback", "method", "looks"),
     [

@@ -67,7 +67,7 @@ def test_the_estimated_constant_is_the_next_on_the_grid_above_the_steepest_slope
         assert power == pytest.approx(round(power), abs=1e-9)
 
 
-@pytest.mark.first(10)
+@pytest.mark.first(5)
 @pytest.mark.parametrize("seed", range(20))
 def test_with_the_right_constant_lipo_is_never_worse_than_its_own_uniform_candidates(seed, monkeypatch):
     """Every evaluation draws a uniform candidate first: with these alone, the search would be pure random search."""
@@ -150,6 +150,7 @@ def test_adalipo_does_not_depend_on_the_units_of_the_coordinates():
     np.testing.assert_allclose((scaled.trace.points - lower) / sides, plain.trace.points, atol=1e-6)
 
 
+@pytest.mark.first(7)
 @pytest.mark.parametrize("maximiser", [AdaLipo(), Lipo(constant=1e-12), Lipo(constant=1e12)])
 @pytest.mark.parametrize(
     "function",

@@ -43,6 +43,7 @@ def cusp(points):
     return -np.sqrt(np.abs(points - 0.4)).sum(axis=1)
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("function", [ridge, step, cusp])
 @pytest.mark.parametrize(("count", "dimension"), [(5, 1), (50, 2), (200, 3), (300, 1)])
 def test_no_evaluated_value_lies_above_the_bound(function, count, dimension):
@@ -119,6 +120,7 @@ def test_no_point_is_evaluated_twice():
     assert len(np.unique(report.trace.points, axis=0)) == 150
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("dimension", [31, 120])
 def test_in_high_dimension_it_still_climbs_by_changing_few_coordinates(dimension):
     def hill(x):

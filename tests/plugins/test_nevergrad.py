@@ -83,6 +83,7 @@ def recording(heard, refuses):
     return Recording
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ["TwoPointsDE", "OnePlusOne", "CMA", "PSO", "Cobyla"])
 def test_an_optimiser_by_name_climbs_and_spends_the_budget_exactly(name):
     report = search(budget=200, optimiser=name)

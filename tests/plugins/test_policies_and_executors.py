@@ -163,6 +163,7 @@ def ran(place, policy, plugin):
     return sr.run(config, out=place, quiet=True, figures=False)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
 def test_a_policy_of_somebody_else_that_answers_the_last_measurement_is_solved_proven_and_checked(
     tmp_path, plugin, cost

@@ -84,6 +84,7 @@ class TestEverySolverOfQpsolvers(SolverContract):
         return solver(self.name)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", sorted({"daqp", "highs", "osqp"} & set(ALL)))
 def test_whole_problems_are_certified_by_them(name):
     problem = sr.OptimalControlProblem(

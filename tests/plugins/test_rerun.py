@@ -150,6 +150,7 @@ def test_rounds_have_the_bounds_of_the_history_on_all_three_timelines(exchanged:
     assert np.isnan(values[0, 1])
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("kind", ["searched", "exchanged"])
 def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.FixtureRequest) -> None:
     outcome = request.getfixturevalue(kind)

@@ -36,6 +36,7 @@ SMALL = {
 }
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("config", ["experiment1_literal.yaml", "experiment1_reduced.yaml"])
 def test_every_evaluated_tuple_says_which_indices_have_the_largest_multipliers(config: str) -> None:
     from sparserob_rerun.recording.outlet import joined

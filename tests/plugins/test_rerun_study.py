@@ -95,6 +95,7 @@ def test_of_points_with_equal_configs_all_are_told_of_at_once(config: Path, tmp_
             assert list(event.places) == [place for place, value in enumerate(values) if value == mine]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("kind", [sr.SweepStarted, sr.PointProgress, sr.SweepProgress, sr.SweepFinished])
 def test_an_observer_that_fails_is_told_of_once_and_the_study_goes_on(
     kind: type[sr.Event], config: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture

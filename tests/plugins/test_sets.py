@@ -132,6 +132,7 @@ SOLID = changed(
 )
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("config", [SLANTED, SOLID], ids=["plane", "space"])
 def test_every_claim_about_slanted_zonotopes_is_checked(config, tmp_path):
     pytest.importorskip("flint")

@@ -79,6 +79,7 @@ def test_capabilities_are_declared():
     assert not Piqp.conic
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("package", ["piqp", "proxsuite", "clarabel"])
 def test_a_solver_is_imported_only_when_it_solves(package):
     adapters = "sparserob_piqp, sparserob_proxqp, sparserob_clarabel, sparserob_core.sip.inner.solve"

@@ -83,6 +83,8 @@ SLOW = {  # every status, formulation and kind of uncertainty has a lighter conf
     "prisma_transfer",
     "simbol_x_transfer",
     "breakpoints",
+    "narrowing_corridor",
+    "output_feedback",
     "experiment1_literal",
     "rendezvous",
     "heated_house",
@@ -185,6 +187,7 @@ def test_every_maximiser_takes_part_in_every_experiment_and_none_claims_too_much
     assert not wrong
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", sorted(name for name, (status, *_) in EXPECTED.items() if status == "infeasible"))
 def test_an_infeasible_config_says_which_constraint_is_at_fault_and_when(name: str, tmp_path: Path) -> None:
     message = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run", figures=False).result.message

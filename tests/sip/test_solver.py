@@ -79,6 +79,7 @@ WAYS = {
 }
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize("way", WAYS)
 def test_a_solver_that_is_named_answers_every_program(way):
     options = {"control": {"name": "piecewise_constant", "pieces": 10}, **WAYS[way]}
@@ -93,6 +94,7 @@ def test_a_solver_that_is_named_answers_every_program(way):
     assert sum(auto.solved_by.values()) == auto.counts["relaxed_programs"]
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("policy", ["open_loop", "affine"])
 @pytest.mark.parametrize(
     ("changed", "words"), [(refused, "ArithmeticError: not today"), (given_up, "no memory"), (impossible, "INFEASIBLE")]

@@ -403,6 +403,7 @@ def test_a_disturbance_that_changes_within_its_own_piece_is_told() -> None:
 POLYTOPE = {"polytope": {"H": [[1, 1], [-1, 0], [0, -1]], "h": [0.06, 0.05, 0.05]}}
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("disturbance", [{"box": [0.05, 0.05]}, {"norm": {"p": 1.5, "radius": 0.05}}, POLYTOPE])
 @pytest.mark.parametrize("policy", [pytest.param("affine", marks=pytest.mark.slow), "open_loop"])
 def test_with_a_limit_nothing_is_written_down_and_nothing_hopeless_begun_in_a_step(

@@ -40,7 +40,7 @@ VARIANTS = {
 }
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", VARIANTS)
 def test_it_proves_and_finds_what_the_exchange_does(name) -> None:
     own, units = spring(**VARIANTS[name])

@@ -90,6 +90,7 @@ def test_violation_is_the_largest_excess_over_unit_normals(seed: int, d: int) ->
         assert member.contains(member.interior_point(), 1e-9)
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("p", [1.2, 2.0, 3.0, 7.0])
 @pytest.mark.parametrize("radius", [0.0, 0.5])
 def test_a_ball_contains_what_violates_it_by_no_more_than_the_tolerance(p: float, radius: float) -> None:

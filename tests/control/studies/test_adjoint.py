@@ -55,6 +55,7 @@ def truth(row: WorstRow, kind: str, t: float) -> float:
     return total
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("kind", ["none", "constant", "measurable"])
 def test_values_are_those_of_transitions_and_quadrature(kind: str) -> None:
     row = worst(kind)

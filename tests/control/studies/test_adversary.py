@@ -80,7 +80,7 @@ HEAVY = [
 ]
 
 
-@pytest.mark.first(9)
+@pytest.mark.first(4)
 @pytest.mark.parametrize(
     ("name", "parameters"),
     [

@@ -131,6 +131,7 @@ def test_the_tree_of_a_scalar_problem_proves_what_dynamic_programming_finds(
     assert bound.lower <= result.cost + 1e-9
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize(("K", "L"), [(3, 1), (2, 4), (4, 2), (3, 2)])
 @pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
 def test_the_tree_proves_no_more_than_all_signals_do_on_any_two_grids(K: int, L: int, cost: str) -> None:
@@ -195,6 +196,7 @@ def test_a_signal_outside_of_its_set_proves_nothing() -> None:
     assert proven(result.model, problem, replace(bound, signals=tuple(wide))) is None
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
 def test_the_units_of_the_control_change_nothing(cost: str) -> None:
     plain, unit = scalar(0.2, 0.7, 0.9), 1e12

@@ -55,7 +55,7 @@ def truth(of: sr.OptimalControlProblem, rows: list[Multiplier], T: float, low: f
     return total - float(of.control.support(-slopes).sum())
 
 
-@pytest.mark.first(3)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("kind", ["known", "disturbed", "uncertain", "drift", "begun", "round", "measurable"])
 def test_what_is_proven_of_an_interval_holds_at_every_horizon_in_it(kind):
     rng = np.random.default_rng(len(kind))

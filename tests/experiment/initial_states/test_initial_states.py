@@ -74,6 +74,7 @@ def problems() -> list[sr.OptimalControlProblem]:
     ]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("number", range(4), ids=["flat", "measurable", "curved", "uncertain"])
 def test_a_plane_shares_its_work_and_agrees_with_the_problem_transcribed_afresh(number: int) -> None:
     problem, control = problems()[number], uniform(8, 2.0)

@@ -110,6 +110,7 @@ def status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., 
     return run
 
 
+@pytest.mark.first(18)
 @pytest.mark.parametrize(("kind", "body", "words"), MISBEHAVIOURS)
 def test_a_component_that_misbehaves_is_named_and_ends_with_status_5(kind, body, words, status, tmp_path) -> None:
     code, said = status(plugin(kind, body), CHOSEN[kind])

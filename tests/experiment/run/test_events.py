@@ -73,6 +73,7 @@ def same(first: sr.Outcome, second: sr.Outcome) -> bool:
     )
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("method", METHODS)
 def test_a_run_begins_and_ends_once_and_everything_is_in_between(
     method: str, watched: Callable[..., sr.Outcome]
@@ -88,7 +89,7 @@ def test_a_run_begins_and_ends_once_and_everything_is_in_between(
     assert len(listener.heard) >= 3
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("method", METHODS)
 def test_the_run_is_the_same_with_and_without_observers(method: str, watched: Callable[..., sr.Outcome]) -> None:
     listener = Listener()
@@ -216,6 +217,7 @@ def test_an_observer_that_fails_to_close_is_named_too(
     assert [record.getMessage() for record in caplog.records] == ["observer 'Listener' is detached: OSError: disk full"]
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_interrupt_ends_the_run_and_everybody_hears_of_it(
     kind: type[sr.Event], watched: Callable[..., sr.Outcome]
@@ -389,6 +391,7 @@ def test_maximisers_tell_how_they_stand_in_their_own_terms(maximiser: str, names
     assert all(np.isfinite(value) for value in heard[-1].notes.values())
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("method", ["exchange", "sparserob", "scenario"])
 def test_rounds_and_searches_are_read_back_as_they_were(method: str, watched: Callable[..., sr.Outcome]) -> None:
     listener = Listener()

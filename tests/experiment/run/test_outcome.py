@@ -162,6 +162,7 @@ def test_a_result_that_is_not_saved_leaves_nothing_behind() -> None:
     assert not directory.parent.exists()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("given", [{}, {"formulation": "literal"}, {"policy": sr.AffinePolicy(cost="peak")}])
 def test_the_result_of_a_program_that_was_transcribed_is_a_run_too(given: dict[str, Any], tmp_path: Path) -> None:
     pieces = sr.Dictionary.indicators(np.linspace(0.0, 2.0, 5))

@@ -336,6 +336,7 @@ def test_of_equal_configs_any_number_names_one_run(counting: Path, tmp_path: Pat
     assert names == {row["run"] for row in same.table}
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "other", [{"method.number": [1, 2, 3]}, {"method.number": [2, 1]}, {"method.number": [1, 2], "seed": [4]}]
 )
@@ -563,6 +564,7 @@ def test_a_directory_that_holds_something_else_is_left_alone(counting: Path, tmp
         sr.sweep(tmp_path / "full")
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -583,6 +585,7 @@ def test_a_broken_study_file_is_one_clear_error(
     assert len(finished(tmp_path / "out")) == 2
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(
     ("text", "said"),
     [

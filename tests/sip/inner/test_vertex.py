@@ -32,6 +32,7 @@ def program(rng: np.random.Generator, number: int) -> FiniteProgram:
     )
 
 
+@pytest.mark.first(12)
 @pytest.mark.parametrize("number", range(24))
 def test_few_entries_give_the_same_optimum_as_all_of_them(number: int) -> None:
     rng = np.random.default_rng(number)

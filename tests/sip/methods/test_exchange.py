@@ -389,6 +389,7 @@ def test_a_parameter_that_cannot_be_enclosed_ends_undecided(options):
     assert "branch" in result.message
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("weight", [2.0, 4.0])
 def test_the_regularised_problem_is_solved_where_the_exact_one_is_not_asked_for(options, weight):
     """``|x1| + 2 |x2| + weight/2 |x|^2`` with ``x1 + x2 >= t`` on [0, 1]: equal slopes ``1 + weight x1`` and

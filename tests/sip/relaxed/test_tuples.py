@@ -56,6 +56,7 @@ def moved(g, point, rng, blocks):
     return point.ravel()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("formulation", ["reduced", "literal"])
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000), epsilon=st.sampled_from([1.0, 0.1, 1e-3]))
@@ -187,6 +188,7 @@ def test_without_what_does_not_act_the_value_is_the_same_and_without_what_does_i
         assert value(program, tools, idle.size).at(slots[idle].ravel()) < at - 1e-6
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("formulation", ["reduced", "literal"])
 def test_the_gradient_is_that_of_central_differences(tools, formulation):
     rng, program, checked = np.random.default_rng(5), oscillator(formulation, 6), 0

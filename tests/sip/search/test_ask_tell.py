@@ -49,6 +49,7 @@ def no_thread_is_left():
     assert not [one for one in alive if one.is_alive()]
 
 
+@pytest.mark.first(10)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("k", [None, 1, 3])
 def test_it_asks_what_the_same_search_asks_of_a_function(name, k):
@@ -68,6 +69,7 @@ def test_whole_batches_are_asked_where_a_maximiser_has_them():
     assert by_hand(search, k=8) == [8] * 12 + [4]
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", NAMES)
 def test_it_goes_on_from_its_state_as_if_it_had_never_stopped(name):
     arguments = {"box": BOX, "name": name, "budget": 50, "seed": 2, "polish": 0.2}
@@ -171,7 +173,7 @@ def test_a_single_point_is_told_with_a_number():
         assert (search.best_value, search.best_point.tolist()) == (2.5, point.tolist())
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["simulated_annealing", "maxlipo", "direct", "random_search"])
 def test_workers_are_given_different_points_and_the_search_stays_the_same(name):
     alone = sr.ask_tell(BOX, name, budget=30, seed=5)

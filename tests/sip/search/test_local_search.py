@@ -62,7 +62,7 @@ def polished(function, box, found=200, budget=200, seed=0, gradient=None, block=
     return objective.report("")
 
 
-@pytest.mark.first(3)
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("function", "box", "regret"),
     [

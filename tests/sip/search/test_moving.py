@@ -72,6 +72,7 @@ def test_events_tell_of_all_coordinates():
     assert {event.block for event in events} == {3}
 
 
+@pytest.mark.first(11)
 @pytest.mark.parametrize("name", sr.load_registry().names("maximiser"))
 @pytest.mark.parametrize("polish", [0.0, 0.4])
 def test_a_coordinate_with_a_single_value_changes_no_search(name, polish):

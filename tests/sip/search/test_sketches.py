@@ -36,6 +36,7 @@ def _every_step_is_told(monkeypatch):
     monkeypatch.setattr("sparserob_core.sip.search.notifier.SECONDS_BETWEEN_EVENTS", -1.0)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("name", "role", "options"),
     [

@@ -44,6 +44,7 @@ def climb(function, dimension, steps, seed=0, first=10):
     return points, values
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize(
     ("function", "dimension", "steps", "regret"),
     [
