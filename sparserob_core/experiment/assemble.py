@@ -38,6 +38,20 @@ class Experiment(ABC):
     def program(self) -> SemiInfiniteProgram:
         """The semi-infinite program."""
 
+    @abstractmethod
+    def of_control(self, expected: str) -> ControlExperiment:
+        """Itself, of a control problem; raises `InputError` that says what was ``expected`` where it is none."""
+
+    @property
+    def model(self) -> Transcription | None:
+        """What became of a control problem; ``None`` for a program that is none."""
+        return None
+
+    @property
+    def problem(self) -> OptimalControlProblem | None:
+        """The control problem; ``None`` for a program that is none."""
+        return None
+
     @property
     def gap_tolerance(self) -> float | None:
         """The relative gap that the config's method is to close; ``None`` for a method that has no such option."""
@@ -60,9 +74,15 @@ class ControlExperiment(Experiment):
     def program(self) -> SemiInfiniteProgram:
         return self.transcription.program
 
+    def of_control(self, expected: str) -> ControlExperiment:
+        return self
+
+    @property
+    def model(self) -> Transcription:
+        return self.transcription
+
     @property
     def problem(self) -> OptimalControlProblem:
-        """The control problem."""
         return self.transcription.problem
 
     @property
@@ -86,6 +106,9 @@ class PlainExperiment(Experiment):
     @property
     def program(self) -> SemiInfiniteProgram:
         return self.stated
+
+    def of_control(self, expected: str) -> ControlExperiment:
+        raise InputError(f"{expected}, got a semi-infinite program of another kind")
 
 
 def assemble(loaded: Loaded, deadline: Deadline | None = None) -> Experiment:

@@ -12,7 +12,7 @@ from sparserob_core.control.studies.adversary import Adversary, find_adversaries
 from sparserob_core.control.studies.simulate import delivered, fine_times, finer, walk, worst_errors
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment
+from sparserob_core.experiment.assemble import Experiment
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
 from sparserob_core.sip.convex_set import Array
 
@@ -42,11 +42,8 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
     ``state_times (T,)`` is what they do to the state. Nothing, ``{}``, for a program that is no control problem, or has
     no state constraint.
     """
-    if not isinstance(experiment, ControlExperiment):
-        return {}
-    model, theta = experiment.transcription, np.asarray(decision, dtype=float).ravel()
-    kept = find_adversaries(model, theta)
-    if not kept:
+    model, theta = experiment.model, np.asarray(decision, dtype=float).ravel()
+    if model is None or not (kept := find_adversaries(model, theta)):
         return {}
     arrays = _stacked(kept, model)
     times, states = propagated(model, theta, arrays)

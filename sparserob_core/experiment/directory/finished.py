@@ -271,7 +271,7 @@ def read_finished(
 ) -> FinishedRun:
     """Read a run directory and build its experiment again, unless ``experiment`` is at hand; raises `InputError` when
     it is none, holds no control, or a file of it cannot be understood. ``plugins`` as in `read_config`."""
-    from sparserob_core.experiment.assemble import ControlExperiment, assemble
+    from sparserob_core.experiment.assemble import assemble
 
     stored = stored_run(directory)
     summary, solution = stored.summary, stored.solution
@@ -279,11 +279,9 @@ def read_finished(
         raise InputError(
             f"{directory}: there is no control in it; the status is '{summary['status']}': {summary['message']}"
         )
-    experiment = experiment or assemble(stored.config(plugins))
-    if not isinstance(experiment, ControlExperiment):
-        raise InputError(
-            f"{directory}: expected the run of a control problem, got one of another semi-infinite program"
-        )
+    experiment = (experiment or assemble(stored.config(plugins))).of_control(
+        f"{directory}: expected the run of a control problem"
+    )
     theta, shape = solution["theta"], (experiment.problem.system.controls, experiment.control.functions)
     if theta.shape != shape or theta.dtype.kind != "f" or not np.isfinite(theta).all():
         raise InputError(

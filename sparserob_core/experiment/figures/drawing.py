@@ -19,7 +19,6 @@ from sparserob_core.control.studies.adversary import find_adversaries
 from sparserob_core.control.studies.answer import Tube, supports, tube
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.terms.superposed import at_corners
-from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.experiment.figures.active import Active
@@ -89,9 +88,9 @@ def figure_data(
     """What figures of a decision (``theta (m, N)``, or whole) show, of all ``states`` or of those that are named; under
     feedback also what so many random disturbances and the worst one make of the control. The title says so where a
     ``status`` claims no proof. Raises `InputError` when the program is no control problem."""
-    if not isinstance(experiment, ControlExperiment):
-        raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
-    data = _data(experiment, theta, active, history, cost, draws, states)
+    data = _data(
+        experiment.of_control("figures: expected a control problem"), theta, active, history, cost, draws, states
+    )
     unproven = f"{data.title}: {status}, not proven" if status not in ("", "certified", "verified") else data.title
     return replace(data, title=unproven)
 
@@ -146,14 +145,15 @@ def _data(
 def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     """The states that figures show of a system of very many, whose tubes would take longer than the control: of all of
     them the reach is told at a few times. ``None``: all."""
-    if not isinstance(experiment, ControlExperiment) or experiment.problem.system.states <= MOST_STATES:
+    model = experiment.model
+    if model is None or model.problem.system.states <= MOST_STATES:
         return None
-    problem, own = experiment.problem, _own(experiment.transcription)
+    problem, own = model.problem, _own(model)
     if own is not None and len(own) <= MOST_STATES:
         return own
-    rough = _tube(experiment.transcription, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own)
+    rough = _tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own)
     reach = rough.upper.max(axis=1) - rough.lower.min(axis=1)
-    return sorted({*telling(reach, [*_walls(experiment.transcription)])[:MOST_STATES], *(problem.names.in_plane or ())})
+    return sorted({*telling(reach, [*_walls(model)])[:MOST_STATES], *(problem.names.in_plane or ())})
 
 
 def _own(model: Transcription) -> list[int] | None:

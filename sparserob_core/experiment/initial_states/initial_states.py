@@ -17,7 +17,7 @@ from sparserob_core.control.studies.initial_states import InitialPlane, check_st
 from sparserob_core.control.transcription.own_units import walls
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
 from sparserob_core.errors import InputError, SparseRobError
-from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
+from sparserob_core.experiment.assemble import assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
@@ -63,9 +63,9 @@ def initial_states(
     limit = _limit(within)
     loaded = load_config(as_config(config), overrides)
     tools = tools_of(loaded)
-    experiment = assemble(loaded, tools.deadline)
-    if not isinstance(experiment, ControlExperiment):
-        raise InputError("problem: expected a control problem, which has an initial state, got a semi-infinite program")
+    experiment = assemble(loaded, tools.deadline).of_control(
+        "problem: expected a control problem, which has an initial state"
+    )
     model = experiment.transcription
     if model.problem.repeat:
         raise InputError(

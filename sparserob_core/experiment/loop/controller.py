@@ -10,7 +10,7 @@ import numpy as np
 from sparserob_core.control.loop.controller import Controller
 from sparserob_core.control.loop.resolving import PROVEN, Plan, Resolving
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, counting, tools_of
+from sparserob_core.experiment.assemble import ControlExperiment, assemble, build, counting, tools_of
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.directory.finished import read_finished
 from sparserob_core.experiment.run.given import GivenConfig, as_config
@@ -19,6 +19,8 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, as_seconds, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
+
+CONTROLLED = "config: expected a control problem, in which there is something to control"
 
 
 def controller(
@@ -62,7 +64,9 @@ def resolving(experiment: ControlExperiment, seconds: float | None) -> Resolving
 def _planned(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, ControlExperiment]:
     if isinstance(config, Outcome | SolvedProblem):
         result = config.result if isinstance(config, Outcome) else config
-        return _plan(config.experiment, result.status, result.message, result.decision, result.indices)
+        return _plan(
+            config.experiment.of_control(CONTROLLED), result.status, result.message, result.decision, result.indices
+        )
     if isinstance(config, str | Path) and Path(config).is_dir():
         finished = read_finished(Path(config), plugins)
         finished.require_certified()
@@ -70,9 +74,7 @@ def _planned(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, Contr
         return _plan(finished.experiment, status, message, finished.decision)
     loaded = load_config(as_config(config))
     deadline = Deadline(loaded.config.limits.seconds)
-    experiment = assemble(loaded, deadline)
-    if not isinstance(experiment, ControlExperiment):
-        return _plan(experiment, "", "", None)
+    experiment = assemble(loaded, deadline).of_control(CONTROLLED)
     method = build(loaded, "method", loaded.config.method)
     try:
         require_suited(method, experiment.program, loaded.config.method.name)
@@ -83,10 +85,8 @@ def _planned(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, Contr
 
 
 def _plan(
-    experiment: Experiment, status: str, message: str, decision: Array | None, cuts: Iterable[Cut] = ()
+    experiment: ControlExperiment, status: str, message: str, decision: Array | None, cuts: Iterable[Cut] = ()
 ) -> tuple[Plan, ControlExperiment]:
-    if not isinstance(experiment, ControlExperiment):
-        raise InputError("expected a control problem, got another semi-infinite program: there is nothing to control")
     if status not in PROVEN or decision is None:
         raise InputError(f"there is no proven control to apply; the status is '{status}': {message}")
     return Plan(experiment.transcription, np.asarray(decision, dtype=float).ravel(), 0, tuple(cuts)), experiment

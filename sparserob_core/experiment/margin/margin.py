@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError, SparseRobError, named
-from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
+from sparserob_core.experiment.assemble import assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import ProblemKeys
 from sparserob_core.experiment.config.reader import write_yaml
@@ -170,11 +170,9 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
     from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
     tools = tools_of(loaded)
-    experiment = assemble(loaded, tools.deadline)
-    if not isinstance(experiment, ControlExperiment):
-        raise InputError(
-            "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
-        )
+    experiment = assemble(loaded, tools.deadline).of_control(
+        "config: expected a control problem, whose sets can be scaled"
+    )
     problem, control, disturbance = experiment.transcription.stated, experiment.control, experiment.disturbance
     policy = experiment.transcription.policy
     if of == HORIZON:

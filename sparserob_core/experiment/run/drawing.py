@@ -192,7 +192,7 @@ def picture(experiment: Experiment, result: Result) -> bytes | None:
 
 
 def _cost_unit(experiment: Experiment) -> str:
-    return experiment.problem.cost_unit if isinstance(experiment, ControlExperiment) else ""
+    return "" if experiment.problem is None else experiment.problem.cost_unit
 
 
 def switching(experiment: ControlExperiment, result: Result) -> Array | None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
+from sparserob_core.experiment.assemble import Experiment, assemble, tools_of
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import DECIDING
 from sparserob_core.sip.methods.baselines import Scenario
@@ -96,8 +96,7 @@ class Inspection:
     @property
     def problem(self) -> OptimalControlProblem | None:
         """The control problem; ``None`` for a program of another kind."""
-        experiment = self._experiment
-        return experiment.problem if isinstance(experiment, ControlExperiment) else None
+        return self._experiment.problem
 
     @property
     def literal(self) -> bool:
@@ -119,7 +118,7 @@ class Inspection:
         from sparserob_core.experiment.figures.drawing import figure_data
 
         experiment, theta = self._experiment, np.asarray(decision, dtype=float)
-        active = marks_of(experiment.transcription, cuts) if isinstance(experiment, ControlExperiment) else None
+        active = None if experiment.model is None else marks_of(experiment.model, cuts)
         return figure_data(experiment, theta, active, (), None, draws)
 
     def clash(self, result: Result) -> list[Strip]:

@@ -10,9 +10,8 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.studies.answer import ControlResult
-from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import Path, SparseRobError, dotted
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment, build
+from sparserob_core.experiment.assemble import Experiment, build
 from sparserob_core.experiment.config.load import Loaded
 from sparserob_core.experiment.config.run_config import RunConfig
 from sparserob_core.experiment.directory.adversary import FILE as ADVERSARY
@@ -49,7 +48,7 @@ class Journal(Observer):
         config = self.experiment.loaded.config
         summary = {
             "title": self.experiment.title,
-            **summary_of(result, control, self._model),
+            **summary_of(result, control, self.experiment.model),
             **self._added_up(result),
             **self._causal(result),
             "notes": list(_notes(self.experiment.loaded, result, self.asked)),
@@ -63,15 +62,17 @@ class Journal(Observer):
 
     def _added_up(self, result: Result) -> dict[str, str]:
         """What the cost is made of, where that is not the L1 norm alone."""
-        if not isinstance(self.experiment, ControlExperiment) or result.sparsest is not None:
+        problem = self.experiment.problem
+        if problem is None or result.sparsest is not None:
             return {}
-        words = self.experiment.problem.cost.words()
+        words = problem.cost.words()
         return {"cost_of": words} if words else {}
 
     def _causal(self, result: Result) -> dict[str, Any]:
         """Under feedback what no causal policy costs less than; ``null`` where nothing is proven, or none exists, and
         why no more was sought."""
-        if not isinstance(self.experiment, ControlExperiment) or self.experiment.transcription.feedback is None:
+        model = self.experiment.model
+        if model is None or model.feedback is None:
             return {}
         bound = result.causal if isinstance(result, ControlResult) else None
         lower = None if bound is None or not np.isfinite(bound.lower) else bound.lower
@@ -83,11 +84,8 @@ class Journal(Observer):
 
     @property
     def _dictionary(self) -> Dictionary | None:
-        return None if self._model is None else self._model.control
-
-    @property
-    def _model(self) -> Transcription | None:
-        return self.experiment.transcription if isinstance(self.experiment, ControlExperiment) else None
+        model = self.experiment.model
+        return None if model is None else model.control
 
     def known(self, said: str, seconds: float) -> Result | None:
         """What is known of a run whose method was interrupted: the decision of the last round, undecided; ``None``
@@ -129,7 +127,7 @@ class Journal(Observer):
         `StudyProgress` where a figure takes longer."""
         experiment, write = self.experiment, self.directory
         control, summary = self.record(result)
-        model = self._model
+        model = self.experiment.model
         feedback = None if model is None or result.decision is None else model.feedback
         answers = {} if feedback is None else feedback.loop.written(np.asarray(result.decision))
         write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control, answers))

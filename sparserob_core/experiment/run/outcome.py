@@ -239,7 +239,7 @@ class Outcome:
     @property
     def problem(self) -> OptimalControlProblem | None:
         """The control problem."""
-        return self.experiment.problem if isinstance(self.experiment, ControlExperiment) else None
+        return self.experiment.problem
 
     @property
     def program(self) -> SemiInfiniteProgram:

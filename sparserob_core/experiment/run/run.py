@@ -10,7 +10,7 @@ from typing import Any
 
 from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 from sparserob_core.errors import InputError, SparseRobError, named
-from sparserob_core.experiment.assemble import Anew, ControlExperiment, assemble, build, name_of, tools_of
+from sparserob_core.experiment.assemble import Anew, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
@@ -83,7 +83,7 @@ def _run(
 ) -> Outcome:
     deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
     experiment = assemble(loaded, deadline)
-    why = unprovable(experiment.problem) if isinstance(experiment, ControlExperiment) else None
+    why = None if experiment.problem is None else unprovable(experiment.problem)
     if why is not None:
         deadline, why = (deadline if deadline.bounded else Deadline(SECONDS)), announced(why, deadline.bounded)
     tools = replace(tools, deadline=deadline)
@@ -107,7 +107,7 @@ def _run(
                 RunStarted(
                     title=printable(experiment.title),
                     directory=directory.path,
-                    problem=experiment.problem if isinstance(experiment, ControlExperiment) else None,
+                    problem=experiment.problem,
                     unprovable=why,
                     program=experiment.program,
                     quiet=quiet,
