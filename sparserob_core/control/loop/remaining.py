@@ -6,7 +6,6 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.windows import MixedConstraint
 from sparserob_core.control.response.response import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
@@ -35,9 +34,7 @@ def refuse_remaining(model: Transcription) -> None:
         "a control that acts at once, without a delay": problem.system.delay > 0.0,
         "a policy that measures the whole state, not outputs": model.feedback is not None
         and problem.measurements is not None,
-        "a known system where it changes with time: what parameters did is not measured": isinstance(
-            problem.system, VaryingSystem
-        )
+        "a known system where it changes with time: what parameters did is not measured": problem.system.varies
         and model.stated.system.parameter_count > 0,
         "a control_step with flat sides, and no feedback beside it, where the plan repeats": bool(problem.repeat)
         and problem.control_step is not None

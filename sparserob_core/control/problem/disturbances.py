@@ -11,7 +11,6 @@ are one on the pieces of all, of which some parts stay what they are from one to
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -22,7 +21,7 @@ import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.control.problem.expression import Entries, beside
-from sparserob_core.control.problem.system import LinearSystem, Matrix, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem, Matrix, System
 from sparserob_core.control.sets.sets import Product, product
 from sparserob_core.control.term import SAME_TIME
 from sparserob_core.errors import InputError
@@ -71,7 +70,7 @@ def joined(
     """The system under all of these disturbances side by side until the ``horizon``, the set of them together, their
     class, or that of every part of the set, and the breakpoints of every part where one has its own; raises
     `InputError` that begins with ``disturbance`` and the number of the one at fault."""
-    kind, first = every[0].kind, system.law if isinstance(system, VaryingSystem) else system.modes[0]
+    kind, first = every[0].kind, system.turns(horizon)[0][2]
     for i, one in enumerate(every):
         if one.kind not in get_args(DisturbanceClass):
             wanted = f"one of {', '.join(get_args(DisturbanceClass))}"
@@ -101,7 +100,7 @@ def joined(
     together: tuple[ConvexSet, Classes] = (product(sets), kind)
     if len(set(kinds)) > 1 or grids is not None:
         together = Product(tuple(sets)), kinds if len(set(kinds)) > 1 else kind
-    return of_legs(system, pieces), *together, grids
+    return system.taking(pieces), *together, grids
 
 
 def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
@@ -159,29 +158,13 @@ def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]
 
 
 def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[tuple[float, float, LinearSystem]]:
-    """Between which times which of the systems acts, or of the laws, cut at more times than its own, but not at
-    rounding."""
-    if isinstance(system, VaryingSystem):
-        switches, modes = tuple(begin for begin, _ in system.later), [law for _, _, law in system.laws]
-    else:
-        switches, modes = system.switches, list(system.modes)
-    ends = [*switches, horizon]
-    for time in sorted(cuts):
-        if min(abs(time - end) for end in (0.0, *ends)) > SAME_TIME * horizon:
-            ends.append(time)
-    begin = 0.0
-    for until in sorted(ends):
-        yield begin, until, modes[bisect_right(switches, begin)]
-        begin = until
-
-
-def of_legs(system: System, pieces: Sequence[tuple[float, float, LinearSystem]]) -> System:
-    """A system whose `legs` became these."""
-    if isinstance(system, VaryingSystem):
-        return system.lawful([(begin, law) for begin, _, law in pieces])
-    if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
-        return pieces[0][2]
-    return SwitchedSystem([(until, replace(one, delay=0.0)) for _, until, one in pieces], system.delay)
+    """The `turns` of a system, cut at more times than its own, but not at rounding."""
+    for begin, until, mode in system.turns(horizon):
+        for time in sorted(cuts):
+            if min(abs(time - begin), abs(until - time)) > SAME_TIME * horizon and begin < time < until:
+                yield begin, time, mode
+                begin = time
+        yield begin, until, mode
 
 
 def _columns(system: LinearSystem) -> Entries:

@@ -28,7 +28,6 @@ from sparserob_core.control.problem.system import (
     SwitchedSystem,
     System,
     VaryingSystem,
-    require_period,
 )
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.problem.terms.repeat import RETURN, SAME, Repeating, ending, widths
@@ -166,7 +165,7 @@ class OptimalControlProblem(Term):
             step = checked_set("control_step", self.control_step, self.system.controls, "controls")
             self._set("control_step", None if restricts_nothing(step) else step)
         self._check_disturbance()
-        if isinstance(self.system, VaryingSystem) and self.measurable is not None and not self.measurable.is_box:
+        if self.system.varies and self.measurable is not None and not self.measurable.is_box:
             raise InputError(
                 path="disturbance",
                 expected="a box where the system changes with time and disturbances are measurable",
@@ -243,31 +242,7 @@ class OptimalControlProblem(Term):
                 expected=f"less than {self.horizon:g} (the horizon), or no control ever acts, and more than rounding",
                 got=f"{self.system.delay:g}",
             )
-        if isinstance(self.system, SwitchedSystem):
-            self._check_pieces([until for until, _ in self.system.pieces], whole=False)
-        if isinstance(self.system, VaryingSystem):
-            self._check_pieces([until for _, until, _ in self.system.laws], whole=not self.system.later)
-
-    def _check_pieces(self, ends: Sequence[float], whole: bool) -> None:
-        """Raise `InputError` where the systems, or laws, that end at these times do not fill the horizon; ``whole``: it
-        is one law, of which no piece is named."""
-        last, begin = len(ends) - 1, 0.0
-        if abs(ends[last] - self.horizon) > SAME_TIME * self.horizon:
-            raise InputError(
-                path="system" if whole else f"system.pieces.{last}.until",
-                expected=f"a law up to {self.horizon:g}, the horizon"
-                if whole
-                else f"{self.horizon:g}, the horizon, since it is the last piece",
-                got=f"up to {ends[last]:g}" if whole else f"{ends[last]:g}",
-            )
-        for i, until in enumerate(ends):
-            if until - begin <= SAME_TIME * self.horizon:
-                raise InputError(
-                    path=f"system.pieces.{i}.until",
-                    expected=f"a time that is after {begin:g} by more than rounding",
-                    got=f"{until!r}",
-                )
-            begin = until
+        self.system.check_horizon(self.horizon)
 
     def _check_uncertain(self, system: VaryingSystem) -> None:
         """Raise `InputError` for what is not proven of a system that changes with time and has parameters."""
@@ -303,7 +278,7 @@ class OptimalControlProblem(Term):
             ),
             "pieces of the system": isinstance(self.system, SwitchedSystem),
             "uncertain parameters, but for those beside the time t": bool(self.system.parameter_count)
-            and not isinstance(self.system, VaryingSystem),
+            and not self.system.varies,
             "a delay": self.system.delay > 0.0,
             "measurable disturbances": self.measurable is not None,
             "integrals of state and control": bool(self.sums),
@@ -455,8 +430,7 @@ class OptimalControlProblem(Term):
             raise InputError(path="repeat", expected="true or false", got=f"{self.repeat!r}")
         if not self.repeat:
             return
-        if isinstance(self.system, VaryingSystem):
-            require_period(self.system)
+        self.system.check_period()
         if self.system.delay > 0.0:
             raise InputError(
                 path="repeat",

@@ -8,7 +8,6 @@ from dataclasses import fields, is_dataclass
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.errors import InputError, Path
 
 LARGEST = 1e75
@@ -24,7 +23,7 @@ def require_representable(problem: OptimalControlProblem) -> None:
     than that within the horizon: ``e^(a T)``, ``a`` the largest real part of an eigenvalue of a mode."""
     for path, value in _numbers(problem, ()):
         _require_small(path, value)
-    if isinstance(problem.system, VaryingSystem):
+    if problem.system.varies:
         for mode in problem.system.modes:
             for name, values in zip("ABE", mode.forced.matrices(mode.probes), strict=True):
                 _require_small(("system", name), values)

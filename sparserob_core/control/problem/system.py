@@ -25,7 +25,7 @@ from sparserob_core.control.problem.expression import (
     parse_matrix,
 )
 from sparserob_core.control.sets.sets import Box
-from sparserob_core.control.term import over
+from sparserob_core.control.term import SAME_TIME, over
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, dense, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -167,6 +167,25 @@ class LinearSystem:
     def switches(self) -> tuple[float, ...]:
         """When one mode follows another: never."""
         return ()
+
+    @property
+    def varies(self) -> bool:
+        """Whether it changes with time all along, not at its switches alone."""
+        return False
+
+    def turns(self, horizon: float) -> tuple[tuple[float, float, LinearSystem], ...]:
+        """Between which times which of the systems acts, or of the laws: this one until the horizon."""
+        return ((0.0, horizon, self),)
+
+    def taking(self, turns: Sequence[tuple[float, float, LinearSystem]]) -> LinearSystem | SwitchedSystem:
+        """A system of the same kind whose `turns` are these."""
+        return turns[0][2] if len(turns) == 1 else _switched(turns, self.delay)
+
+    def check_horizon(self, horizon: float) -> None:
+        """Raise `InputError` where it does not last until the horizon."""
+
+    def check_period(self) -> None:
+        """Raise `InputError` where it does not begin again at the horizon; what does not change does."""
 
     @property
     def parameter_count(self) -> int:
@@ -492,6 +511,26 @@ class SwitchedSystem:
         return tuple(until for until, _ in self.pieces[:-1])
 
     @property
+    def varies(self) -> bool:
+        """As `LinearSystem.varies`."""
+        return False
+
+    def turns(self, horizon: float) -> tuple[tuple[float, float, LinearSystem], ...]:
+        """As `LinearSystem.turns`."""
+        return _turns((0.0, *self.switches), self.modes, horizon)
+
+    def taking(self, turns: Sequence[tuple[float, float, LinearSystem]]) -> SwitchedSystem:
+        """As `LinearSystem.taking`."""
+        return _switched(turns, self.delay)
+
+    def check_horizon(self, horizon: float) -> None:
+        """As `LinearSystem.check_horizon`."""
+        _check_ends([until for until, _ in self.pieces], horizon, whole=False)
+
+    def check_period(self) -> None:
+        """As `LinearSystem.check_period`: its pieces take their turns again."""
+
+    @property
     def states(self) -> int:
         """Number ``d`` of states."""
         return self.modes[0].states
@@ -664,6 +703,41 @@ class VaryingSystem:
         begun = ((0.0, self.law), *self.later)
         return tuple((begin, until, law) for (begin, law), until in zip(begun, ends, strict=True))
 
+    @property
+    def varies(self) -> bool:
+        """As `LinearSystem.varies`."""
+        return True
+
+    def turns(self, horizon: float) -> tuple[tuple[float, float, LinearSystem], ...]:
+        """As `LinearSystem.turns`: its laws."""
+        return _turns([begin for begin, _, _ in self.laws], [law for _, _, law in self.laws], horizon)
+
+    def taking(self, turns: Sequence[tuple[float, float, LinearSystem]]) -> VaryingSystem:
+        """As `LinearSystem.taking`."""
+        return self.lawful([(begin, law) for begin, _, law in turns])
+
+    def check_horizon(self, horizon: float) -> None:
+        """As `LinearSystem.check_horizon`."""
+        _check_ends([until for _, until, _ in self.laws], horizon, whole=not self.later)
+
+    def check_period(self) -> None:
+        """Raise `InputError` where the horizon is no period of a law, but for what rounding it explains. Nothing is
+        proven by that: the law of a plan that repeats begins again at the horizon, as pieces of a system do. Laws that
+        take turns may differ there as at any other time."""
+        if self.later:
+            return
+        every = [[part[0] for part in mode.forced.matrices(np.zeros((1, 0)))] for mode in self.modes]
+        sizes = [np.abs(parts).max(axis=0) for parts in zip(*every, strict=True)]
+        ends = self.law.forced.matrices(self._points(np.array([[0.0], [self.horizon]])))
+        for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
+            for i, j in np.argwhere(np.abs(last - first) > PERIODIC * size):
+                entry = f"c[{i + 1}]" if name == "B" and j >= self.controls else f"{name}[{i + 1}][{j + 1}]"
+                raise InputError(
+                    path="repeat",
+                    expected="a horizon that is a period of the system, which begins again there",
+                    got=f"{entry} = {first[i, j]:.12g} at 0, and {last[i, j]:.12g} at {self.horizon:.12g}",
+                )
+
     def lawful(self, laws: Sequence[tuple[float, LinearSystem]]) -> VaryingSystem:
         """The same with other ``laws``, each with the time from which it holds, the first from 0 on."""
         return replace(self, law=laws[0][1], later=tuple(laws[1:]))
@@ -767,23 +841,36 @@ def _difference(low: float, high: float) -> float:
     return found if Fraction(found) >= exact else float(np.nextafter(found, np.inf))
 
 
-def require_period(system: VaryingSystem) -> None:
-    """Raise `InputError` where the horizon is no period of a law, but for what rounding it explains. Nothing is proven
-    by that: the law of a plan that repeats begins again at the horizon, as pieces of a system do. Laws that take turns
-    may differ there as at any other time."""
-    if system.later:
-        return
-    every = [[part[0] for part in mode.forced.matrices(np.zeros((1, 0)))] for mode in system.modes]
-    sizes = [np.abs(parts).max(axis=0) for parts in zip(*every, strict=True)]
-    ends = system.law.forced.matrices(system._points(np.array([[0.0], [system.horizon]])))
-    for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
-        for i, j in np.argwhere(np.abs(last - first) > PERIODIC * size):
-            entry = f"c[{i + 1}]" if name == "B" and j >= system.controls else f"{name}[{i + 1}][{j + 1}]"
+def _turns(
+    begins: Sequence[float], systems: Sequence[LinearSystem], horizon: float
+) -> tuple[tuple[float, float, LinearSystem], ...]:
+    return tuple(zip(begins, (*begins[1:], horizon), systems, strict=True))
+
+
+def _switched(turns: Sequence[tuple[float, float, LinearSystem]], delay: float) -> SwitchedSystem:
+    return SwitchedSystem([(until, replace(one, delay=0.0)) for _, until, one in turns], delay)
+
+
+def _check_ends(ends: Sequence[float], horizon: float, whole: bool) -> None:
+    """Raise `InputError` where the systems, or laws, that end at these times do not fill the horizon; ``whole``: it is
+    one law, of which no piece is named."""
+    last, begin = len(ends) - 1, 0.0
+    if abs(ends[last] - horizon) > SAME_TIME * horizon:
+        raise InputError(
+            path="system" if whole else f"system.pieces.{last}.until",
+            expected=f"a law up to {horizon:g}, the horizon"
+            if whole
+            else f"{horizon:g}, the horizon, since it is the last piece",
+            got=f"up to {ends[last]:g}" if whole else f"{ends[last]:g}",
+        )
+    for i, until in enumerate(ends):
+        if until - begin <= SAME_TIME * horizon:
             raise InputError(
-                path="repeat",
-                expected="a horizon that is a period of the system, which begins again there",
-                got=f"{entry} = {first[i, j]:.12g} at 0, and {last[i, j]:.12g} at {system.horizon:.12g}",
+                path=f"system.pieces.{i}.until",
+                expected=f"a time that is after {begin:g} by more than rounding",
+                got=f"{until!r}",
             )
+        begin = until
 
 
 def _check_piece(i: int, pair: object, before: float) -> None:

@@ -19,7 +19,7 @@ from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport, summed
@@ -90,7 +90,7 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
     if problem.disturbance_breakpoints is not None:
         expected = "disturbances on the pieces of their dictionary, which become shorter with the horizon"
         raise InputError(path="disturbance", expected=expected, got="breakpoints of their own")
-    if isinstance(problem.system, VaryingSystem):
+    if problem.system.varies:
         expected = "a system that stays the same with time: of another one no shorter horizon is looked at yet"
         raise InputError(path="system", expected=expected, got="one in t")
     shorter = problem.remaining(0.0, horizon)
@@ -135,8 +135,7 @@ class Horizons:
     def changes(self) -> float:
         """The time at which the system changes first, ``inf`` where it does not: nothing is proven of intervals of
         horizons beyond it, since the time of a change is no share of the horizon."""
-        system = self.problem.system
-        return system.switches[0] if isinstance(system, SwitchedSystem) and system.switches else np.inf
+        return min(self.problem.system.switches, default=np.inf)
 
     def amount(self, multipliers: Sequence[Multiplier], low: float, high: float) -> float:
         """A proven lower bound of the weighted sum of violations, over all controls and all horizons in
@@ -230,8 +229,7 @@ class Horizons:
     @property
     def _unchanged(self) -> OptimalControlProblem:
         """The problem as it is up to the first change of the system."""
-        system = self.problem.system
-        return replace(self.problem, system=system.modes[0]) if isinstance(system, SwitchedSystem) else self.problem
+        return replace(self.problem, system=self.problem.system.modes[0])
 
     @cached_property
     def _start(self) -> Array:

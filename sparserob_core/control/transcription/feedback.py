@@ -22,7 +22,6 @@ from sparserob_core.control.feedback.zonoid import has_corners
 from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.control.transcription.own_units import added_up, fixed, units_of_steps
@@ -269,8 +268,7 @@ def refuse(
         and problem.system.delay > 0.0,
         "single linear system under measurable disturbances, without pieces": measurable
         and bool(problem.system.switches),
-        "system that stays the same with time under measurable disturbances": measurable
-        and isinstance(problem.system, VaryingSystem),
+        "system that stays the same with time under measurable disturbances": measurable and problem.system.varies,
         "whole state that is measured without noise where a plan with a control_step repeats": bool(problem.repeat)
         and problem.control_step is not None
         and problem.measurements is not None,

@@ -17,7 +17,6 @@ import numpy as np
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.response import Propagator, TimeGrid, merge_grids
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -76,8 +75,7 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     d, m, horizon = system.states, system.controls, float(breakpoints[-1])
     given = np.zeros(m) if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
     ends, constants = np.array([0.0, horizon]), int(system.c is not None)
-    varying = isinstance(system, VaryingSystem)
-    grid = merge_grids(breakpoints, ends, system.delay, given, constants, system.switches, varying)
+    grid = merge_grids(breakpoints, ends, system.delay, given, constants, system.switches, system.varies)
     parameter = np.zeros(0) if system.parameters is None else nominal_point(system.parameters)
     modes = [[matrix[0] for matrix in mode.matrices(parameter[None])] for mode in system.forced.modes]
     reference = np.zeros(d) if state is None else state.reference
@@ -85,7 +83,7 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     M = np.zeros((d + 1 + m, d + 1 + m))
     if state is not None:
         M[:d, :d] = state.Q
-    if varying:
+    if system.varies:
         propagator = Propagator(system.forced, grid)
         which, (flows, weights) = np.arange(grid.pieces), _in_time(propagator, reference, noise, given, M)
     else:

@@ -14,7 +14,6 @@ from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.representable import require_representable
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.problem.units import Units, ratios
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
@@ -139,9 +138,14 @@ def _functionals(
     system, before = problem.system.forced, np.zeros(problem.system.controls)
     before = before if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
     constants = system.controls - problem.system.controls
-    varying = isinstance(system, VaryingSystem)
     grid = merge_grids(
-        control.breakpoints, disturbance.breakpoints, problem.system.delay, before, constants, system.switches, varying
+        control.breakpoints,
+        disturbance.breakpoints,
+        problem.system.delay,
+        before,
+        constants,
+        system.switches,
+        system.varies,
     )
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
@@ -152,7 +156,7 @@ def _functionals(
     if problem.execution is not None:
         from sparserob_core.control.response.measurable import Execution, VaryingExecution
 
-        made = VaryingExecution if varying else Execution
+        made = VaryingExecution if system.varies else Execution
         execution = made(response, control.breakpoints, np.asarray(problem.execution))
     functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)

@@ -8,7 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_core.control.problem.disturbances import legs, of_legs
+from sparserob_core.control.problem.disturbances import legs
 from sparserob_core.control.problem.names import Corners, Names, measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, System
@@ -128,7 +128,7 @@ def _system(system: System, running: list[Running], horizon: float) -> System:
         acts = np.array([[one.start <= begin + slack and until <= one.stop + slack] for one in running])
         h, g = np.stack([one.h for one in running]), np.stack([one.g for one in running])
         pieces.append((begin, until, mode.accumulating(acts * h, acts * g)))
-    return of_legs(system, pieces)
+    return system.taking(pieces)
 
 
 def _names(names: Names, states: int, running: list[Running]) -> Names:
