@@ -286,7 +286,7 @@ class ClosedLoop:
         drives, radii = self.path(x)[1][pieces], np.concatenate([[1.0], self.spread.radii])
         if self.motion is not None:
             return self.motion.bent(H, start, width, pieces, states, drives, radii)
-        modes = np.zeros(1, dtype=int) if self.grid.mode is None else self.grid.mode[pieces]
+        modes = self.grid.modes[pieces]
         A = self.steps.A[0, modes]  # (1, d, d) of one system, (k, d, d) of several
         h, rates = width[:, None, None], A @ states + drives
         row, factor = H @ A, np.ones_like(h)

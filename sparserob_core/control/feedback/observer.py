@@ -57,9 +57,8 @@ class Observer:
         C, K = np.asarray(measured.C), seen.shape[0]
         p, d = C.shape
         L = np.zeros((K, d, p))
-        box = None if measured.noise is None else measured.noise.bounding_box()
-        noise = np.zeros(p) if box is None else (box.upper - box.lower) / 2.0  # from its middle, which is no deviation
-        middle = np.zeros(p) if measured.noise is None else measured.noise.middle()
+        box, middle = measured.noises.bounding_box(), measured.noises.middle()
+        noise = (box.upper - box.lower) / 2.0  # from its middle, which is no deviation
         whole = measured.noise is None and p == d and np.linalg.matrix_rank(C) == d
         entered = seen * radii
         P = entered[0] @ entered[0].T

@@ -208,8 +208,7 @@ class Controller:
     @property
     def _observer(self) -> Observer | None:
         """What makes innovations of outputs; ``None`` where the state is measured."""
-        feedback = self._plan.known.feedback
-        return None if feedback is None else feedback.loop.observer
+        return self._plan.known.observer
 
     def _measured(self, state: object) -> Array:
         """The outputs, or the state with the integrals after it."""
@@ -246,10 +245,9 @@ class Controller:
         return bool((seen >= lower - room).all() and (seen <= upper + room).all()) and self._caused(state, room)
 
     def _expected(self, outputs: Array) -> bool:
-        feedback = self._plan.known.feedback
-        assert self._measuring is not None and feedback is not None
+        assert self._measuring is not None
         new = self._measuring.seen(outputs)[-1]
-        least, most = (bound[self._next - self._plan.first] for bound in feedback.loop.expected)
+        least, most = (bound[self._next - self._plan.first] for bound in self._plan.known.answering.loop.expected)
         room = SEEN * float(np.max([np.abs(outputs), np.abs(new), np.abs(least), np.abs(most)]))
         return bool((new >= least - room).all() and (new <= most + room).all())
 

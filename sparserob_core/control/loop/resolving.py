@@ -85,7 +85,7 @@ class Plan:
             if grid.varying:  # whose pieces are its modes
                 B = grid.of_modes(response.steps(KNOWN).B[0])[number]
             else:
-                mode = system.modes[0 if grid.mode is None else int(grid.mode[number])]
+                mode = system.modes[int(grid.modes[number])]
                 B = mode.matrices(mode.probes[:1])[1][0]
             found = found + grid.lengths[number] * (B[:, : control.size] @ control)
         return found
@@ -138,8 +138,7 @@ class Plan:
 
     def cost_left(self, piece: int, innovations: Sequence[Array]) -> float:
         """The cost of that under feedback: of the nominal control, or of its peaks over what may still happen."""
-        feedback, problem = self.known.feedback, self.known.problem
-        assert feedback is not None
+        feedback, problem = self.known.answering, self.known.problem
         nominal, spread = self.left(piece, innovations), feedback.loop.spread
         size = np.abs(nominal)
         if feedback.charge.cost == "peak":

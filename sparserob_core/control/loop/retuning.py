@@ -27,8 +27,7 @@ class Kept:
     d)``: the `Answering` of a `Tracking`."""
 
     def __init__(self, model: Transcription, decision: Array, piece: int, H: Array) -> None:
-        assert model.feedback is not None
-        loop = model.feedback.loop
+        loop = model.answering.loop
         nodes, drives = loop.path(decision)
         later = np.abs(loop.entries[piece:]).sum(axis=(0, 1)) > 0.0  # (Q,): deviations that act from now on
         self.H, self.spread, self.A = H, loop.spread, loop.steps.A[0, 0]
@@ -77,9 +76,8 @@ class Retuning:
 
     def _prepared(self, piece: int, state: Array) -> Tracking | None:
         model, grid = self.model, self.model.response.grid
-        assert model.feedback is not None
-        loop, signal = model.feedback.loop, model.functionals.disturbance
-        if model.feedback.charge.cost not in ("nominal", "peak") or not loop.spread.is_box or loop.middles.any():
+        loop, signal = model.answering.loop, model.functionals.disturbance
+        if model.answering.charge.cost not in ("nominal", "peak") or not loop.spread.is_box or loop.middles.any():
             return None
         if model.problem.disturbance_class != "piecewise_constant":
             return None

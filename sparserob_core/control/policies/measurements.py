@@ -12,7 +12,7 @@ from sparserob_core.brief import noun
 from sparserob_core.control.term import Term, measured
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense
-from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
 
 SAME = (
     1e-12  # of the horizon: what is known by less later than a breakpoint is known at it; ten times less and a latency
@@ -36,6 +36,11 @@ class Measurements(Term):
     def outputs(self) -> int:
         """How many numbers are measured at once, ``p``."""
         return int(np.asarray(self.C).shape[0])
+
+    @property
+    def noises(self) -> ConvexSet:
+        """The set of the noise; the point 0 where there is none."""
+        return self.noise or Box(np.zeros(self.outputs), np.zeros(self.outputs))
 
     def checked(self, states: int, horizon: float) -> Measurements:
         """The same with ``C`` as an array, and without a noise that is a point at 0; raises `InputError` that begins

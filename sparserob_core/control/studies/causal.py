@@ -133,8 +133,7 @@ class CausalSearch:
     def __init__(
         self, model: Transcription, decision: Array | None, active: Sequence[tuple[str, float, Array | None]]
     ) -> None:
-        assert model.feedback is not None
-        self.model, self.loop, self.decision = model, model.feedback.loop, decision
+        self.model, self.loop, self.decision = model, model.answering.loop, decision
         flat = [one for one in model.constraints if isinstance(one, FlatConstraint)]
         self.constraints = [one for one in flat if one.gains is None and one.reference is None]  # fewer: a bound still
         grid, disturbance = model.response.grid, model.functionals.disturbance
@@ -178,8 +177,7 @@ class CausalSearch:
         return self._planted(knowledge, known, limits, highest)
 
     def _planted(self, knowledge: Knowledge, known: list[Array], limits: Limits, highest: float | None) -> Tree:
-        problem, feedback = self.model.problem, self.model.feedback
-        assert feedback is not None
+        problem, feedback = self.model.problem, self.model.answering
         limits.again()
         prices = problem.prices(self.model.control.breakpoints)
         tree = Tree(self.sampled, knowledge, problem.control, prices, feedback.charge.cost, highest)

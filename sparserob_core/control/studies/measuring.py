@@ -37,8 +37,7 @@ class Measuring:
     @staticmethod
     def of(model: Transcription, decision: Array, noises: Array | None = None) -> Measuring:
         """The control of a decision."""
-        assert model.feedback is not None
-        return Measuring(model, model.pieces(decision), model.feedback.loop.gains(decision), noises)
+        return Measuring(model, model.pieces(decision), model.answering.loop.gains(decision), noises)
 
     def seen(self, measured: Array) -> list[Array]:
         """The innovations ``(p,)`` so far, when ``measured (p,)`` is what is seen as the next piece begins; nothing is
@@ -46,8 +45,7 @@ class Measuring:
         return [*(one[:, 0] for one in self._innovations), self._new(measured[:, None], self._observed())[:, 0]]
 
     def _loop(self) -> ClosedLoop:
-        assert self.model.feedback is not None
-        return self.model.feedback.loop
+        return self.model.answering.loop
 
     def outputs(self, k: int, state: Array) -> Array:
         """What is measured of states ``(d, n)`` as piece ``k`` of the control begins, ``(p, n)``."""

@@ -52,9 +52,9 @@ class Motion(Protocol):
     def leave(self, state: Array) -> Array:
         """The states ``(d, n)`` of coordinates."""
 
-    def step(self, piece: int, state: Array, control: Array, disturbance: Array | None) -> Array:
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
         """The coordinates at the end of a ``piece`` that begins in ``state``, under ``control (m, n or 1)`` and
-        ``disturbance (mw, n)``."""
+        ``disturbance (mw, n or 1)``."""
 
 
 def walk(
@@ -74,7 +74,8 @@ def walk(
     grid, motion = response.grid, _motion(response, parameters)
     if initial_states is None:
         initial_states = np.repeat(response.initial_state[None], parameters.shape[0], axis=0)
-    signal = None if disturbances is None else np.ascontiguousarray(disturbances.transpose(2, 1, 0))
+    none = np.broadcast_to(0.0, (1, response.system.disturbances, grid.disturbance_piece.max() + 1))
+    signal = np.ascontiguousarray((none if disturbances is None else disturbances).transpose(2, 1, 0))
     state = motion.enter(initial_states)
     now = motion.leave(state)
     yield now
@@ -84,7 +85,7 @@ def walk(
     ):
         if acting != before:
             decided, before = control(acting, now) if callable(control) else control[:, acting, None], acting
-        state = motion.step(piece, state, decided, None if signal is None else signal[pushing])
+        state = motion.step(piece, state, decided, signal[pushing])
         now = motion.leave(state)
         yield now
 
@@ -119,15 +120,15 @@ class _ByMatrices:
     def leave(self, state: Array) -> Array:
         return state
 
-    def step(self, piece: int, state: Array, control: Array, disturbance: Array | None) -> Array:
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
         grid = self.grid
-        mode = 0 if grid.mode is None else int(grid.mode[piece])
+        mode = int(grid.modes[piece])
         A, B, W = self.modes[mode]
         if mode != self.mode:
             self.mode, (self.flows, self.integrals) = mode, _transitions(A, self.lengths)
         inputs = (int(self.which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]), mode)
         if inputs != self.inputs:  # the pieces that times inside cut one into are driven alike
-            drive = _times(B, control) if disturbance is None else _times(B, control) + _times(W, disturbance)
+            drive = _times(B, control) + _times(W, disturbance)
             self.inputs, self.driven = inputs, _times(self.integrals[inputs[0]], drive)
         return _times(self.flows[inputs[0]], state) + self.driven
 
@@ -149,8 +150,8 @@ class _Apart:
     def leave(self, state: Array) -> Array:
         return np.asarray(self.basis.transform @ state.T)
 
-    def step(self, piece: int, state: Array, control: Array, disturbance: Array | None) -> Array:
-        drive = self.B @ control if disturbance is None else self.B @ control + self.W @ disturbance
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
+        drive = self.B @ control + self.W @ disturbance
         lengths = np.full(state.shape[0], self.lengths[piece])
         return np.asarray(self.flows.columns(state, np.broadcast_to(drive.T, state.shape), lengths))
 
@@ -168,10 +169,8 @@ class _InTime:
     def leave(self, state: Array) -> Array:
         return state
 
-    def step(self, piece: int, state: Array, control: Array, disturbance: Array | None) -> Array:
-        drive = (
-            self.B[piece] @ control if disturbance is None else self.B[piece] @ control + self.E[piece] @ disturbance
-        )
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
+        drive = self.B[piece] @ control + self.E[piece] @ disturbance
         return np.asarray(self.steps.Phi[0, piece] @ state + self.steps.Gamma[0, piece] @ drive)
 
 

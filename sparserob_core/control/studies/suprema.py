@@ -17,7 +17,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.response import merge_grids
+from sparserob_core.control.response.grid import grid_of
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal
@@ -197,9 +197,7 @@ def followed(
         return None
     forced = system.forced
     A, B, E = (part[0] for part in forced.matrices(np.zeros((1, 0))))
-    constants = forced.controls - system.controls
-    before = np.zeros(system.controls) if problem.initial_control is None else np.asarray(problem.initial_control)
-    grid = merge_grids(control.breakpoints, disturbance.breakpoints, system.delay, before, constants)
+    grid = grid_of(problem, control.breakpoints, disturbance.breakpoints)
     pieces = control.control(theta)
     inputs = np.hstack([B, E]) if problem.disturbance is not None else B
     state, gains = row.direction[:d], row.direction[d:]

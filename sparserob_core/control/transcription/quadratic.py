@@ -17,7 +17,8 @@ import numpy as np
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.response.response import Propagator, TimeGrid, merge_grids
+from sparserob_core.control.response.grid import grid_of
+from sparserob_core.control.response.response import Propagator, TimeGrid
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -74,8 +75,7 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     system, (state, _, final) = problem.system, problem.cost.terms
     d, m, horizon = system.states, system.controls, float(breakpoints[-1])
     given = np.zeros(m) if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
-    ends, constants = np.array([0.0, horizon]), int(system.c is not None)
-    grid = merge_grids(breakpoints, ends, system.delay, given, constants, system.switches, system.varies)
+    grid = grid_of(problem, breakpoints, np.array([0.0, horizon]))
     parameter = np.zeros(0) if system.parameters is None else nominal_point(system.parameters)
     modes = [[matrix[0] for matrix in mode.matrices(parameter[None])] for mode in system.forced.modes]
     reference = np.zeros(d) if state is None else state.reference
@@ -104,7 +104,7 @@ def _by_kind(
 ) -> tuple[np.ndarray, Array, Array]:
     """Which of a few kinds every piece is of, ``(L,)``, and the flows and weights of these, `NominalPieces`."""
     d, m = reference.size, given.size
-    decided, mode = grid.control_piece >= 0, np.zeros(grid.pieces) if grid.mode is None else grid.mode
+    decided, mode = grid.control_piece >= 0, grid.modes
     kinds, which = np.unique(
         np.column_stack([np.round(grid.lengths / float(grid.breakpoints[-1]), 13), decided, mode]),
         axis=0,

@@ -24,6 +24,7 @@ from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfini
 
 if TYPE_CHECKING:
     from sparserob_core.control.feedback.closed_loop import ClosedLoop
+    from sparserob_core.control.feedback.observer import Observer
     from sparserob_core.control.policies.policy import Charge, Policy
     from sparserob_core.control.problem.units import Units
     from sparserob_core.control.transcription.telling import Telling
@@ -190,6 +191,17 @@ class Transcription(Posed):
     def policy(self) -> Policy | None:
         """The policy by which the control answers what it measures; ``None`` for one that answers nothing."""
         return self.acting.answers_by
+
+    @property
+    def answering(self) -> Feedback:
+        """The feedback of a control that answers, which is asked for where there is one."""
+        assert self.feedback is not None
+        return self.feedback
+
+    @property
+    def observer(self) -> Observer | None:
+        """What makes innovations of outputs; ``None`` where states are measured, or nothing is."""
+        return None if self.feedback is None else self.feedback.loop.observer
 
     @property
     def noise(self) -> ConvexSet | None:

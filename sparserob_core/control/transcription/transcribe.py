@@ -18,9 +18,10 @@ from sparserob_core.control.problem.terms.windows import MixedConstraint, PathCo
 from sparserob_core.control.problem.units import Units, ratios
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.grid import grid_of
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
-from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times, merge_grids
+from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
 from sparserob_core.control.transcription.own_units import (
     own_units,
     rough_units,
@@ -135,18 +136,7 @@ def _on_one_grid(problem: OptimalControlProblem, disturbance: Dictionary) -> tup
 def _functionals(
     problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
 ) -> tuple[WorstCase, ParameterIndex]:
-    system, before = problem.system.forced, np.zeros(problem.system.controls)
-    before = before if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
-    constants = system.controls - problem.system.controls
-    grid = merge_grids(
-        control.breakpoints,
-        disturbance.breakpoints,
-        problem.system.delay,
-        before,
-        constants,
-        system.switches,
-        system.varies,
-    )
+    system, grid = problem.system.forced, grid_of(problem, control.breakpoints, disturbance.breakpoints)
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
         bound, breakpoints = problem.disturbance, problem.disturbance_breakpoints

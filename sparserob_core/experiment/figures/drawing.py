@@ -181,8 +181,7 @@ def _answered(
     """What feedback adds to the figures: the tube that the nominal control alone has, how far the disturbance moves the
     control, and the gains; with ``draws`` the effort under so many of them, and what moves the control in the worst
     case."""
-    assert model.feedback is not None
-    loop, alone = model.feedback.loop, _tube(replace(model, feedback=None), model.nominal(decision), times, states)
+    loop, alone = model.answering.loop, _tube(replace(model, feedback=None), model.nominal(decision), times, states)
     nominal, effects = loop.nominal(decision), loop.effects(decision)
     held = model.problem.disturbance_class == "piecewise_constant"  # of all measurable functions none is drawn evenly
     return {
@@ -199,15 +198,13 @@ def _answered(
 
 def _outputs(model: Transcription, decision: Array, times: Array) -> Outputs | None:
     """The outputs that a policy measures with their noise; ``None`` where it measures states."""
-    assert model.feedback is not None
-    measured, loop, points = model.problem.measurements, model.feedback.loop, model.control.breakpoints
+    measured, loop, points = model.problem.measurements, model.answering.loop, model.control.breakpoints
     if measured is None:
         return None
     C = np.asarray(measured.C)
     instants = points[:-1][measured.known(points).any(axis=0)]
     lower, upper = -supports(model, decision, times, -C), supports(model, decision, times, C)
-    axes = np.eye(len(C))
-    noise = (np.zeros(len(C)),) * 2 if measured.noise is None else [measured.noise.support(s * axes) for s in (-1, 1)]
+    noise = [measured.noises.support(side * np.eye(len(C))) for side in (-1, 1)]
     return Outputs(
         C=C,
         nominal=C @ loop.states(decision, times)[:, :, 0].T,
@@ -244,11 +241,10 @@ def _drawn(loop: ClosedLoop, nominal: Array, effects: Array, draws: int) -> dict
 def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
     """What every innovation adds to the control on every piece, in the worst case of the constraint that comes nearest
     to being violated."""
-    assert model.feedback is not None
     worst = max(find_adversaries(model, decision), key=lambda one: one.violation, default=None)
     if worst is None or worst.deviation is None:
         return {}
-    loop = model.feedback.loop
+    loop = model.answering.loop
     return {
         "answers": np.einsum("kjid,jd->kji", loop.gains(decision), loop.innovations @ worst.deviation),
         "worst_case": f"the worst case of {plain(worst.name)} at t = {worst.time:.4g}",

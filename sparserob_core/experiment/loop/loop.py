@@ -196,7 +196,7 @@ class _Closing:
 
     def _measured(self, state: Array) -> Array:
         """What is measured of a state ``(d,)``."""
-        observer = None if self.model.feedback is None else self.model.feedback.loop.observer
+        observer = self.model.observer
         if observer is None:
             return state[: self.model.stated.system.states]
         noise = None if self.noise is None else self.noise[self._asked, :, None]

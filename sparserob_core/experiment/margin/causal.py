@@ -35,8 +35,7 @@ def causal_upper(
     known = [factor for factor, result in results.items() if factor > 0.0 and result.decision is not None]
     base = max(known, default=1.0)
     model = model_at(base)
-    assert model.feedback is not None
-    charge, result = model.feedback.charge, results.get(base)
+    charge, result = model.answering.charge, results.get(base)
     if not charge.causal_signals:
         return np.nan, None
     notify(StudyProgress(text=f"looking for the factor of {scaling.of} above which no causal policy exists"))

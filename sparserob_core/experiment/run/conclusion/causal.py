@@ -71,11 +71,10 @@ def _from(rest: Array, signal: Array) -> Array:
 
 def active(model: Transcription, result: Result) -> list[tuple[str, float, Array | None]]:
     """Names, times and deviations of the constraints that the bound of a result rests on."""
-    assert model.feedback is not None
-    rest, found = model.feedback.loop.spread.middle, []
+    rest, found = model.answering.loop.spread.middle, []
     for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         if said is not None:
-            signal = None if model.feedback.loop.measurable is not None else said.disturbance
+            signal = None if model.answering.loop.measurable is not None else said.disturbance
             found.append((cut.family, said.time, None if signal is None else _from(rest, np.asarray(signal))))
     return found
 
@@ -88,12 +87,11 @@ def searched(
     none can do against all."""
     from sparserob_core.control.studies.causal import CausalSearch
 
-    assert model.feedback is not None
-    if model.feedback.loop.measurable is None:
+    if model.answering.loop.measurable is None:
         return CausalSearch(model, decision, rests)
     pieces = Dictionary.indicators(model.response.grid.breakpoints)
     problem = replace(model.problem, disturbance_class="piecewise_constant")
-    return CausalSearch(prepare(problem, model.control, pieces, policy=model.feedback.policy), None, rests)
+    return CausalSearch(prepare(problem, model.control, pieces, policy=model.answering.policy), None, rests)
 
 
 def proven(model: Transcription, problem: OptimalControlProblem, stated: CausalBound) -> float | None:
@@ -103,8 +101,7 @@ def proven(model: Transcription, problem: OptimalControlProblem, stated: CausalB
     from sparserob_core.checker.claims.claims import derived_causal_bound
     from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 
-    assert model.feedback is not None
-    policy, none = model.feedback.policy, stated.lower == np.inf
+    policy, none = model.answering.policy, stated.lower == np.inf
     try:
         case = Case(problem, model.control, model.disturbance, {}, Clock(SECONDS), policy=policy)
         derived = derived_causal_bound(case, finite(causal_data(stated)), priced=not none)
