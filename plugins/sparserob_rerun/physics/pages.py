@@ -33,20 +33,13 @@ class Page:
 def pages(problem: sr.OptimalControlProblem) -> list[Page]:
     """The first screen with two controls and four states, those with walls first; then whatever is left."""
     controls, walled = problem.system.controls, _walled(problem)
-    order = sorted(drawn(problem), key=lambda state: state not in walled)
+    order = sorted(problem.names.own(problem.system.states), key=lambda state: state not in walled)
     first, rest = sorted(order[:STATES]), sorted(order[STATES:])
     plots = [*_controls(range(min(CONTROLS, controls))), *(("state", state) for state in first)]
     first_page = Page("physics/plots", tuple(plots))
     more = [*_controls(range(CONTROLS, controls)), *(("state", state) for state in rest)]
     parts = [more[start : start + PLOTS] for start in range(0, len(more), PLOTS)]
     return [first_page, *(Page(f"physics/more/{number}", tuple(part)) for number, part in enumerate(parts))]
-
-
-def drawn(problem: sr.OptimalControlProblem) -> list[int]:
-    """The states that are drawn: not what parameters beside the time add to others, whose tubes hold it."""
-    corners = problem.names.corners
-    d, size = (0, 0) if corners is None else corners.rows[0].shape
-    return [state for state in range(problem.system.states) if not d <= state < size]
 
 
 def heading(problem: sr.OptimalControlProblem) -> str:

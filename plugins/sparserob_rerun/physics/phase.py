@@ -57,7 +57,10 @@ def moved(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
         for place in plane.places[np.unique(np.linspace(0, data.times.size - 1, SLICES).astype(int))]:
             drawing.line("slices", axes.at(*np.vstack([place, place[:1]]).T), ink.TUBE, 1.0)
         drawn.append(("worst case", ink.SKY))
-    drawn += [entry for limit in plane.limits for entry in _limited(drawing, axes, limit, frame)]
+    for wall in plane.walls:
+        for corners in wall.beyond(frame):
+            drawing.forbidden("hatch", axes, axes.at(*corners.T), ink.HATCH)
+    drawn += [_outlined(drawing, axes, *one) for one in plane.outlined(frame) if len(one[1])]
     for path in worst.get("states", ()):
         drawing.line("worst", axes.at(path[across], path[up]), ink.ORANGE, 1.2)
     if len(worst.get("states", ())):
@@ -72,20 +75,13 @@ def moved(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
     return drawing
 
 
-def _limited(drawing: Drawing, axes: Axes, limit: Any, frame: Floats) -> list[tuple[str, Colour]]:
-    """Hatch what is always forbidden, outline what holds for a while, and the goal; returns what to say of it."""
-    if limit.is_wall:
-        for corners in limit.beyond(frame):
-            drawing.forbidden("hatch", axes, axes.at(*corners.T), ink.HATCH)
-        return []
-    allowed = limit.allowed(frame)
-    if limit.moves or not len(allowed):
-        return []
+def _outlined(drawing: Drawing, axes: Axes, limit: Any, allowed: Floats) -> tuple[str, Colour]:
+    """Outline what is ``allowed`` for a while, or as the goal; returns what to say of it."""
     places = axes.at(*np.vstack([allowed, allowed[:1]]).T)
     if np.ptp(places, axis=0).max() < POINT:  # a mark around a goal that is too small to be seen
         places = places.mean(axis=0) + POINT / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     drawing.line("wall", places, ink.VERMILLION, 2.0 if limit.is_final else 1.0)
-    return [("terminal set" if limit.is_final else limit.name, ink.VERMILLION)]
+    return ("terminal set" if limit.is_final else limit.name), ink.VERMILLION
 
 
 def _named(drawing: Drawing, axes: Axes, drawn: list[tuple[str, Colour]], below: bool = False) -> None:

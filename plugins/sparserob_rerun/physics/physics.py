@@ -11,7 +11,7 @@ import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing
 from sparserob_rerun.drawing.palette import Floats
-from sparserob_rerun.physics.pages import drawn, pages
+from sparserob_rerun.physics.pages import pages
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -84,7 +84,7 @@ class Physics:
         rows = rr.Scalars.columns(scalars=data.control.T.ravel()).partition([channels] * data.control.shape[1])
         self.stream.send_columns("signals/control", at, rows)
         at = [rr.TimeColumn("t", duration=data.times)]
-        for state in drawn(self.problem):
+        for state in self.problem.names.own(self.problem.system.states):
             name, colour = data.names.state(state), ink.legible(SHADES[state % len(SHADES)])
             pale = (*colour[:3], 110)
             self.stream.log(
@@ -170,7 +170,7 @@ class Physics:
         the time axis; in the plot of a state those of the constraints that bound it."""
         for position, (kind, place) in enumerate(plots):
             axes = _axes(position, data, (0.0, 1.0))
-            times = data.active_on(place) if kind == "state" else data.active_times
+            times = data.active.on(place) if kind == "state" else data.active.times
             for time in times:
                 drawing.dashed("marks", axes.at(np.full(2, time), np.array([0.0, 1.0])), ink.PURPLE)
             if times.size:

@@ -33,6 +33,18 @@ class Corners:
         d, size = self.rows[0].shape
         return np.concatenate([direction[:d], np.zeros(size - d), direction[size:]])
 
+    def own(self, states: int) -> list[int]:
+        """Those of so many states that no parameter added: what parameters add is in the tubes of the others."""
+        d, size = self.rows[0].shape
+        return [*range(d), *range(size, states)]
+
+    def stated(self, direction: Array, states: Array) -> Array:
+        """Trajectories ``(n, T)`` of all states, with the first of them at the corner that a direction is nearest
+        to."""
+        d, size = self.rows[0].shape
+        corner = min(self.rows, key=lambda one: np.abs(direction[:d] @ one[:, d:] - direction[d:size]).sum())
+        return np.concatenate([corner @ states[:size], states[d:]])
+
     def at(self, direction: Array) -> str | None:
         """The parameters whose corner a direction is about, such as ``gain = 0.1``; empty where it is about all,
         ``None`` where it is about none alone."""
@@ -93,6 +105,10 @@ class Names:
             units = [self.state_units[place] for place in places if place is not None and place < len(self.state_units)]
             if len(set(units)) > 1:
                 raise InputError(path="names.plane", expected="two states of the same unit", got=" and ".join(units))
+
+    def own(self, states: int) -> list[int]:
+        """Those of so many states that figures show: all but what parameters beside the time add."""
+        return [*range(states)] if self.corners is None else self.corners.own(states)
 
     @property
     def in_plane(self) -> tuple[int, int] | None:

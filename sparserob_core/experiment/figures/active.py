@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -22,10 +22,14 @@ NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
 @dataclass(frozen=True, eq=False)
 class Active:
     """The ``times (k,)`` of constraints, each once and in order, and which ``states (k, d)`` those of a time bound:
-    none where they are about the control."""
+    none where they are about the control, and ``None`` where that is not known."""
 
-    times: Array
-    states: np.ndarray
+    times: Array = field(default_factory=lambda: np.empty(0))
+    states: np.ndarray | None = None
+
+    def on(self, component: int) -> Array:
+        """When a constraint on a state is active."""
+        return self.times if self.states is None else self.times[self.states[:, component]]
 
 
 def active_of(experiment: ControlExperiment, cuts: Sequence[Cut]) -> Active:

@@ -85,11 +85,8 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
 def _path(states: Array, direction: Array, data: FigureData) -> Array:
     """The states ``(d, T)`` of a worst case, at the corner of the parameters beside the time that its direction is
     of."""
-    if not data.corners:
-        return states
-    d, size = data.corners[0].shape
-    corner = min(data.corners, key=lambda one: np.abs(direction[:d] @ one[:, d:] - direction[d:size]).sum())
-    return np.concatenate([corner @ states[:size], states[d:]])
+    corners = data.names.corners
+    return states if corners is None else corners.stated(direction, states)
 
 
 def _uncertain(arrays: Mapping[str, Array], data: FigureData) -> str:
@@ -98,7 +95,7 @@ def _uncertain(arrays: Mapping[str, Array], data: FigureData) -> str:
     begun = not np.allclose(arrays["initial_states"][:, known], data.state[known, 0], rtol=1e-9, atol=0.0)
     kinds = {
         "disturbance": arrays["disturbances"].any(),
-        "parameter": arrays["parameters"].shape[1] > 0 or bool(data.corners),
+        "parameter": arrays["parameters"].shape[1] > 0 or data.names.corners is not None,
         "noise": "noises" in arrays,
         "initial state": begun,
     }

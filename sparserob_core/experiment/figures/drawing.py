@@ -18,7 +18,6 @@ from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.studies.adversary import find_adversaries
 from sparserob_core.control.studies.answer import Tube, supports, tube
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.terms.superposed import at_corners
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.experiment.figures.active import Active
@@ -109,7 +108,7 @@ def _data(
     axes = np.eye(problem.system.controls)
     tolerance = experiment.loaded.config.method.options.get("tolerance")
     decision, times = np.ravel(theta), _times(model.response.grid.breakpoints)
-    states = _own(model) if states is None else states
+    states = problem.names.own(problem.system.states) if states is None else states
     around = _tube(model, decision, times, states)
     answered = {} if model.feedback is None else _answered(model, decision, times, draws, states)
     longest = 0.0 if program.activity is None else float(program.activity.sum())
@@ -125,8 +124,7 @@ def _data(
         tube_lower=around.lower,
         tube_upper=around.upper,
         walls=list(_walls(model)),
-        active_times=np.empty(0) if active is None else active.times,
-        active_states=None if active is None else active.states,
+        active=active or Active(),
         history=history,
         cost_scale=program.added(decision) if decision.size == program.n and not counts else 0.0,
         counts=counts,
@@ -137,7 +135,6 @@ def _data(
         names=problem.names,
         plane=_plane(model, decision, around.times),
         tolerance=tolerance if isinstance(tolerance, float) else None,
-        corners=at_corners(model.stated) or (),
         **answered,
     )
 
@@ -148,36 +145,22 @@ def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     model = experiment.model
     if model is None or model.problem.system.states <= MOST_STATES:
         return None
-    problem, own = model.problem, _own(model)
-    if own is not None and len(own) <= MOST_STATES:
+    problem, own = model.problem, model.problem.names.own(model.problem.system.states)
+    if len(own) <= MOST_STATES:
         return own
     rough = _tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own)
     reach = rough.upper.max(axis=1) - rough.lower.min(axis=1)
     return sorted({*telling(reach, [*_walls(model)])[:MOST_STATES], *(problem.names.in_plane or ())})
 
 
-def _own(model: Transcription) -> list[int] | None:
-    """All states but those that parameters beside the time add, which are in the tubes of the others; ``None``: all."""
-    corners = at_corners(model.stated)
-    if corners is None:
-        return None
-    d, size = corners[0].shape
-    return [*range(d), *range(size, model.problem.system.states)]
-
-
-def _tube(model: Transcription, decision: Array, times: Array, states: Sequence[int] | None) -> Tube:
+def _tube(model: Transcription, decision: Array, times: Array, states: Sequence[int]) -> Tube:
     """The tube of the ``states`` that are named, in rows of all of them; NaN stands in the others."""
-    found = tube(model, decision, times, states)
-    if states is None:
-        return found
-    rows = np.full((3, model.problem.system.states, times.size), np.nan)
+    found, rows = tube(model, decision, times, states), np.full((3, model.problem.system.states, times.size), np.nan)
     rows[:, states] = found.nominal, found.lower, found.upper
     return Tube(times, *rows)
 
 
-def _answered(
-    model: Transcription, decision: Array, times: Array, draws: int, states: Sequence[int] | None
-) -> dict[str, Any]:
+def _answered(model: Transcription, decision: Array, times: Array, draws: int, states: Sequence[int]) -> dict[str, Any]:
     """What feedback adds to the figures: the tube that the nominal control alone has, how far the disturbance moves the
     control, and the gains; with ``draws`` the effort under so many of them, and what moves the control in the worst
     case."""

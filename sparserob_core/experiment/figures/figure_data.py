@@ -10,6 +10,7 @@ import numpy as np
 
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.figures.active import Active
 from sparserob_core.experiment.figures.plane import Plane
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
@@ -76,15 +77,12 @@ class FigureData:
     ``breakpoints (K+1,)`` with the control ``(m, K)`` on the pieces and its bounds ``(m,)`` (infinite: none);
     ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
     every disturbance and parameter, rows of NaN for states that nobody asked for; ``walls`` the path and terminal
-    constraints on single components; ``active_times (k,)`` the times of the imposed constraints that carry a
-    multiplier, ``active_states (k, d)`` which states those of a time bound, ``None`` where that is not known;
+    constraints on single components; ``active`` the imposed constraints that carry a multiplier;
     ``history`` the rounds of the method. ``tolerance`` is the relative gap that was asked for, ``cost_scale`` what is
     added up to the cost, ``cost_of`` what is added up to it, where that is not the L1 norm alone, ``cost_unit``
     what it is measured in, where that is known, ``counts`` whether cost means the time that the control acts, ``names``
     what everything is called, ``plane`` where the system moves, if the problem says that it does so in one, ``push (m,
-    K)`` the switching function, how hard the constraints push the control, where that is known. ``corners``: of
-    parameters beside the time, the states at each corner as rows ``(d, size)`` on the first of them, of which those
-    after the ``d``-th are what parameters add, and not drawn.
+    K)`` the switching function, how hard the constraints push the control, where that is known.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and
@@ -104,8 +102,7 @@ class FigureData:
     tube_lower: Array
     tube_upper: Array
     walls: Sequence[Wall] = ()
-    active_times: Array = field(default_factory=lambda: np.empty(0))
-    active_states: np.ndarray | None = None
+    active: Active = field(default_factory=Active)
     history: Sequence[RoundFinished] = ()
     active_fraction: float | None = None
     cost: float | None = None
@@ -127,7 +124,6 @@ class FigureData:
     names: Names = UNNAMED
     plane: Plane | None = None
     push: Array | None = None
-    corners: Sequence[Array] = ()
 
     def __post_init__(self) -> None:
         pieces, instants = self.breakpoints.size - 1, self.times.size
@@ -165,15 +161,10 @@ class FigureData:
             found.append(np.stack([np.interp(times, self.times, coordinate) for coordinate in path.T], axis=1))
         return found
 
-    def active_on(self, component: int) -> Array:
-        """When a constraint on a state is active."""
-        return self.active_times if self.active_states is None else self.active_times[self.active_states[:, component]]
-
     @property
     def of_states(self) -> str:
         """What a title adds where not every state is shown."""
-        added = sum(one.shape[1] - one.shape[0] for one in self.corners[:1])
-        drawn, known = len(self.drawn_states), self.state.shape[0] - added
+        drawn, known = len(self.drawn_states), len(self.names.own(self.state.shape[0]))
         return "" if drawn == known else f", {drawn} of {known} states"
 
     def control_label(self, channel: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,17 +52,28 @@ class Plane:
     places: Array
     limits: tuple[Limit, ...] = ()
 
+    @property
+    def walls(self) -> list[Limit]:
+        """What holds all the time and stands still."""
+        return [limit for limit in self.limits if limit.is_wall]
+
+    def outlined(self, frame: Array) -> Iterator[tuple[Limit, Array]]:
+        """The other limits, each with what of a convex polygon ``(k, 2)`` is within it; nothing of one that moves."""
+        for limit in self.limits:
+            if not limit.is_wall:
+                yield limit, np.empty((0, 2)) if limit.moves else limit.allowed(frame)
+
     def view(self, path: Array) -> tuple[Array, Array]:
         """The lower and the upper corner of what is shown: a ``path (T, 2)``, its places, the goal, and walls that are
         near."""
         points = np.vstack([path, self.places.reshape(-1, 2)])
         size = float(np.ptp(points, axis=0).max()) or 1.0
         low, high = points.min(axis=0) - size, points.max(axis=0) + size
-        wide = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+        wide = framed(low, high)
         shown = [points]
         for limit in self.limits:
             if limit.is_final:
-                goal = clipped(wide, limit.normals, limit.bounds[-1])
+                goal = limit.allowed(wide)
                 shown.append(goal[((goal > low) & (goal < high)).all(axis=1)])  # no corner of a side that is free
                 continue
             for normal, bounds in zip(limit.normals, limit.bounds.T, strict=True):
@@ -74,6 +86,11 @@ class Plane:
         size = float((high - low).max()) or 1.0
         missing = np.maximum(SLIM * size - (high - low), 0.0) / 2 + MARGIN * size
         return low - missing, high + missing
+
+
+def framed(low: Array, high: Array) -> Array:
+    """A rectangle as a polygon ``(4, 2)``, from its lower and its upper corner."""
+    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
 def clipped(polygon: Array, normals: Array, bounds: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData, plain
-from sparserob_core.experiment.figures.plane import Limit, clipped
+from sparserob_core.experiment.figures.plane import Limit, framed
 from sparserob_core.experiment.figures.style import draw_legend
 
 if TYPE_CHECKING:
@@ -38,13 +38,10 @@ def draw_plane(data: FigureData) -> Figure:
     figure = Figure(figsize=(look.WIDTH, tall + 1.1), layout="constrained")
     ax = figure.subplots()
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-    colour = iter((look.GREEN, look.PURPLE, look.INK))
-    whole = [limit for limit in plane.limits if limit.is_wall]
-    _hatched(ax, frame, whole)
-    for limit in plane.limits:
+    frame, colour = framed(low, high), iter((look.GREEN, look.PURPLE, look.INK))
+    _hatched(ax, frame, plane.walls)
+    for limit, allowed in plane.outlined(frame):
         if limit.is_final:
-            allowed = clipped(frame, limit.normals, limit.bounds[-1])
             goal = Polygon(allowed, fill=False, edgecolor=look.VERMILLION, linewidth=2.0, zorder=4)
             goal.set_label("terminal set")
             if len(allowed) and np.ptp(allowed, axis=0).max() <= POINT * sides.max():
@@ -52,8 +49,8 @@ def draw_plane(data: FigureData) -> Figure:
                         markersize=9, zorder=4, label="terminal set")  # fmt: skip
             else:
                 ax.add_patch(goal)
-        elif not limit.is_wall:
-            _gate(ax, data, limit, path, frame, next(colour, look.INK))
+        else:
+            _gate(ax, data, limit, path, allowed, next(colour, look.INK))
     pair = list(plane.states)
     if (data.tube_upper[pair] > data.tube_lower[pair]).any():
         said = "worst case" if data.gains is None else "worst case, with feedback"
@@ -78,7 +75,7 @@ def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
 
     allowed = frame
     for wall in walls:
-        allowed = clipped(allowed, wall.normals, wall.bounds[0])
+        allowed = wall.allowed(allowed)
     if not walls or not len(allowed):
         return
     hole = allowed[::-1]
@@ -93,15 +90,14 @@ def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
             ax.plot(*np.stack([one, other]).T, color=look.GREY, linewidth=1.0, zorder=1)
 
 
-def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, frame: Array, colour: str) -> None:
-    """A set that holds for a part of the time, or moves: its outline, or where its sides are when the path is beside
-    them, and that part of the path."""
+def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, allowed: Array, colour: str) -> None:
+    """A set that holds for a part of the time, or moves: the outline of what is ``allowed (k, 2)``, or where its sides
+    are when the path is beside them, and that part of the path."""
     during = (data.times >= limit.times[0]) & (data.times <= limit.times[-1])
     unit = f" {plain(data.names.time)}" if data.names.time else ""
     said = f"{plain(limit.name)}, $t$ from {limit.times[0]:.6g} to {limit.times[-1]:.6g}{unit}"
     ax.plot(*path[during].T, color=colour, linewidth=4.0, alpha=0.6, zorder=2.5, solid_capstyle="butt", label=said)
     if not limit.moves:
-        allowed = clipped(frame, limit.normals, limit.bounds[0])
         if len(allowed):
             ax.fill(*allowed.T, fill=False, edgecolor=colour, linewidth=1.1, linestyle=(0, (4, 2)), zorder=1.5)
         return
@@ -132,6 +128,6 @@ def _marks(ax: Axes, data: FigureData, path: Array) -> None:
             path_effects=[withStroke(linewidth=2.0, foreground="white")],
             zorder=6,
         )
-    if len(data.active_times):
-        where = np.stack([np.interp(data.active_times, data.times, coordinate) for coordinate in path.T], axis=1)
+    if len(data.active.times):
+        where = np.stack([np.interp(data.active.times, data.times, coordinate) for coordinate in path.T], axis=1)
         ax.plot(*where.T, "^", color=look.PURPLE, markersize=6, markeredgewidth=0, zorder=5, label="active constraint")

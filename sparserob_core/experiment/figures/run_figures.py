@@ -80,7 +80,7 @@ def draw_control(data: FigureData) -> Figure:
             )
         ax.stairs(*edges, baseline=None, color=look.BLUE, linewidth=1.5, zorder=3, label="control")
         _bounds(ax, float(data.control_lower[channel]), float(data.control_upper[channel]), steps)
-        _rug(ax, data.active_times)
+        _rug(ax, data.active.times)
         ax.set_ylabel(data.control_label(channel))
     draw_time_axis(axes[-1], data)
     _title(axes[0], data.title, _summary(data))
@@ -107,7 +107,7 @@ def draw_switching(data: FigureData) -> Figure:
         ax.stairs(
             push, ends, baseline=None, color=look.PURPLE, linewidth=1.5, zorder=3, label="push of the constraints"
         )
-        _rug(ax, data.active_times)
+        _rug(ax, data.active.times)
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(f"push on {plain(data.names.control(channel))}")
     draw_time_axis(axes[-1], data)
@@ -156,7 +156,7 @@ def draw_states(data: FigureData) -> Figure:
         walls = [wall for wall in data.walls if wall.state == component]
         ax.set_ylim(*_limits(data, component, walls))
         draw_walls(ax, walls)
-        _rug(ax, data.active_on(component))
+        _rug(ax, data.active.on(component))
         ax.set_ylabel(data.state_label(component))
     draw_time_axis(axes[-1], data)
     axes[0].set_title(data.title + data.of_states)

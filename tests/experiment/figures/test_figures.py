@@ -16,7 +16,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, assemble
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.figures import drawing
-from sparserob_core.experiment.figures.active import active_of, stored_active
+from sparserob_core.experiment.figures.active import Active, active_of, stored_active
 from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
 from sparserob_core.experiment.figures.style import _letters_told, draw_legend, held, panels, style
@@ -45,7 +45,7 @@ def data() -> FigureData:
         tube_lower=state - 0.1,
         tube_upper=state + 0.1,
         history=history,
-        active_times=np.array([0.5, 2.0]),
+        active=Active(np.array([0.5, 2.0])),
         tolerance=1e-6,
         walls=[Wall(state=0, upper=1.2, start=0.0, end=2.0), Wall(state=1, lower=-1.5, upper=0.5, start=2.0, end=2.0)],
     )
@@ -72,7 +72,7 @@ def test_the_same_data_gives_the_same_bytes(files: list[Path], data: FigureData,
 
 
 def test_an_active_constraint_is_marked_under_the_states_that_it_bounds(data: FigureData) -> None:
-    some = replace(data, active_states=np.array([[True, False], [False, False]]))
+    some = replace(data, active=replace(data.active, states=np.array([[True, False], [False, False]])))
     for drawn, counts in ((data, (2, 2)), (some, (1, 0))):
         for axes, count in zip(draw_states(drawn).axes, counts, strict=True):
             marks = [line for line in axes.lines if line.get_label() == "active constraint"]
@@ -235,7 +235,7 @@ def test_bounds_that_are_not_known_yet_are_not_drawn(data: FigureData) -> None:
 
 @pytest.mark.slow
 def test_a_run_that_ended_in_its_first_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
-    only = replace(data, history=data.history[:1], tolerance=None, active_times=np.empty(0), walls=())
+    only = replace(data, history=data.history[:1], tolerance=None, active=Active(), walls=())
     assert len(write_figures(tmp_path, only)) == 6
 
 
