@@ -167,28 +167,30 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
     lattice, _ = model.parameters.lattice()
     if len(lattice) > PARAMETERS:
         lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
-    count, found = len(lattice), np.full((len(directions), times.size), -np.inf)
-    every = _everywhere(model, directions)
+    rows, every = _everywhere(model, directions)
+    count, found = len(every) * len(lattice), np.full((len(directions), times.size), -np.inf)
+    along, p = np.repeat(every, len(lattice), axis=0), np.tile(lattice, (len(every), 1))
     size = max(1, INSTANTS // count)
     for start in range(0, times.size, size):
         part = slice(start, start + size)
-        at, p = np.tile(times[part], count), np.repeat(lattice, times[part].size, axis=0)
-        for row, direction in every:
-            values = model.functionals.values(theta, at, np.tile(direction, (at.size, 1)), p)
-            found[row, part] = np.maximum(found[row, part], values.reshape(count, -1).max(axis=0))
+        now = times[part].size
+        at = np.tile(times[part], count), np.repeat(along, now, axis=0), np.repeat(p, now, axis=0)
+        values = model.functionals.values(theta, *at).reshape(len(every), len(lattice), now).max(axis=1)
+        np.maximum.at(found, (rows, part), values)
     return found
 
 
-def _everywhere(model: Transcription, directions: Array) -> list[tuple[int, Array]]:
-    """Rows ``(d,)`` of ``directions (q, d)``, each with its number, at every corner of the parameters beside the time;
-    one that looks at no state which these reach is there once."""
+def _everywhere(model: Transcription, directions: Array) -> tuple[np.ndarray, Array]:
+    """Rows ``(k, d)`` of ``directions (q, d)``, after the number of each, at every corner of the parameters beside the
+    time; one that looks at no state which these reach is there once."""
     corners = at_corners(model.stated)
     if corners is None:
-        return list(enumerate(directions))
+        return np.arange(len(directions)), directions
     d, size = corners[0].shape
     every = np.repeat(directions[:, None], len(corners), axis=1)
     every[:, :, d:size] += np.stack([directions[:, :d] @ one[:, d:] for one in corners], axis=1)
-    return [(row, one) for row, part in enumerate(every) for one in np.unique(part, axis=0)]
+    kept = [np.unique(part, axis=0) for part in every]
+    return np.repeat(np.arange(len(kept)), [len(part) for part in kept]), np.concatenate(kept)
 
 
 def _times(time: npt.ArrayLike, horizon: float) -> Array:

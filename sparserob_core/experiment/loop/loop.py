@@ -129,9 +129,7 @@ def _closed(
             if laws[law] <= DRAWN and not period:
                 kept.append((law, states[shown, :, 0].T, closing.applied))
             before, begun = closing.applied[:, -1:].T, states[-1].T.copy()
-            begun[:, model.stated.system.states :] = (
-                0.0  # integrals, and what parameters add beside the time, begin anew
-            )
+            begun[:, model.stated.system.states :] = 0.0  # integrals, and what parameters add, begin anew
         spent += [1e3 * one.seconds for one in acting.steps]
         resolved += sum(one.resolved for one in acting.steps)
         uncovered += max(sum(not one.covered for one in acting.steps), int(acting.ever_uncovered))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -134,9 +135,7 @@ def _unit_axis(ax: Axes, found: Margin) -> None:
 
 
 def _mathematics(quantity: str) -> str:
-    for written, drawn in (("|w_i|", "$|w_i|$"), ("|u_i|", "$|u_i|$"), ("|x_i(0)|", "$|x_i(0)|$")):
-        quantity = quantity.replace(written, drawn)
-    return quantity
+    return re.sub(r"\|?[wux]_i(\(0\))?\|?", lambda written: f"${written.group()}$", quantity)
 
 
 def _view(values: Array) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.messages import nearest
+from sparserob_core.sip.convex_set import Array
 
 Sense: TypeAlias = Literal["largest", "smallest"]
 LARGEST = 1e6  # factors beyond are not looked at
@@ -49,6 +50,8 @@ class Scaling:
     too."""
     cost_unit: str = ""
     """Of the cost, where the problem names one."""
+    unit: str = ""
+    """Of the quantity, where it is that of some states of several units alone."""
 
 
 def scaling(
@@ -89,7 +92,7 @@ def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
         "control_step": joined(names.control_units),
         "execution": "",
         **dict.fromkeys(problem.sums, ""),
-    }.get(chosen.of.split(".")[0], of_states if chosen.relative else joined([names.time])).strip()
+    }.get(chosen.of.split(".")[0], chosen.unit or of_states if chosen.relative else joined([names.time])).strip()
     label = chosen.label.replace("[unit of time]", f"[{unit}]") if unit else chosen.label
     quantity = f"{chosen.quantity} [{unit}]" if unit else chosen.quantity
     return replace(chosen, label=label, quantity=quantity, cost_unit=problem.cost_unit)
@@ -165,7 +168,7 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
             " another thing to vary"
         )
     if bound is not None:
-        one, far = np.ones(bound.dimension), float(bound.reach(np.eye(bound.dimension)).max())
+        one, reach = np.ones(bound.dimension), bound.reach(np.eye(bound.dimension))
         return Scaling(
             "initial_state",
             "factor on the set of initial states",
@@ -173,7 +176,8 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
             # about the centre, which is no deviation, not about the middle of the deviations
             lambda f: replace(problem, initial_set=bound.in_units(one / f) if f > 0.0 else None),
             "largest deviation of x_i(0)",
-            _times(far),
+            _times(float(reach.max())),
+            unit=_of_largest(problem, reach),
         )
     state = np.asarray(problem.initial_state, dtype=float)
     if not state.any():
@@ -186,7 +190,15 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
         "largest |x_i(0)|",
         _times(float(np.abs(state).max())),
         nested=False,
+        unit=_of_largest(problem, np.abs(state)),
     )
+
+
+def _of_largest(problem: OptimalControlProblem, sizes: Array) -> str:
+    """The unit of the states with the largest of the ``sizes (d,)``, where these share one."""
+    names = problem.names
+    units = {names.state_units[one] for one in np.flatnonzero(sizes == sizes.max())} if names.state_units else set()
+    return units.pop() if len(units) == 1 else ""
 
 
 def _control(problem: OptimalControlProblem) -> Scaling:

@@ -190,7 +190,7 @@ class PlainRows(Working):
     def candidate(self, answer: Answer) -> Answer | None:
         return None
 
-    def bounded(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+    def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
         return ledger.relaxed.lower_bound(answer.rows, replace(answer.solution, x=x))
 
     def choose(

@@ -361,7 +361,7 @@ class RobustRows(Working):
             ledger.relaxed.counted.calls = ledger.relaxed.solves
         ledger.relaxed.solved_by.update(self.calls - ledger.relaxed.solved_by)
 
-    def bounded(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+    def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
         return self.at_rest
 
     def choose(

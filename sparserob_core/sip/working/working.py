@@ -97,7 +97,7 @@ class Working(ABC):
         is left to try."""
 
     @abstractmethod
-    def bounded(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+    def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
         """What is proven with the multipliers of an answer, or none, where the cost is touched at ``x (n,)``."""
 
     @abstractmethod
@@ -141,7 +141,7 @@ class Working(ABC):
         cost = self.program.cost(other)
         if answer.epsilon or not ledger.open(x) or not ledger.lower <= cost < self.program.cost(x):
             return answer, found  # what costs less than the lower bound is proven not to be feasible
-        ledger.improve(self.bounded(ledger, answer, other))
+        ledger.improve(self.proven(ledger, answer, other))
         if not fits(ledger, other):
             return answer, found
         every = separate(self.program, other, ledger.tools, ALLOWED, number)
