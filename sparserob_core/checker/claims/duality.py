@@ -237,18 +237,21 @@ class Duality:
         charges = price if lengths else None
         groups = [] if charges is None else [block for block in charges.blocks if len(block) > 1]
         free = [[_exact(0.0)] * self.problem.system.controls] * len(slopes)
-        charged = self.charged(rows, free if charges is None else charges.costs)
-        for k, (costs, slope) in enumerate(zip(charged, slopes, strict=True)):
+        costs = free if charges is None else charges.costs
+        sizes = self.charged(rows, free)
+        for k, (cost, size, slope) in enumerate(zip(costs, sizes, slopes, strict=True)):
             if groups and touched is not None:
                 offered = None if norms is None else [_exact(v) for v in norms[:, k]]
-                constant = constant + self._least_of_groups(costs, slope, groups, touched[k].entries(), offered)
+                constant = constant + self._least_of_groups(cost, size, slope, groups, touched[k].entries(), offered)
             else:
-                constant = constant + known(self.problem.control).least(costs, costs, slope)
+                every = [a + b for a, b in zip(cost, size, strict=True)]
+                constant = constant + known(self.problem.control).least(every, every, slope)
         return constant
 
     def _least_of_groups(
         self,
         weights: list[arb],
+        sizes: list[arb],
         slope: list[arb],
         groups: Sequence[Sequence[int]],
         at: Sequence[arb],
@@ -256,19 +259,21 @@ class Duality:
     ) -> arb:
         """At most the least cost with norms of groups: ``weight |s| >= d's`` for any ``|d| <= weight``, that which the
         slope asks for, that of the tangent or one that is ``offered``; each group the best one, for a set that is a
-        box, else all the same.
+        box, else all the same. What absolute values cost beside them, ``sizes``, is taken from what is asked for and
+        offered.
 
         In a corner of slanted sides the one that bounds most is between these two: the multipliers of the sides take a
         part of what the slope asks for, and a tangent at a control that is off by a little tilts the corner.
         """
-        asked = [_exact(-float(s.mid())) for s in slope]
+        asked = _shrunk([_exact(-float(s.mid())) for s in slope], sizes)
+        given = [] if offered is None else [(_within, _shrunk(offered, sizes))]
         offers = []
-        for chosen, wanted in ((_within, asked), (_lengthened, at), *([] if offered is None else [(_within, offered)])):
-            tilted, left = list(slope), list(weights)
+        for chosen, wanted in ((_within, asked), (_lengthened, at), *given):
+            tilted, left = list(slope), [a + b for a, b in zip(weights, sizes, strict=True)]
             for block in groups:
                 d = chosen([wanted[c] for c in block], weights[block[0]])
                 for c, push in zip(block, d, strict=True):
-                    tilted[c], left[c] = slope[c] + push, _exact(0.0)
+                    tilted[c], left[c] = slope[c] + push, sizes[c]
             offers.append((left, tilted))
         shape = known(self.problem.control)
         if not isinstance(shape, Boxed):
@@ -383,6 +388,12 @@ def _differences(integrals: Sequence[list[arb] | None], width: int) -> list[list
 def _most(values: Sequence[arb]) -> arb:
     """The largest of what is proven in several ways."""
     return reduce(lambda one, other: one.max(other), values)
+
+
+def _shrunk(vector: Sequence[arb], sizes: Sequence[arb]) -> list[arb]:
+    """Exact numbers, each nearer to 0 by a size, or 0."""
+    about = [(float(v.mid()), float(size.mid())) for v, size in zip(vector, sizes, strict=True)]
+    return [_exact(np.sign(v) * max(abs(v) - size, 0.0)) for v, size in about]
 
 
 def _within(vector: Sequence[arb], length: arb) -> Sequence[arb]:

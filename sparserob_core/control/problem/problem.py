@@ -283,7 +283,6 @@ class OptimalControlProblem(Term):
             "measurable disturbances": self.measurable is not None,
             "integrals of state and control": bool(self.sums),
             "curved sets of states": any(one.halfspaces() is None for one in sets),
-            "a cost other than the L1 norm": not self.cost.is_linear,
         }
         for beside, given in refused.items():
             if given:
