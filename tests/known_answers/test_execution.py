@@ -103,6 +103,7 @@ BOTH: dict[str, Any] = {  # x' = u in two axes, of which one is pushed by 0.9 / 
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("control", [{"box": [1.0, 1.0]}, {"polytope": {"H": CORNERS, "h": [1.2] * 4 + [1.0] * 4}}])
 def test_a_push_as_one_vector_has_errors_channel_by_channel(control: dict[str, Any], tmp_path: Path) -> None:
     problem = {**BOTH, "control": control, "cost": {"group": "all"}}
@@ -111,6 +112,7 @@ def test_a_push_as_one_vector_has_errors_channel_by_channel(control: dict[str, A
     )
 
 
+@pytest.mark.slow
 def test_an_energy_is_that_of_the_command(tmp_path: Path) -> None:
     # the mean is the same on all pieces: 2 |u|^2 of it over the horizon of 2, and the norm beside it
     problem = {**BOTH, "cost": {"l1": 1.0, "control": {"R": [[1, 0], [0, 1]]}}}
@@ -191,8 +193,14 @@ def test_a_control_that_is_refuted_shows_by_how_much(tmp_path: Path) -> None:
         ({"execution": [-0.1, 0.1]}, "numbers from 0 to 1"),
         ({"execution": [0.1, 0.1, 0.1]}, "2"),
         ({"terminal": [{"equals": [0, 0]}]}, "fixed final values"),
-        ({"system": {"A": A.tolist(), "B": B.tolist(), "delay": 0.1}}, "a delay"),
-        ({"disturbance": {"box": 0.01}, "disturbance_class": "measurable"}, "measurable"),
+        (
+            {
+                "system": {"A": A.tolist(), "B": B.tolist(), "delay": 0.1},
+                "disturbance": {"norm": {"p": 1, "radius": 0.01}},
+                "disturbance_class": "measurable",
+            },
+            "measurable disturbances in another set than a box",
+        ),
         ({"terminal": [{"norm": {"p": 2, "radius": 0.3}}]}, "curved sets of states"),
     ],
 )

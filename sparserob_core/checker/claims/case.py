@@ -26,19 +26,20 @@ from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.turns import in_turns
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.integral import Accumulated
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.sets.sets import Box, ConvexSet, Product, product
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb_mat
+    from flint import arb, arb_mat
 
 
 RETURN, EQUALS, STEP = "return", "equals", "control_step"
@@ -73,7 +74,7 @@ class Case:
         known = parted(plain)
         if known is not plain and self.policy is not None:
             raise Unchecked("the checker knows no feedback beside parameters and the time")
-        object.__setattr__(self, "problem", integrating(known))
+        object.__setattr__(self, "problem", in_turns(integrating(known)))
         if self.problem.disturbance_breakpoints is not None:
             known_by, joint = on_one_grid(self.problem, self.disturbance)
             object.__setattr__(self, "problem", known_by)
@@ -402,13 +403,32 @@ class Case:
         if shares is None:
             return None
         system = self.problem.system
-        one = isinstance(system, LinearSystem | VaryingSystem)
-        if not one or system.parameter_count or system.delay or self.answering:
-            raise Unchecked("the checker knows errors of execution of one known system, undelayed and without feedback")
+        if system.parameter_count or self.answering:
+            raise Unchecked("the checker knows errors of execution of known systems, without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
         if self.changing is not None:
-            return VaryingExecution(self.changing, np.asarray(shares, dtype=float), self.control.breakpoints, pieces)
+            acts = self.control.breakpoints
+            if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
+                begins = acts[:-1] + system.delay
+                acts = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
+                pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][
+                    : acts.size - 1 if pieces else 0
+                ]
+            return VaryingExecution(self.changing, np.asarray(shares, dtype=float), acts, pieces)
         return Execution(self.problem, np.asarray(shares, dtype=float), self.control.breakpoints, pieces)
+
+    def erring(self, c: Array, time: float) -> tuple[Array | None, arb]:
+        """What errors of execution add to ``c'x(t)`` at least: of a command of size 1 on every piece, ``(K, m)``,
+        ``None`` where there are none; and of what was commanded before."""
+        from flint import arb
+
+        found, none = None if self.execution is None else self.execution.least(c, time), arb(0)
+        if found is None or not self.problem.system.delay > 0.0:
+            return found, none
+        sizes = np.zeros((self.control.pieces, found.shape[1]))
+        sizes[: len(found) - 1] = found[1:]
+        known = zip(balls(found[0]), balls(before(self.problem)), strict=True)
+        return sizes, sum((size * abs(u) for size, u in known), none)
 
     def at(self, time: float) -> str:
         """A time in words."""

@@ -159,7 +159,8 @@ def _undisturbed(
             row = replace(row, constant=answers_of(case).disturbed(c, time, limit))
     if case.strayed is not None:
         row = replace(row, constant=row.constant + balls([case.strayed.added(c, time)[0]])[0])
-    row = replace(row, sizes=None if case.execution is None else case.execution.least(c, time))
+    sizes, given = case.erring(c, time)
+    row = replace(row, constant=row.constant + given, sizes=sizes)
     if window is not None and window.is_mixed:
         piece = piece_of(case, window, entry, time)
         row.slope[piece] = [a + b for a, b in zip(row.slope[piece], balls(gain), strict=True)]

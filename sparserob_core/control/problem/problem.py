@@ -276,11 +276,12 @@ class OptimalControlProblem(Term):
             "fixed final values, which an error of execution misses: a terminal set such as box": bool(
                 self.terminal_equalities
             ),
-            "pieces of the system": isinstance(self.system, SwitchedSystem),
             "uncertain parameters, but for those beside the time t": bool(self.system.parameter_count)
             and not self.system.varies,
-            "a delay": self.system.delay > 0.0,
-            "measurable disturbances": self.measurable is not None,
+            "measurable disturbances in another set than a box where the system has pieces or a delay": self.measurable
+            is not None
+            and not self.measurable.is_box
+            and (bool(self.system.switches) or self.system.delay > 0.0),
             "integrals of state and control": bool(self.sums),
             "curved sets of states": any(one.halfspaces() is None for one in sets),
         }

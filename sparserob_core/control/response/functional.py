@@ -131,7 +131,7 @@ class WorstCase:
             zero = np.zeros(model.channels)
             model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
         if isinstance(system, VaryingSystem):  # which is known
-            return replace(self, disturbance=model, initial=None, shared=None)
+            return replace(self, disturbance=model, initial=None, shared=None, execution=self._exactly)
         middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
         modes = [LinearSystem(*(part[0] for part in mode.matrices(middle))) for mode in system.modes]
         ends = (*system.switches, float(self.response.grid.breakpoints[-1]))
@@ -212,6 +212,8 @@ class WorstCase:
             if self.execution is not None:
                 G[part, self.coefficients :] = self.execution.lengths(times[part], directions[part])
             offset[part] = known.free @ self.response.initial_state + self.given(known.control) + pushed(part, known)
+            if self.execution is not None:
+                offset[part] += self.execution.given(times[part], directions[part])
         return G, offset
 
     @shaped

@@ -568,6 +568,10 @@ class Execution:
         """The same of a control that is delivered as it is commanded."""
         return replace(self, shares=np.zeros(self.shares.size))
 
+    def given(self, times: Array, directions: Array) -> Array:
+        """What errors of what was commanded before the first piece add to ``c'x(t)``, ``(k,)``: nothing."""
+        return np.zeros(times.size)
+
     @property
     def size(self) -> int:
         """How many absolute values there are, one for every channel and piece."""
@@ -721,10 +725,16 @@ class ExecutionCellSupport(KnownCellSupport):
 @dataclass(frozen=True, eq=False)
 class VaryingExecution(Execution):
     """`Execution` of a system that changes with time; ``disturbing``: what is commanded enters through ``E``, all of
-    it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do."""
+    it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do. ``before (m,)``: the
+    size of what acts until the first command does, where these act late."""
 
     disturbing: bool = False
+    before: Array | None = None
     _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
+
+    def none(self) -> VaryingExecution:
+        """`Execution.none`; what is remembered is of these shares."""
+        return replace(self, shares=np.zeros(self.shares.size), _lengths={})
 
     def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion) -> Support:
         """`Execution.over`."""
@@ -744,12 +754,23 @@ class VaryingExecution(Execution):
 
     @cached_property
     def acting(self) -> np.ndarray:
-        """The piece of the command that acts between marks, ``(K,)``."""
+        """What acts between marks, ``(L,)``: a piece of the command, after what did before the first of them where
+        they act late (`acts`)."""
         grid = self.motion.grid
         if not self.disturbing:
-            return grid.control_piece
+            return np.asarray(grid.control_piece + self.late)
         middles = (grid.breakpoints[:-1] + grid.breakpoints[1:]) / 2
         return np.clip(np.searchsorted(self.breakpoints, middles) - 1, 0, self.breakpoints.size - 2)
+
+    @property
+    def late(self) -> int:
+        """How much acts before the first piece of the command: 1, or 0 where that acts at once."""
+        return int(self.motion.grid.before is not None and not self.disturbing)
+
+    def acts(self, control: Array) -> Array:
+        """The size of all that acts, ``(m, late + K)``, from a command ``(m, K)``."""
+        size = np.abs(control)
+        return np.column_stack([self.before, size]) if self.late and self.before is not None else size
 
     @cached_property
     def kernel(self) -> Kernel:
@@ -760,8 +781,19 @@ class VaryingExecution(Execution):
     @shaped
     def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
         """`Execution.lengths`."""
-        every = np.ones((self.shares.size, self.breakpoints.size - 1), dtype=bool)
-        return np.asarray(self._over_pieces(times, directions, every).mean(axis=3).reshape(times.size, -1))
+        return np.asarray(self._of_each(times, directions)[:, :, self.late :].reshape(times.size, -1))
+
+    @shaped
+    def given(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, " k"]:
+        """`Execution.given`, where commands act late."""
+        if not self.late:
+            return np.zeros(times.size)
+        return self.added(np.zeros((self.shares.size, self.breakpoints.size - 1)), times, directions)
+
+    def _of_each(self, times: Array, directions: Array) -> Array:
+        """What each size of 1 of all that acts adds, ``(k, m, late + K)``."""
+        every = np.ones((self.shares.size, self.late + self.breakpoints.size - 1), dtype=bool)
+        return np.asarray(self._over_pieces(times, directions, every).mean(axis=3))
 
     @shaped
     def added(
@@ -776,8 +808,8 @@ class VaryingExecution(Execution):
             return self.added(control, times, directions)
         key = times.tobytes() + directions.tobytes()
         if key not in self._lengths:
-            remember(self._lengths, key, self.lengths(times, directions), KEPT)
-        return np.asarray(self._lengths[key] @ np.abs(control).ravel())
+            remember(self._lengths, key, self._of_each(times, directions).reshape(times.size, -1), KEPT)
+        return np.asarray(self._lengths[key] @ self.acts(control).ravel())
 
     @shaped
     def slope(
@@ -799,14 +831,14 @@ class VaryingExecution(Execution):
 
     def _summed(self, control: Array, times: Array, directions: Array) -> Array:
         """What errors of a control add, between two bounds, ``(k, 2)``."""
-        size = np.abs(control)
+        size = self.acts(control)
         bounds: Array = self._over_pieces(times, directions, np.asarray(size > 0.0))
         return np.asarray(np.einsum("kjpe,jp->ke", bounds, size))
 
     def _over_pieces(self, times: Array, directions: Array, wanted: np.ndarray) -> Array:
-        """Bounds of ``share_j int |c'Phi(t, s) B_j(s)| ds`` over every piece of the command, ``(k, m, K, 2)``; 0 for
-        pieces that are not ``wanted (m, K)``."""
-        found = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1, 2))
+        """Bounds of ``share_j int |c'Phi(t, s) B_j(s)| ds`` over all that acts, ``(k, m, late + K, 2)``; 0 for what is
+        not ``wanted (m, late + K)``."""
+        found = np.zeros((times.size, *wanted.shape, 2))
         asked = np.logical_and(wanted, self.shares[:, None] > 0.0)
         acting = self.acting
         pieces = np.flatnonzero(asked[:, acting].any(axis=0))
@@ -925,7 +957,7 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     @cached_property
     def _sizing(self) -> Array:
         """How large errors may be on every piece between marks, ``(K, m)``."""
-        size = self.execution.shares[:, None] * np.abs(self.control)
+        size = self.execution.shares[:, None] * self.execution.acts(self.control)
         return np.asarray(size[:, self.execution.acting].T * OUTWARD)
 
     @cached_property

@@ -32,6 +32,7 @@ from sparserob_core.control.transcription.program import OpenLoop, held_nominall
 from sparserob_core.control.transcription.record import Acting, Posed, Transcription
 from sparserob_core.control.transcription.steps import refuse_without_steps
 from sparserob_core.control.transcription.terms.accumulated import accumulated
+from sparserob_core.control.transcription.terms.in_time import in_time
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import OwnUnits, SemiInfiniteProgram
@@ -90,7 +91,7 @@ def prepare(
             )
     require_representable(problem)
     stated, disturbance = _on_one_grid(problem, disturbance)
-    problem = accumulated(stated)
+    problem = in_time(accumulated(stated))
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
     if problem.execution is not None and mask.any():
@@ -146,8 +147,12 @@ def _functionals(
     if problem.execution is not None:
         from sparserob_core.control.response.measurable import Execution, VaryingExecution
 
-        made = VaryingExecution if system.varies else Execution
-        execution = made(response, control.breakpoints, np.asarray(problem.execution))
+        shares = np.asarray(problem.execution)
+        execution = (
+            VaryingExecution(response, control.breakpoints, shares, before=np.abs(before))
+            if system.varies
+            else Execution(response, control.breakpoints, shares)
+        )
     functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)
 

@@ -1,0 +1,192 @@
+"""Guards known answers: errors of execution beside pieces of the system, delays, and measurable disturbances,
+against an independent linear program, in two systems of units; the worst errors themselves."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import linprog
+
+import sparserob_core as sr
+from sparserob_core.experiment.check.check import check
+from tests.known_answers.test_checks import pieces, verified
+
+PIECES, HORIZON, FINE = 8, 3.0, 60  # steps of a piece: delays and turns fall on them
+A = np.array([[0.0, 1.0], [-4.0, -0.3]])
+B = np.array([[0.0, 0.4], [1.0, 0.0]])
+PROBLEM: dict[str, Any] = {
+    "name": "linear",
+    "system": {"A": A.tolist(), "B": B.tolist()},
+    "horizon": HORIZON,
+    "initial_state": [-1.0, 0.5],
+    "control": {"box": [1.0, 1.0]},
+    "weights": [1.0, 0.2],
+    "execution": [0.1, 0.05],
+    "path": [{"box": [0.6, None], "from": 1.5}],
+    "terminal": [{"box": [0.25, 0.35]}],
+}
+TURNS = {
+    "pieces": [
+        {"until": 1.5, "A": A.tolist(), "B": B.tolist()},
+        {"until": 3.0, "A": [[0.0, 1.0], [-1.0, -0.4]], "B": [[0.3, 0.1], [0.0, 0.8]]},
+    ]
+}
+LATE = {"delay": 0.25, **PROBLEM["system"]}
+CASES: dict[str, dict[str, Any]] = {
+    "pieces": {"system": TURNS},
+    "delay": {"system": LATE},
+    "delay from another control": {"system": LATE, "initial_control": [0.4, -0.6]},
+    "pieces and delay": {"system": {**TURNS, "delay": 0.25}, "initial_control": [0.4, 0.6]},
+    "measurable": {"disturbance": {"box": [0.02, 0.03]}, "disturbance_class": "measurable"},
+    "measurable and pieces": {
+        "system": TURNS,
+        "disturbance": {"box": [0.02, 0.03]},
+        "disturbance_class": "measurable",
+    },
+}
+STATES, CONTROLS, TIME = np.array([7.0, 0.003]), np.array([40.0, 0.9]), 1100.0  # one of the other units
+
+
+def in_other_units(given: dict[str, Any]) -> dict[str, Any]:
+    """The same problem with states, controls and times in other units, of which the cost is that in the other time."""
+    problem = copy.deepcopy(given)
+    for one in problem["system"].get("pieces", [problem["system"]]):
+        one["A"] = (np.array(one["A"]) * STATES / STATES[:, None] * TIME).tolist()
+        one["E"] = np.diag(TIME / STATES).tolist()
+        one["B"] = (np.array(one["B"]) * CONTROLS / STATES[:, None] * TIME).tolist()
+        if "until" in one:
+            one["until"] /= TIME
+    if "delay" in problem["system"]:
+        problem["system"]["delay"] /= TIME
+    problem["horizon"] /= TIME
+    problem["initial_state"] = (np.array(problem["initial_state"]) / STATES).tolist()
+    problem["weights"] = (np.array(problem["weights"]) * CONTROLS).tolist()
+    problem["control"]["box"] = (np.array(problem["control"]["box"]) / CONTROLS).tolist()
+    if "initial_control" in problem:
+        problem["initial_control"] = (np.array(problem["initial_control"]) / CONTROLS).tolist()
+    for entry in (*problem["path"], *problem["terminal"]):
+        entry["box"] = [None if v is None else v / u for v, u in zip(entry["box"], STATES, strict=True)]
+    for entry in problem["path"]:
+        entry["from"] /= TIME
+    return problem
+
+
+class Walk:
+    """A problem on fine steps: transitions, and what commands and disturbances of each step push by."""
+
+    def __init__(self, problem: dict[str, Any]) -> None:
+        system, steps = problem["system"], PIECES * FINE
+        self.step, d = HORIZON / steps, 2
+        modes = system.get("pieces", [{"until": HORIZON, **system}])
+        middles = (np.arange(steps) + 0.5) * self.step
+        which = [next(i for i, one in enumerate(modes) if middle < one["until"]) for middle in middles]
+        known = []
+        for one in modes:
+            flow, M = np.array(one["A"]), np.zeros((d + 4, d + 4))
+            M[:d, :d], M[:d, d : d + 2], M[:d, d + 2 :] = flow, np.array(one["B"]), np.eye(d)
+            known.append(expm(M * self.step)[:d])
+        self.flows = np.array([known[i][:, :d] for i in which])
+        self.pushed = np.array([known[i][:, d : d + 2] for i in which])
+        self.moved = np.array([known[i][:, d + 2 :] for i in which])
+        late = round(system.get("delay", 0.0) / self.step)
+        self.piece = (np.arange(steps) - late) // FINE  # negative ones: what was commanded before
+        self.before = np.array(problem.get("initial_control", [0.0, 0.0]))
+        self.start = np.array(problem["initial_state"])
+        sizes = problem.get("disturbance", {"box": [0.0, 0.0]})["box"]
+        self.shares, self.far = np.array(problem["execution"]), np.array(sizes)
+
+    def row(self, c: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Of ``c'x`` after ``n`` steps: what commands give, what sizes of commands add, and the rest."""
+        lines = [c]
+        for flow in self.flows[:n][::-1]:
+            lines.append(lines[-1] @ flow)
+        rows = np.array(lines[:n][::-1]).reshape(n, 2)
+        on, off = np.zeros((2, PIECES)), np.zeros((2, PIECES))
+        each = np.einsum("nd,ndm->nm", rows, self.pushed[:n])
+        early = self.piece[:n] < 0
+        for k in range(PIECES):
+            on[:, k] = each[self.piece[:n] == k].sum(axis=0)
+            off[:, k] = self.shares * np.abs(each[self.piece[:n] == k]).sum(axis=0)
+        rest = float(lines[n] @ self.start + each[early].sum(axis=0) @ self.before)
+        rest += float(self.shares * np.abs(self.before) @ np.abs(each[early]).sum(axis=0))
+        return on, off, rest + float(np.abs(np.einsum("nd,ndm->nm", rows, self.moved[:n])).sum(axis=0) @ self.far)
+
+
+def least_cost(problem: dict[str, Any]) -> float:
+    """The cost by a linear program in ``u = a - b``, its rows at every fine step."""
+    walk, G, h = Walk(problem), [], []
+    last = PIECES * FINE
+    begin = round(problem["path"][0]["from"] / walk.step)
+    windows = [(0, problem["path"][0]["box"][0], range(begin, last + 1))]
+    windows += [(i, problem["terminal"][0]["box"][i], range(last, last + 1)) for i in range(2)]
+    for axis, bound, times in windows:
+        for n in times:
+            for sign in (1.0, -1.0):
+                on, off, rest = walk.row(sign * np.eye(2)[axis], n)
+                G.append(np.concatenate([(on + off).ravel(), (off - on).ravel()]))
+                h.append(bound - rest)
+    prices = np.tile(np.repeat(problem["weights"], PIECES), 2) * HORIZON / PIECES
+    found = linprog(prices, A_ub=G, b_ub=h, bounds=(0, 1), method="highs")
+    assert found.success
+    return float(found.fun)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_the_cost_is_that_of_an_independent_linear_program_in_any_units(name: str, tmp_path: Path) -> None:
+    problem = {**PROBLEM, **CASES[name]}
+    expected = least_cost(problem)
+    assert verified(tmp_path / "run", problem, pieces(PIECES))["cost"] == pytest.approx(expected, rel=1e-4)
+    other = verified(tmp_path / "other", in_other_units(problem), pieces(PIECES))["cost"]
+    mine = json.loads((tmp_path / "run" / "result.json").read_text())["cost"]
+    assert other * TIME == pytest.approx(mine, rel=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pieces", "delay from another control", "measurable and pieces"])
+def test_a_plan_that_does_not_know_them_is_refuted_by_what_is_derived_again(name: str, tmp_path: Path) -> None:
+    problem = {**PROBLEM, **CASES[name]}
+    config = {"problem": problem, "dictionaries": {"control": pieces(PIECES)}, "observers": []}
+    sr.run({**config, "method": {"name": "nominal"}}, out=tmp_path / "nominal", figures=False)
+    assert {one.name: one.verdict for one in check(tmp_path / "nominal").claims}["violation"] == "holds"
+    sr.run(config, out=tmp_path / "run", figures=False)
+    for row in sr.simulate(tmp_path / "run", law="adversary").constraints:
+        assert row.worst - 1e-4 < row.largest < 1e-9  # errors change their signs where steps of the replay do
+
+
+@pytest.mark.slow
+def test_what_is_commanded_before_a_delay_is_missed_too(tmp_path: Path) -> None:
+    # x' = u(t - 0.5) from -1: of 0.4 before and of U by the pieces 0.95 arrive for sure, 0.9 at least must
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0]], "B": [[1]], "delay": 0.5},
+        "horizon": 2.0,
+        "initial_state": [-1],
+        "initial_control": [0.4],
+        "control": {"box": 1.0},
+        "terminal": [{"box": 0.1}],
+        "execution": 0.05,
+    }
+    assert verified(tmp_path / "run", problem, pieces(4))["cost"] == pytest.approx(0.9 / 0.95 - 0.2, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_errors_of_a_piece_count_through_the_system_that_acts_then(tmp_path: Path) -> None:
+    # x' = u, then x' = 2 u: a push of 0.5 U through the second one is the cheapest
+    turns = [{"until": 1.0, "A": [[0]], "B": [[1]]}, {"until": 2.0, "A": [[0]], "B": [[2]]}]
+    problem = {
+        "name": "linear",
+        "system": {"pieces": turns},
+        "horizon": 2.0,
+        "initial_state": [-1],
+        "control": {"box": 1.0},
+        "terminal": [{"box": 0.1}],
+        "execution": 0.05,
+    }
+    assert verified(tmp_path / "run", problem, pieces(4))["cost"] == pytest.approx(0.45 / 0.95, rel=1e-9)
