@@ -124,7 +124,7 @@ class Controller:
         self._last: Array | None = None
         self._reach: tuple[Array, Array] | None = None
         # of the integrals, which nobody measures, what the applied controls have added up to
-        self._added_up = np.zeros(self._planned.model.problem.system.states - self._states)
+        self._added_up = np.zeros(self._planned.model.problem.system.states - self._states - self._beside)
 
     def step(self, time: float, state: npt.ArrayLike | None) -> Array:
         """The control ``(m,)`` for the piece that begins at ``time``, a breakpoint, from the ``state (d,)`` measured
@@ -152,7 +152,7 @@ class Controller:
         u = self._control(piece - self._plan.first, measured)
         told = None if self._observer is not None else measured
         self._reach = None if told is None else self._plan.reach(piece - self._plan.first, told, u)
-        self._added_up = self._added_up + self._plan.added(piece - self._plan.first, u)[self._states :]
+        self._added_up = self._added_up + self._plan.added(piece - self._plan.first, u)[self._states + self._beside :]
         self._next, self._covered, self._before, self._last = piece + 1, covered, u, measured
         at = self._begins_at(period, piece)
         taken = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
@@ -206,12 +206,19 @@ class Controller:
         return self._planned.model.stated.system.states
 
     @property
+    def _beside(self) -> int:
+        """How many states after these hold what parameters beside the time add, which is nothing where a state is
+        measured."""
+        corners = self._planned.model.problem.names.corners
+        return 0 if corners is None else corners.rows[0].shape[1] - self._states
+
+    @property
     def _observer(self) -> Observer | None:
         """What makes innovations of outputs; ``None`` where the state is measured."""
         return self._plan.known.observer
 
     def _measured(self, state: object) -> Array:
-        """The outputs, or the state with the integrals after it."""
+        """The outputs, or the state with what is not measured after it."""
         observer, count, one = self._observer, self._states, "state"
         if observer is not None:
             count, one = observer.C.shape[0], "output"
@@ -222,7 +229,8 @@ class Controller:
         if measured.shape != (count,) or not np.isfinite(measured).all():
             expected = f"{count} finite numbers, one per {one}, or None where the measurement is missing"
             raise InputError(path="state", expected=expected, got=f"{state!r}")
-        return measured if observer is not None else np.append(measured, self._added_up)
+        unseen = np.append(np.zeros(self._beside), self._added_up)
+        return measured if observer is not None else np.append(measured, unseen)
 
     def _within(self, state: Array) -> bool:
         """Whether a state is among those that the last one may lead to, or may begin with; coordinate by coordinate. Of

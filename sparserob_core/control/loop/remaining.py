@@ -34,8 +34,6 @@ def refuse_remaining(model: Transcription) -> None:
         "a control that acts at once, without a delay": problem.system.delay > 0.0,
         "a policy that measures the whole state, not outputs": model.feedback is not None
         and problem.measurements is not None,
-        "a known system where it changes with time: what parameters did is not measured": problem.system.varies
-        and model.stated.system.parameter_count > 0,
         "a control_step with flat sides, and no feedback beside it, where the plan repeats": bool(problem.repeat)
         and problem.control_step is not None
         and (problem.control_step.halfspaces() is None or model.feedback is not None),
@@ -56,7 +54,8 @@ def remaining(
     """The problem that is left where piece ``piece`` of the control begins in ``state (d,)``, after the control
     ``before (m,)``, transcribed as the ``model`` was; its times begin at 0.
 
-    The parameters may be any of their set, and every piece of the disturbance that is left may be any of its own, also
+    The parameters may be any of their set, also those beside the time, which add nothing to a state that is measured
+    and begin to when it is; and every piece of the disturbance that is left may be any of its own, also
     what is left of one that has begun: no less than what can happen. ``alone``: the nominal control and state alone,
     as if nothing disturbed them and nothing were answered. ``again (m,)``: of a plan that repeats, the control with
     which the next period begins, to which the last control takes a step of ``control_step``.

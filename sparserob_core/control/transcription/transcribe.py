@@ -147,9 +147,9 @@ def _functionals(
     if problem.execution is not None:
         from sparserob_core.control.response.measurable import Execution, VaryingExecution
 
-        shares = np.asarray(problem.execution)
+        shares, early = np.asarray(problem.execution), None if grid.before is None else np.abs(grid.before)
         execution = (
-            VaryingExecution(response, control.breakpoints, shares, before=np.abs(before))
+            VaryingExecution(response, control.breakpoints, shares, before=early)
             if system.varies
             else Execution(response, control.breakpoints, shares)
         )

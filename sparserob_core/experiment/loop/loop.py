@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -15,7 +16,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.loop.controller import Controller
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
-from sparserob_core.control.studies.laws import LawName, Uncertainty, noises
+from sparserob_core.control.studies.laws import LawName, ParametersInTime, Uncertainty, noises
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
@@ -41,8 +42,9 @@ SHOWN, DRAWN = 400, 3  # times, and loops of every law, that are drawn
 CONTROL, STEP = "control", "control_step"
 ROUNDING = 1e-12  # of the size of the set of controls
 
-# law, disturbance (1, mw, M) of every period, parameter (1, nu), state (1, d), noise (K, p) of every period
-Drawn = tuple[str, list[Array | None], Array, Array | None, list[Array | None]]
+# law, disturbance (1, mw, M) of every period, parameter (1, nu), parameters beside the time (1, d, size), state (1, d),
+# noise (K, p) of every period
+Drawn = tuple[str, list[Array | None], Array, Array | None, Array | None, list[Array | None]]
 
 
 def loop(
@@ -106,12 +108,14 @@ def _closed(
         np.concatenate([ends, worst.get("times", np.zeros(0))]),
     )
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
-    drawn = [*_replayed(worst, periods), *_sampled(model, worst, counts, np.random.default_rng(seed))]
+    beside = ParametersInTime.of(model.stated)
+    drawn = [*_replayed(worst, beside, periods), *_sampled(model, worst, beside, counts, np.random.default_rng(seed))]
     spent, paid, kept, laws = list[float](), list[float](), list[tuple[str, Array, Array]](), dict[str, int]()
     found = {one.name: -np.inf for one in model.constraints}
     limits = {one.name: TOLERANCE * float(row_units(one, model.problem.control).min()) for one in model.constraints}
     resolved, uncovered, outside, stepped = 0, 0, -np.inf, -np.inf
-    for number, (law, disturbances, parameter, begun, seen) in enumerate(drawn):
+    for number, (law, disturbances, parameter, here, begun, seen) in enumerate(drawn):
+        told = None if beside is None or here is None else partial(beside.at, rows=here)
         on = grid if law == ADVERSARY else model.response.grid
         fine = Response(model.response.system, finer(on, times), model.response.initial_state)
         laws[law] = laws.get(law, 0) + 1
@@ -119,8 +123,9 @@ def _closed(
         costs, before = list[float](), np.zeros((0, model.problem.system.controls))
         for period, (disturbance, noise) in enumerate(zip(disturbances, seen, strict=True)):
             which = on.control_piece if law == ADVERSARY else np.arange(on.pieces)
-            closing = _Closing(model, acting, which, noise, period * model.problem.horizon)
-            states = np.stack(list(walk(fine, closing, parameter, disturbance, begun)))
+            closing = _Closing(model, acting, which, noise, period * model.problem.horizon, told)
+            path = walk(fine, closing, parameter, disturbance, begun)
+            states = np.stack(list(path if told is None else map(told, path)))
             for name, largest in _violations(model, finished, states, times, closing.applied).items():
                 found[name] = max(found[name], largest)
             outside = max(outside, float(model.problem.control.violation(closing.applied.T).max()))
@@ -172,12 +177,19 @@ def _closed(
 class _Closing:
     """What drives a system: a controller, asked at the breakpoints of the control in the order in which they come.
     ``which``: the pieces of the model's grid that are walked through; ``noise (K, p)``: that of measured outputs;
-    ``begins``: when, for the controller."""
+    ``begins``: when, for the controller; ``told``: what states are at the parameters beside the time."""
 
     def __init__(
-        self, model: Transcription, acting: Controller, which: np.ndarray, noise: Array | None, begins: float
+        self,
+        model: Transcription,
+        acting: Controller,
+        which: np.ndarray,
+        noise: Array | None,
+        begins: float,
+        told: Callable[[Array], Array] | None = None,
     ) -> None:
         self.model, self.acting, self.which, self.noise, self.begins = model, acting, which, noise, begins
+        self.told = told
         self.applied = np.zeros((model.problem.system.controls, model.control.pieces))
         self._asked = 0
 
@@ -188,7 +200,8 @@ class _Closing:
         middle = (grid.breakpoints[piece] + grid.breakpoints[piece + 1]) / 2
         if self._asked < points.size - 1 and middle > points[self._asked]:
             time = self.begins + float(points[self._asked])
-            self.applied[:, self._asked] = self.acting.step(time, self._measured(state[:, 0]))
+            here = state if self.told is None else self.told(state)
+            self.applied[:, self._asked] = self.acting.step(time, self._measured(here[:, 0]))
             self._asked += 1
         return np.asarray(grid.inputs(self.applied)[:, piece, None])
 
@@ -201,7 +214,7 @@ class _Closing:
         return observer.outputs(state[:, None], noise)[:, 0]
 
 
-def _replayed(worst: Mapping[str, Array], periods: int) -> Iterator[Drawn]:
+def _replayed(worst: Mapping[str, Array], beside: ParametersInTime | None, periods: int) -> Iterator[Drawn]:
     """The worst case of every constraint, under the plan; from period to period they take turns."""
     count = worst["names"].size if worst else 0
     for row in range(count):
@@ -209,27 +222,34 @@ def _replayed(worst: Mapping[str, Array], periods: int) -> Iterator[Drawn]:
         disturbances = [worst["disturbances"][at : at + 1] if worst["disturbances"].shape[1] else None for at in turns]
         seen = [worst["noises"][at] if "noises" in worst else None for at in turns]
         one = slice(row, row + 1)
-        yield ADVERSARY, disturbances, worst["parameters"][one], worst["initial_states"][one], seen
+        here = None if beside is None else beside.seen(worst["directions"][row])[None]
+        yield ADVERSARY, disturbances, worst["parameters"][one], here, worst["initial_states"][one], seen
 
 
 def _sampled(
-    model: Transcription, worst: Mapping[str, Array], counts: tuple[int, int], rng: np.random.Generator
+    model: Transcription,
+    worst: Mapping[str, Array],
+    beside: ParametersInTime | None,
+    counts: tuple[int, int],
+    rng: np.random.Generator,
 ) -> Iterator[Drawn]:
     """So many loops of every law, of so many periods; one loop where nothing is uncertain."""
     functionals, parameters, (count, periods) = model.functionals, model.parameters, counts
-    if not functionals.disturbed and parameters.set is None and model.noise is None:
-        yield "iid", [None] * periods, np.zeros((1, 0)), None, [None] * periods
+    if not functionals.disturbed and parameters.set is None and model.noise is None and beside is None:
+        yield "iid", [None] * periods, np.zeros((1, 0)), None, None, [None] * periods
         return
     known = tuple(worst[name] for name in ("times", "directions", "parameters")) if worst else (np.zeros(0),) * 3
     uncertainty = Uncertainty(functionals, parameters, model.constraints, (known[0], known[1], known[2]))
     for law in (law for law in LAWS if law != ADVERSARY and (worst or law != "neighbours")):
         disturbances, drawn, begun = uncertainty.draw(cast(LawName, law), count * periods, rng)
         seen = noises(model.noise, cast(LawName, law), count * periods, model.control.pieces, rng)
+        here = None if beside is None else beside.draw(cast(LawName, law), count, None, rng)
         for row in range(count):
             one, turns = slice(row, row + 1), range(row, count * periods, count)
             every = [None if disturbances is None else disturbances[p : p + 1] for p in turns]
             heard = [None if seen is None else seen[:, :, p] for p in turns]
-            yield law, every, drawn[one], None if begun is None else begun[one], heard
+            rows = None if here is None else here[one]
+            yield law, every, drawn[one], rows, None if begun is None else begun[one], heard
 
 
 def _stepped(model: Transcription, applied: Array) -> float:

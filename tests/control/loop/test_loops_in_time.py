@@ -91,7 +91,36 @@ def test_a_state_that_no_disturbance_leads_to_is_seen_beside_entries_in_the_time
 
 
 @pytest.mark.slow
-def test_parameters_beside_the_time_are_not_measured_so_that_nothing_is_solved_anew() -> None:
-    made = config(B=[[0], ["1 + p*sin(t)"]], parameters={"p": [-0.01, 0.01]})
-    with pytest.raises(sr.InputError, match=r"resolve.*known system"):
-        sr.controller(made, resolve=True)
+def test_parameters_beside_the_time_are_those_of_a_system_that_does_not_change_where_a_plan_is_solved_anew() -> None:
+    used: list[list[np.ndarray]] = []
+    for entry in ("1 + p", "1 + p + 0*t"):
+        made = config(B=[[0], [entry]], c=[0, "0.05 + q"], parameters={"p": [-0.02, 0.04], "q": [-0.01, 0.01]})
+        controller = sr.controller(made, resolve=True)
+        state, rng = np.array([-0.5, 0.5]), np.random.default_rng(2)
+        p, q = 0.03, -0.01  # which the controller is not told
+        controls = []
+        for begin, end in zip(controller.breakpoints[:-1], controller.breakpoints[1:], strict=True):
+            u, w = controller.step(begin, state), rng.uniform(-0.05, 0.05)
+            controls.append(u)
+            A, drive = np.array([[0, 1], [-1, -0.4]]), np.array([0, (1 + p) * u[0] + w + 0.05 + q])
+            for _ in range(200):
+                h = (end - begin) / 200
+                state = state + h * (A @ (state + h / 2 * (A @ state + drive)) + drive)
+        assert (np.abs(state) <= 0.25).all()
+        assert any(step.resolved for step in controller.steps) and controller.covered
+        used.append(controls)
+    np.testing.assert_allclose(used[1], used[0], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_integrals_of_controls_go_on_where_parameters_beside_the_time_begin_anew() -> None:
+    made = config(B=[[0], ["1 + p*sin(t)"]], parameters={"p": [-0.05, 0.05]})
+    made["problem"]["integral"] = [{"G": [[1.0]], "upper": 0.6, "lower": -0.6}]
+    controller = sr.controller(made, resolve=True)
+    states = controller.plan.known.problem.system.states
+    spent = 0.0
+    for begin, end in zip(controller.breakpoints[:-1], controller.breakpoints[1:], strict=True):
+        u = controller.step(begin, controller._measured([-0.5, 0.5])[:2])  # whatever is told, what was spent is known
+        spent += float(u[0] * (end - begin))
+        unseen = controller._measured([-0.5, 0.5])[2:]
+        assert unseen.size == states - 2 and unseen[-1] == pytest.approx(spent) and not unseen[:-1].any()
