@@ -18,10 +18,9 @@ from sparserob_core.control.problem.terms.windows import MixedConstraint, PathCo
 from sparserob_core.control.problem.units import Units, ratios
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.grid import grid_of
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
-from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
+from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times, grid_of
 from sparserob_core.control.transcription.own_units import (
     own_units,
     rough_units,
