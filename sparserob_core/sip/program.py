@@ -91,6 +91,10 @@ class Explanation(ABC):
         """What it asks for, without remarks."""
         return self.text
 
+    def of_sample(self, number: int) -> Explanation:
+        """The same constraint for one sample of what is uncertain, whatever it says of another case."""
+        return Unexplained(f"{self.text} (sample {number})")
+
     @property
     def alike(self) -> str:
         """What it asks for, where other rows of its family ask for the same in another case; empty elsewhere."""

@@ -22,6 +22,7 @@ from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.figures.drawing import figure_data
+from sparserob_core.experiment.terminal.table import result_rows
 from tests.support import tampering
 
 Config = dict[str, Any]
@@ -86,6 +87,9 @@ def test_the_gain_of_an_integrator_is_paid_for_at_its_weakest(tmp_path: Path) ->
     outcome = solved(config, tmp_path / "run")
     assert outcome.result.status == "certified"
     assert outcome.result.cost == pytest.approx(cost, rel=1e-8)
+    worst = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))["worst"]
+    assert worst["corner"] == "p = -0.1"
+    assert dict(result_rows({**outcome.summary, "worst": worst}))["worst violation"].endswith("at t = 2, p = -0.1")
 
 
 def test_tubes_and_figures_are_of_the_states_at_all_parameters() -> None:

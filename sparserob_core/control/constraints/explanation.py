@@ -14,7 +14,7 @@ from sparserob_core.control.problem.names import UNNAMED, Names, measured_in
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.program import Explanation, WorstConstraint, told_apart
+from sparserob_core.sip.program import Explanation, Unexplained, WorstConstraint, told_apart
 
 SAME = 1e-12  # of the largest coefficient of a combination, one that is rounding
 
@@ -42,12 +42,14 @@ def of_gauge() -> tuple[Array, Array]:
 @dataclass(frozen=True, eq=False)
 class Witness(WorstConstraint):
     """The worst constraint of a control problem, with its ``time``, parameter ``(nu,)``, worst disturbance
-    ``(mw, pieces)`` and worst ``initial_state (d,)`` where it has them."""
+    ``(mw, pieces)`` and worst ``initial_state (d,)`` where it has them; ``corner``: of parameters beside the time those
+    that it is about, in words."""
 
     time: float | None = None
     parameter: Array | None = None
     disturbance: Array | None = field(default=None, repr=False)
     initial_state: Array | None = None
+    corner: str = ""
 
     __repr__ = brief
 
@@ -108,6 +110,7 @@ class TimedExplanation(Explanation):
             self.parameter,
             self.disturbance,
             self.begun,
+            "" if self.names.corners is None else self.where,
         )
 
     def short(self) -> str:
@@ -116,6 +119,9 @@ class TimedExplanation(Explanation):
     @property
     def alike(self) -> str:
         return "" if self.names.corners is None else self.statement
+
+    def of_sample(self, number: int) -> Explanation:
+        return Unexplained(f"{self.statement} (sample {number})")
 
     def from_any_state(self) -> TimedExplanation:
         """The same where the initial state is free: at time 0 without what the given one says."""

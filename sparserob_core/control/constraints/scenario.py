@@ -14,7 +14,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
-from sparserob_core.sip.program import ConstraintFamily, Separation
+from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
 
 BLOCK = 2_000_000  # sampled violations that are held at once
 
@@ -45,10 +45,16 @@ class ScenarioConstraint:
             rows=self.rows,
             worst=self.worst,
             formulation="sampled",
+            explain=self.explain,
             measured=self.base.measured,
             along=self.base.functionals.names.time,
             source=self.base,
         )
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One row at a time, for one sample."""
+        sample = round(float(index[1]))
+        return self.base.explain(np.append(index[0], self.parameters[sample]), row).of_sample(sample)
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 2)``."""

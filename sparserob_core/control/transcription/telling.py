@@ -10,7 +10,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import Source
 from sparserob_core.control.problem.units import Units, ratios
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.program import ConstraintFamily
+from sparserob_core.sip.program import ConstraintFamily, Explanation
 
 
 @final
@@ -39,7 +39,14 @@ class Telling:
         def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
             assert draw is not None
             drawn = draw(count, rng)
-            return told(drawn, drawn if drawn.formulation == "sampled" else theirs)
+            if drawn.formulation != "sampled":
+                return told(drawn, theirs)
+            middle, said = (theirs.index_set.lower + theirs.index_set.upper) / 2.0, theirs.explanation
+
+            def explain(index: Array, row: int) -> Explanation:
+                return said(np.append(index[0] * begins[0], middle[1:]), row).of_sample(round(float(index[1])))
+
+            return replace(told(drawn, drawn), explain=explain)
 
         def form(one: ConstraintFamily | None, as_theirs: ConstraintFamily | None) -> ConstraintFamily | None:
             return None if one is None or as_theirs is None else told(one, as_theirs)

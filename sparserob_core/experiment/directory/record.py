@@ -116,6 +116,7 @@ def _witness(worst: WorstConstraint | None, states: int | None) -> dict[str, Any
             if isinstance(worst, Witness) and worst.initial_state is not None
             else {}
         ),
+        **({"corner": worst.corner} if isinstance(worst, Witness) and worst.corner else {}),
     }
 
 

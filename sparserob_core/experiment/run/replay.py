@@ -143,6 +143,7 @@ def _worst(said: Mapping[str, Any], solution: Mapping[str, Array]) -> WorstConst
         parameter=None if said.get("parameter") is None else np.asarray(said["parameter"], dtype=float),
         disturbance=solution.get("worst_disturbance"),
         initial_state=None if said.get("initial_state") is None else np.asarray(said["initial_state"], dtype=float),
+        corner=str(said.get("corner", "")),
     )
 
 

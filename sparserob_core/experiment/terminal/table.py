@@ -168,6 +168,7 @@ def _worst(worst: Mapping[str, Any], units: Mapping[str, Any], parameters: Seque
         values = [f"{value:.6g}" for value in worst["parameter"]]
         named = [f"{name} = {value}" for name, value in zip(parameters, values, strict=False)]
         at += ", " + (_listed(named) if len(named) == len(values) else f"p = ({_listed(values)})")
+    at += f", {worst['corner']}" if worst.get("corner") else ""
     if worst.get("initial_state") is not None:
         begun = worst["initial_state"]
         measured = zip(begun, states or [""] * len(begun), strict=True)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import sparserob_core as sr
 from sparserob_core.control.constraints import scenario
 from sparserob_core.control.constraints.flat import FlatConstraint, Samples
 from sparserob_core.control.constraints.scenario import ScenarioConstraint
@@ -43,6 +44,7 @@ def test_the_worst_of_sampled_disturbances_is_by_hand(block, monkeypatch):
     family = made.family()
     assert family.formulation == "sampled"
     assert family.index_set.upper.tolist() == [2.0, 2.0]
+    assert family.explanation(np.array([2.0, 1.0]), 0).text == "wall: x1(2) <= 2 (sample 1)"
     for index, values in (((1.0, 1.0), (1.7, -1.7)), ((0.5, 2.0), (1.2, -1.2)), ((2.0, 0.0), (1.25, -1.25))):
         assert family.violations(x, np.array([index]))[0] == pytest.approx(np.array(values) - LIMITS)
     moved = replace(made, deviations=np.array([[0.0], [0.1], [-0.2]]))
@@ -50,6 +52,21 @@ def test_the_worst_of_sampled_disturbances_is_by_hand(block, monkeypatch):
     assert moved.family().violations(x, np.array([[2.0, 2.0]]))[0] == pytest.approx([0.45 - 2.0, -0.45 - 1.0])
     early = replace(made, base=flat(LinearSystem(np.zeros((1, 1)), ONE, E=ONE), Box([-0.5], [0.5]), 0.0, 1.0))
     assert early.worst(x).violations[0] == pytest.approx(1.7 - 2.0)
+
+
+@pytest.mark.parametrize("second", [1.0, 1e3])
+def test_what_samples_ask_for_is_told_by_names_in_the_units_of_the_problem(second: float) -> None:
+    """A plane that 0.1 per second of disturbance moves out of reach, in any unit of time."""
+    system = LinearSystem(np.zeros((1, 1)), ONE / second, E=ONE / second)
+    names = sr.Names(states=["height"], state_units=["m"], time="s")
+    problem = sr.OptimalControlProblem(
+        system=system, horizon=second, initial_state=[5.0], control=Box([-1.0], [1.0]), names=names,
+        disturbance=Box([-0.1], [0.1]), terminal=[Box([-0.2], [0.2])],
+    )  # fmt: skip
+    pieces = {"name": "piecewise_constant", "pieces": 2}
+    result = sr.solve(problem, {"name": "scenario", "scenarios": 5}, control=pieces, disturbance=pieces)
+    assert result.status == "infeasible"
+    assert f"terminal: height({second:g}) <= 0.2 m (sample " in result.message
 
 
 @pytest.mark.parametrize("block", [1, 7, scenario.BLOCK])
