@@ -43,6 +43,10 @@ APART = 16
 DEAR = 2**29
 MOST = 2**27  # numbers that the rows of all steps take
 AT_ONCE = 2**22  # numbers of rows that are worked on at once
+# Terms of a product of floats that are added up before these sums are: of 348 states 43 roundings meet instead of 348.
+# With half of it products take a fourth longer, and with twice as much bounds along modes that are far from normal are
+# twice as wide.
+SUMMED = 32
 
 
 @final
@@ -354,12 +358,16 @@ def _apart(times: Array, others: Array | float) -> tuple[Array, Array]:
 
 
 def _product(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
-    """Rows ``(k, d)`` times matrices ``(j, d, n)``, ``(k, j, n)``, with its error."""
+    """Rows ``(k, d)`` times matrices ``(j, d, n)``, ``(k, j, n)``, with its error. What is rounded is added up as many
+    times as there are terms in one of the sums, and sums (Higham 2002, section 4.2)."""
     j, d, n = right.mid.shape
     flat, off = (part.transpose(1, 0, 2).reshape(d, j * n) for part in (right.mid, right.rad))
     size = np.abs(left.mid)
-    mid = left.mid @ flat
-    rad = size @ (off + rounding(d) * np.abs(flat)) + left.rad @ (np.abs(flat) + off)
+    mid = left.mid[:, :SUMMED] @ flat[:SUMMED]
+    for start in range(SUMMED, d, SUMMED):
+        mid += left.mid[:, start : start + SUMMED] @ flat[start : start + SUMMED]
+    met = min(d, SUMMED) + (d - 1) // SUMMED
+    rad = size @ (off + rounding(met) * np.abs(flat)) + left.rad @ (np.abs(flat) + off)
     return mid.reshape(-1, j, n), rad.reshape(-1, j, n) * OUTWARD
 
 

@@ -230,10 +230,13 @@ def _of_known(worst: WorstRow, row: Row, tolerance: float, notify: Notify, deadl
         ),
         cells=(cells[0][:, None], cells[1][:, None]),
     )
-    looked = worst.at(np.linspace(row.start, row.stop, LOOKS))[0]
+    times = np.linspace(row.start, row.stop, LOOKS)
+    looked = worst.at(times)[0]
     found = supremum(family, np.zeros(1), tolerance, LEAST * float(np.abs(looked).max()), notify, deadline=deadline)
-    tidied = float(tidy(found.index, float(worst.grid[-1]))[0])
-    time = tidied if row.start <= tidied <= row.stop else float(found.index[0])
+    # cells are probed in their middles, and what grows until the end of its window is largest there
+    best = float(times[looked.argmax()]) if looked.max() > found.lower else float(found.index[0])
+    tidied = float(tidy(np.array([best]), float(worst.grid[-1]))[0])
+    time = tidied if row.start <= tidied <= row.stop else best
     state, changes, disturbance = worst.witness(time)
     edges, middles = _bins(row)
     lost = LOST * max(float(np.abs(looked).max()), abs(found.lower)) + worst.lost

@@ -112,6 +112,19 @@ def test_the_measurable_worst_is_that_of_ever_shorter_pieces() -> None:
     assert short[-1] <= whole <= short[-1] + 1e-4
 
 
+def test_products_of_many_terms_hold_the_truth_and_round_as_sums_of_sums() -> None:
+    rng = np.random.default_rng(5)
+    for d in (1, 31, 32, 33, 300):
+        left, right = rng.normal(size=(3, d)), rng.normal(size=(2, d, 4))
+        found = module._product(Enclosed(left, 0.0 * left), Enclosed(right, 0.0 * right))
+        for j, part in enumerate(right):
+            exact = (arb_mat(left.tolist()) * arb_mat(part.tolist())).tolist()
+            pairs = zip(found[0][:, j].tolist(), exact, strict=True)
+            off = [[abs(arb(m) - x) for m, x in zip(*pair, strict=True)] for pair in pairs]
+            assert (np.array([[float(x.upper()) for x in row] for row in off]) <= found[1][:, j]).all()
+        assert (found[1] <= 6e-15 * np.einsum("kd,jdn->kjn", np.abs(left), np.abs(right))).all()
+
+
 def test_a_system_that_is_too_fast_is_not_followed() -> None:
     with pytest.raises(Unchecked):
         Motion.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), 1.0, Clock())

@@ -4,6 +4,7 @@ it; witnesses that reach what is claimed."""
 from __future__ import annotations
 
 from itertools import pairwise
+from math import cos
 
 import numpy as np
 import pytest
@@ -108,3 +109,12 @@ def test_tidy_times_have_exact_differences() -> None:
         float(b - a) == b.as_integer_ratio()[0] / b.as_integer_ratio()[1] - a for a, b in pairwise(times[:3].tolist())
     )
     assert np.abs(times - [0.1, 1 / 3, 0.0, 0.7]).max() <= 1e-13
+
+
+def test_what_a_transition_is_off_by_counts_as_often_as_there_are_steps() -> None:
+    """A rotation, whose cosine is known: squaring doubles the error, and adds none that counting squarings would
+    see."""
+    for horizon in (3e3, 3e4):
+        turning = Adjoint.of(np.array([[0.0, 1.0], [-1.0, 0.0]]), np.zeros((2, 1)), np.array([1.0, 0.0]), horizon)
+        row = WorstRow(turning, np.array([1.0, 0.0]), None, np.array([0.0, horizon]), np.zeros((1, 1)), None)
+        assert abs(float(row.at(np.array([horizon]))[0][0]) - cos(horizon)) < row.lost < 1e-10

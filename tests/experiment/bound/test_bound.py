@@ -95,6 +95,9 @@ def test_a_window_is_bounded_over_time_and_its_envelope_holds_the_truth(tmp_path
     found = sr.bound(stated, out=tmp_path / "out")
     assert_encloses(found.rows[0], 0.2 + 0.8 * math.exp(-0.5))
     assert_encloses(found.rows[1], -0.2 + 1.2 * math.exp(-2.5))
+    # largest at the ends of the window, where no cell has its middle
+    assert [row.time for row in found.rows] == [0.5, 2.5]
+    assert max(row.upper - row.lower for row in found.rows) < 1e-9
     times = np.linspace(0.5, 2.5, 1001)[1:-1]
     truth = 0.2 + 0.8 * np.exp(-times)
     held = np.searchsorted(found.rows[0].edges, times, side="right") - 1
