@@ -150,6 +150,15 @@ def problem_of(loaded: Loaded) -> OptimalControlProblem | SemiInfiniteProgram:
     return problem
 
 
+def control_problem_of(loaded: Loaded, expected: str) -> OptimalControlProblem:
+    """The control problem that a checked config states; raises `InputError` that says what was ``expected`` where it
+    states another program."""
+    problem = problem_of(loaded)
+    if isinstance(problem, SemiInfiniteProgram):
+        raise InputError(f"{expected}, got a semi-infinite program of another kind")
+    return problem
+
+
 def dictionaries_of(loaded: Loaded, horizon: float) -> tuple[Dictionary, Dictionary]:
     """The dictionaries of control and disturbance of a checked config; raises `ConfigError` with the place of the key
     at fault."""

@@ -121,6 +121,11 @@ class ConvexSet(ABC):
         return np.asarray(z @ self.frame)
 
     @property
+    def factors(self) -> tuple[ConvexSet, ...]:
+        """The sets whose product it is; itself alone where it is none."""
+        return (self,)
+
+    @property
     def is_bounded(self) -> bool:
         """Whether the support function is finite in every direction."""
         axes = np.eye(self.dimension)

@@ -33,7 +33,7 @@ class Page:
 def pages(problem: sr.OptimalControlProblem) -> list[Page]:
     """The first screen with two controls and four states, those with walls first; then whatever is left."""
     controls, walled = problem.system.controls, _walled(problem)
-    order = sorted(problem.names.own(problem.system.states), key=lambda state: state not in walled)
+    order = sorted(problem.names.corners.own(problem.system.states), key=lambda state: state not in walled)
     first, rest = sorted(order[:STATES]), sorted(order[STATES:])
     plots = [*_controls(range(min(CONTROLS, controls))), *(("state", state) for state in first)]
     first_page = Page("physics/plots", tuple(plots))

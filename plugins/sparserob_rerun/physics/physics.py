@@ -84,7 +84,7 @@ class Physics:
         rows = rr.Scalars.columns(scalars=data.control.T.ravel()).partition([channels] * data.control.shape[1])
         self.stream.send_columns("signals/control", at, rows)
         at = [rr.TimeColumn("t", duration=data.times)]
-        for state in self.problem.names.own(self.problem.system.states):
+        for state in self.problem.names.corners.own(self.problem.system.states):
             name, colour = data.names.state(state), ink.legible(SHADES[state % len(SHADES)])
             pale = (*colour[:3], 110)
             self.stream.log(

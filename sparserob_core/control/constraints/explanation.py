@@ -14,7 +14,14 @@ from sparserob_core.control.problem.names import UNNAMED, Names, measured_in
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.program import Explanation, Unexplained, WorstConstraint, told_apart
+from sparserob_core.sip.program import (
+    Explanation,
+    Formulation,
+    SemiInfiniteProgram,
+    Unexplained,
+    WorstConstraint,
+    told_apart,
+)
 
 SAME = 1e-12  # of the largest coefficient of a combination, one that is rounding
 
@@ -110,7 +117,7 @@ class TimedExplanation(Explanation):
             self.parameter,
             self.disturbance,
             self.begun,
-            "" if self.names.corners is None else self.where,
+            self.where if self.names.corners else "",
         )
 
     def short(self) -> str:
@@ -118,7 +125,7 @@ class TimedExplanation(Explanation):
 
     @property
     def alike(self) -> str:
-        return "" if self.names.corners is None else self.statement
+        return self.statement if self.names.corners else ""
 
     def of_sample(self, number: int) -> Explanation:
         return Unexplained(f"{self.statement} (sample {number})")
@@ -177,7 +184,7 @@ class TimedExplanation(Explanation):
         stated, corner = _stated(rest, self.names)
         quantity, at = combination(side * stated, self.names, f"({self.time:.6g})"), self._at
         asking = f"{self.statement} and {other.statement} ask"
-        if self.names.corners is not None and corner is None:  # the two are about different corners
+        if self.names.corners and corner is None:  # the two are about different corners
             first, second = sorted([self._share(side), other._share(side * share)], key=lambda one: one[0] == "-")
             single = second[0] == "-" and not any(joint in second for joint in (" + ", " - "))
             quantity, at = f"{first} less {second[1:]}" if single else f"{first} plus {second}", ""
@@ -224,6 +231,16 @@ class TimedExplanation(Explanation):
     @property
     def _set(self) -> str:
         return {"terminal": "the terminal set", "path": "the path set"}.get(self.constraint, self.constraint)
+
+
+def in_numbers(
+    program: SemiInfiniteProgram, name: str, formulation: Formulation, index: Array, row: int
+) -> TimedExplanation | None:
+    """One constraint of a program in numbers; ``None`` for one whose index does not say them, such as the number of a
+    sample."""
+    family = program.formulated(name, formulation)
+    said = None if family is None else family.explanation(index, row)
+    return said if isinstance(said, TimedExplanation) else None
 
 
 def explanation(
@@ -302,8 +319,8 @@ def explanation(
 def _stated(normal: Array, names: Names) -> tuple[Array, str | None]:
     """A normal on the states that were stated, and the corner of the parameters beside the time that it is about;
     itself, and ``None``, where it is about several at once."""
-    corner = None if names.corners is None else names.corners.at(normal)
-    return (normal, None) if names.corners is None or corner is None else (names.corners.without(normal), corner)
+    corner = names.corners.at(normal)
+    return (normal, None) if corner is None else (names.corners.without(normal), corner)
 
 
 def combination(direction: Array, names: Names, suffix: str = "", states: int | None = None) -> str:

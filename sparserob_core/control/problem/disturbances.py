@@ -108,8 +108,7 @@ def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> 
     where there are none."""
     if bound is None or isinstance(classes, str):
         return bound if classes == kind else None
-    assert isinstance(bound, Product)
-    every = zip(bound.parts, classes, strict=True)
+    every = zip(bound.factors, classes, strict=True)
     return product([part if one == kind else _nothing(part.dimension) for part, one in every])
 
 
@@ -117,8 +116,7 @@ def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np
     """Which columns of ``E`` are of disturbances of one class, ``(mw,)``."""
     if isinstance(classes, str):
         return np.full(bound.dimension, classes == kind)
-    assert isinstance(bound, Product)
-    return np.repeat([one == kind for one in classes], [part.dimension for part in bound.parts])
+    return np.repeat([one == kind for one in classes], [part.dimension for part in bound.factors])
 
 
 def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: float) -> Array | None:

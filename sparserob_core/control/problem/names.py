@@ -22,33 +22,57 @@ ROUNDING = 1e-12  # of the largest entry of a direction: products that are added
 @dataclass(frozen=True, eq=False)
 class Corners:
     """The corners of the parameters beside the time, one row of the larger problem each (`at_corners`), with the
-    ``values (k, nu)`` of the parameters called ``names``."""
+    ``values (k, nu)`` of the parameters called ``names``; none where there are no such parameters."""
 
-    rows: list[Array]
-    values: Array
-    names: Sequence[str]
+    rows: list[Array] = field(default_factory=list)
+    values: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    names: Sequence[str] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.rows)
+
+    @property
+    def added(self) -> tuple[int, int]:
+        """The first of the states that parameters add, and the one after the last of them."""
+        d, size = self.rows[0].shape if self.rows else (0, 0)
+        return d, size
+
+    def everywhere(self, directions: Array) -> tuple[np.ndarray, Array]:
+        """Rows ``(k, d)`` of ``directions (q, d)``, after the number of each, at every corner; one that looks at no
+        state which the parameters reach is there once."""
+        if not self.rows:
+            return np.arange(len(directions)), directions
+        d, size = self.added
+        every = np.repeat(directions[:, None], len(self.rows), axis=1)
+        every[:, :, d:size] += np.stack([directions[:, :d] @ one[:, d:] for one in self.rows], axis=1)
+        kept = [np.unique(part, axis=0) for part in every]
+        return np.repeat(np.arange(len(kept)), [len(part) for part in kept]), np.concatenate(kept)
 
     def without(self, direction: Array) -> Array:
         """A direction without what the parameters add to the states."""
-        d, size = self.rows[0].shape
+        d, size = self.added
         return np.concatenate([direction[:d], np.zeros(size - d), direction[size:]])
 
     def own(self, states: int) -> list[int]:
         """Those of so many states that no parameter added: what parameters add is in the tubes of the others."""
-        d, size = self.rows[0].shape
+        d, size = self.added
         return [*range(d), *range(size, states)]
 
     def stated(self, direction: Array, states: Array) -> Array:
         """Trajectories ``(n, T)`` of all states, with the first of them at the corner that a direction is nearest
         to."""
-        d, size = self.rows[0].shape
+        if not self.rows:
+            return states
+        d, size = self.added
         corner = min(self.rows, key=lambda one: np.abs(direction[:d] @ one[:, d:] - direction[d:size]).sum())
         return np.concatenate([corner @ states[:size], states[d:]])
 
     def at(self, direction: Array) -> str | None:
         """The parameters whose corner a direction is about, such as ``gain = 0.1``; empty where it is about all,
         ``None`` where it is about none alone."""
-        d, size = self.rows[0].shape
+        if not self.rows:
+            return None
+        d, size = self.added
         added, far = np.array([direction[:d] @ one[:, d:] for one in self.rows]), np.abs(direction).max()
         mine = np.abs(added - direction[d:size]).max(axis=1, initial=0.0) <= ROUNDING * far
         if not mine.any():
@@ -79,7 +103,7 @@ class Names:
     disturbance_units: Sequence[str] = ()
     time: str = ""
     plane: Sequence[str] = ()
-    corners: Corners | None = field(default=None, repr=False, compare=False)
+    corners: Corners = field(default_factory=Corners, repr=False, compare=False)
 
     __repr__ = noun
 
@@ -105,10 +129,6 @@ class Names:
             units = [self.state_units[place] for place in places if place is not None and place < len(self.state_units)]
             if len(set(units)) > 1:
                 raise InputError(path="names.plane", expected="two states of the same unit", got=" and ".join(units))
-
-    def own(self, states: int) -> list[int]:
-        """Those of so many states that figures show: all but what parameters beside the time add."""
-        return [*range(states)] if self.corners is None else self.corners.own(states)
 
     @property
     def in_plane(self) -> tuple[int, int] | None:

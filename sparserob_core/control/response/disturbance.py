@@ -17,7 +17,7 @@ import numpy as np
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.disturbances import Breakpoints, Classes, apart
 from sparserob_core.control.response.response import TimeGrid
-from sparserob_core.control.sets.sets import NormBall, Polytope, Product, product
+from sparserob_core.control.sets.sets import NormBall, Polytope, product
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -198,9 +198,8 @@ def disturbance_model(
         plain = DisturbanceModel("piecewise_constant", bound, bound, grid, starts=starts)
         if breakpoints is None:
             return plain
-        assert isinstance(bound, Product)
         lasting = _lasting(bound, breakpoints, _middles(grid)[starts])
-        return replace(plain, set=product(bound.parts), lasting=lasting)
+        return replace(plain, set=product(bound.factors), lasting=lasting)
     flat = bound.halfspaces()
     if flat is None:
         raise InputError(
@@ -214,10 +213,10 @@ def disturbance_model(
     return DisturbanceModel("piecewise_constant", coupled, bound, grid, functions=dictionary.at(grid.disturbance_piece))
 
 
-def _lasting(bound: Product, breakpoints: Breakpoints, middles: Array) -> tuple[tuple[slice, np.ndarray], ...]:
+def _lasting(bound: ConvexSet, breakpoints: Breakpoints, middles: Array) -> tuple[tuple[slice, np.ndarray], ...]:
     """`DisturbanceModel.lasting`, of blocks of which these are times that lie within them."""
     found, column = list[tuple[slice, np.ndarray]](), 0
-    for part, times in zip(bound.parts, breakpoints, strict=True):
+    for part, times in zip(bound.factors, breakpoints, strict=True):
         columns = slice(column, column + part.dimension)
         column = columns.stop
         assert times is not None

@@ -272,6 +272,10 @@ class Product(ConvexSet):
     parts: tuple[ConvexSet, ...]
 
     @property
+    def factors(self) -> tuple[ConvexSet, ...]:
+        return self.parts
+
+    @property
     def dimension(self) -> int:
         return sum(part.dimension for part in self.parts)
 

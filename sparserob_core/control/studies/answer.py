@@ -16,7 +16,6 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.terms.superposed import at_corners
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.result import Result
@@ -167,7 +166,7 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
     lattice, _ = model.parameters.lattice()
     if len(lattice) > PARAMETERS:
         lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
-    rows, every = _everywhere(model, directions)
+    rows, every = model.problem.names.corners.everywhere(directions)
     count, found = len(every) * len(lattice), np.full((len(directions), times.size), -np.inf)
     along, p = np.repeat(every, len(lattice), axis=0), np.tile(lattice, (len(every), 1))
     size = max(1, INSTANTS // count)
@@ -178,19 +177,6 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
         values = model.functionals.values(theta, *at).reshape(len(every), len(lattice), now).max(axis=1)
         np.maximum.at(found, (rows, part), values)
     return found
-
-
-def _everywhere(model: Transcription, directions: Array) -> tuple[np.ndarray, Array]:
-    """Rows ``(k, d)`` of ``directions (q, d)``, after the number of each, at every corner of the parameters beside the
-    time; one that looks at no state which these reach is there once."""
-    corners = at_corners(model.stated)
-    if corners is None:
-        return np.arange(len(directions)), directions
-    d, size = corners[0].shape
-    every = np.repeat(directions[:, None], len(corners), axis=1)
-    every[:, :, d:size] += np.stack([directions[:, :d] @ one[:, d:] for one in corners], axis=1)
-    kept = [np.unique(part, axis=0) for part in every]
-    return np.repeat(np.arange(len(kept)), [len(part) for part in kept]), np.concatenate(kept)
 
 
 def _times(time: npt.ArrayLike, horizon: float) -> Array:

@@ -73,8 +73,8 @@ class Row:
     def quantity(self, problem: OptimalControlProblem) -> str:
         """The row in words, with the sign that its sense says, of the states that were stated: what parameters beside
         the time add is told by `Corners.at`."""
-        d, names, corners = problem.system.states, problem.names, problem.names.corners
-        used = np.flatnonzero(self.direction if corners is None else corners.without(self.direction)).tolist()
+        d, names = problem.system.states, problem.names
+        used = np.flatnonzero(names.corners.without(self.direction)).tolist()
         if len(used) > TERMS:
             return f"a combination of {len(used)} states"
         text = ""
@@ -370,9 +370,9 @@ def bound_rows(
     deadline: Deadline | None = None,
 ) -> list[BoundedRow]:
     """`bound_row` of all `rows_of` a problem; ``told`` what is bounded next, its number, and of how many."""
-    rows, found, corners = rows_of(problem), [], problem.names.corners
+    rows, found = rows_of(problem), []
     for i, row in enumerate(rows):
-        at = "" if corners is None else corners.at(row.direction)
+        at = problem.names.corners.at(row.direction)
         told(
             f"{row.constraint}: {row.sense} of {row.quantity(problem)}" + (f" at {at}" if at else ""),
             i,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.brief import noun
-from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.explanation import TimedExplanation, in_numbers
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -172,9 +172,7 @@ class Transcription(Posed):
             size = loop.measurable.size  # of the deviations, which end an index
             loop.measurable.compose([cut.index[-size:] for cut in fresh.values() if cut.index.size > size > 0])
         for key, cut in fresh.items():
-            family = self.program.formulated(cut.family, cut.formulation)
-            told = None if family is None else family.explanation(cut.index, cut.row)
-            self._explained[key] = told if isinstance(told, TimedExplanation) else None
+            self._explained[key] = in_numbers(self.program, cut.family, cut.formulation, cut.index, cut.row)
         return [self._explained[key] for key in keys]
 
     @property

@@ -15,7 +15,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.suprema import bound_rows
 from sparserob_core.control.transcription.terms.accumulated import accumulated
 from sparserob_core.errors import InputError, SparseRobError
-from sparserob_core.experiment.assemble import build, dictionaries_of, name_of, problem_of
+from sparserob_core.experiment.assemble import build, control_problem_of, dictionaries_of, name_of
 from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
@@ -27,7 +27,6 @@ from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import Deadline
-from sparserob_core.sip.program import SemiInfiniteProgram
 
 __all__ = ["Bound", "WorstCase", "bound", "summary_of_bound"]
 
@@ -63,12 +62,7 @@ def bound(
     started = time.perf_counter()
     given = _control(config)
     loaded = load_config(as_config(config), overrides)
-    problem = problem_of(loaded)
-    if isinstance(problem, SemiInfiniteProgram):
-        raise InputError(
-            "config: expected a control problem, whose rows have worst cases, got a semi-infinite program of another"
-            " kind"
-        )
+    problem = control_problem_of(loaded, "config: expected a control problem, whose rows have worst cases")
     dictionaries = dictionaries_of(loaded, problem.horizon)
     problem, shape = accumulated(problem), (problem.system.controls, dictionaries[0].functions)
     if given is not None:

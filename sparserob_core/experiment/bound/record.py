@@ -105,8 +105,8 @@ def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
         edges=found.edges,
         low=bands[0],
         high=bands[1],
-        corner="" if corners is None else corners.at(row.direction) or "",
-        stated=None if corners is None else corners.without(row.direction),
+        corner=corners.at(row.direction) or "",
+        stated=corners.without(row.direction) if corners else None,
     )
 
 

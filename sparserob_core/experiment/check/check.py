@@ -15,7 +15,6 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.check.files import compared
 from sparserob_core.experiment.config.run_config import digest
 from sparserob_core.experiment.directory.finished import read_config, read_json, stored_run
-from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
     from sparserob_core.checker.claims.case import Case
@@ -66,7 +65,7 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
     """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import check as derive
-    from sparserob_core.experiment.assemble import counting, dictionaries_of, gap_tolerance, problem_of
+    from sparserob_core.experiment.assemble import control_problem_of, counting, dictionaries_of, gap_tolerance
 
     if type(seconds) not in (int, float) or not seconds > 0:
         raise InputError(path="seconds", expected="a positive number", got=repr(seconds))
@@ -78,11 +77,7 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
         raise InputError(f"{path}: expected the directory of a finished run, got one without certificate.json")
     data, summary = read_json(path / "certificate.json"), read_json(path / "result.json")
     loaded = stored.config(plugins)
-    problem = problem_of(loaded)
-    if isinstance(problem, SemiInfiniteProgram):
-        raise InputError(
-            f"{path}: expected the run of a control problem; certificates of other programs cannot be checked"
-        )
+    problem = control_problem_of(loaded, f"{path}: expected the run of a control problem, whose certificate is checked")
     control, disturbance = dictionaries_of(loaded, problem.horizon)
     policy = _policy(loaded, data, control, problem.measurements)
     title = loaded.config.title or path.name
@@ -105,13 +100,11 @@ def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, starte
     """The verdicts on the directory that `bound` wrote."""
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.suprema.suprema import check_suprema
-    from sparserob_core.experiment.assemble import dictionaries_of, problem_of
+    from sparserob_core.experiment.assemble import control_problem_of, dictionaries_of
 
     data = read_json(path / "bound.json")
     loaded = read_config(path, plugins)
-    problem = problem_of(loaded)
-    if isinstance(problem, SemiInfiniteProgram):
-        raise InputError(f"{path}: expected worst cases of a control problem")
+    problem = control_problem_of(loaded, f"{path}: expected worst cases of a control problem")
     control, disturbance = dictionaries_of(loaded, problem.horizon)
     decision = data.get("decision")
     if decision is None:  # without any control

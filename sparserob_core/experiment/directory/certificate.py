@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.explanation import TimedExplanation, in_numbers
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.answer import ControlResult
@@ -17,7 +17,7 @@ from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
-from sparserob_core.sip.program import TOLERANCE, Formulation, SemiInfiniteProgram
+from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
 if TYPE_CHECKING:
@@ -235,15 +235,6 @@ def _of_norms(problem: OptimalControlProblem, z: Array, pieces: int) -> Array:
     return answer
 
 
-def _explained(
-    program: SemiInfiniteProgram, name: str, formulation: Formulation, at: Array, row: int
-) -> TimedExplanation | None:
-    """The constraint in numbers; ``None`` for one whose index does not say them, such as the number of a sample."""
-    family = program.formulated(name, formulation)
-    said = None if family is None else family.explanation(at, row)
-    return said if isinstance(said, TimedExplanation) else None
-
-
 def _parameter(problem: OptimalControlProblem, said: TimedExplanation) -> Array:
     """The parameter of a constraint, certainly inside its set; the middle one for a constraint without uncertainty."""
     bound = problem.system.parameters
@@ -325,7 +316,7 @@ def _witness(experiment: ControlExperiment, result: Result) -> dict[str, Any] | 
     worst, problem = result.worst, experiment.problem
     if worst is None:
         return None
-    said = _explained(experiment.program, worst.constraint, worst.formulation, worst.index, worst.row)
+    said = in_numbers(experiment.program, worst.constraint, worst.formulation, worst.index, worst.row)
     if said is None:
         return None
     said = _driven(experiment, said, np.asarray(result.decision))

@@ -85,8 +85,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
 def _path(states: Array, direction: Array, data: FigureData) -> Array:
     """The states ``(d, T)`` of a worst case, at the corner of the parameters beside the time that its direction is
     of."""
-    corners = data.names.corners
-    return states if corners is None else corners.stated(direction, states)
+    return data.names.corners.stated(direction, states)
 
 
 def _uncertain(arrays: Mapping[str, Array], data: FigureData) -> str:
@@ -95,7 +94,7 @@ def _uncertain(arrays: Mapping[str, Array], data: FigureData) -> str:
     begun = not np.allclose(arrays["initial_states"][:, known], data.state[known, 0], rtol=1e-9, atol=0.0)
     kinds = {
         "disturbance": arrays["disturbances"].any(),
-        "parameter": arrays["parameters"].shape[1] > 0 or data.names.corners is not None,
+        "parameter": arrays["parameters"].shape[1] > 0 or bool(data.names.corners),
         "noise": "noises" in arrays,
         "initial state": begun,
     }

@@ -4,12 +4,13 @@ can bring its quantity, and what is allowed."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.explanation import in_numbers
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import plain
@@ -129,8 +130,9 @@ def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:
 
 
 def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> Strip | None:
-    said = family.explanation(cut.index, cut.row)
-    if not isinstance(said, TimedExplanation) or not said.quantity:
+    told = partial(in_numbers, program, cut.family, cut.formulation, cut.index)
+    said = told(cut.row)
+    if said is None or not said.quantity:
         return None
     G, h = family.rows(cut.index[None])
     row = rows_at(_reduced(program, family), family.name, cut.index[None], np.array([cut.row])).G[0]
@@ -142,9 +144,8 @@ def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> 
         for j in range(h.shape[1])
         if j != cut.row and np.abs(G[0, j] + row).max() <= 1e-12 * np.abs(row).max(initial=1e-300)
     ]
-    others = [family.explanation(cut.index, j) for j in opposite]
-    for other in others:
-        if isinstance(other, TimedExplanation) and other.quantity == said.quantity:
+    for other in map(told, opposite):
+        if other is not None and other.quantity == said.quantity:
             limits[other.sign], sigmas[other.sign] = other.limit, other.sigma
     label = f"{said.quantity}\n{family.name}" + (f", {said.where}" if said.where and said.time else "")
     return Strip(

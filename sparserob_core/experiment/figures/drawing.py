@@ -108,7 +108,7 @@ def _data(
     axes = np.eye(problem.system.controls)
     tolerance = experiment.loaded.config.method.options.get("tolerance")
     decision, times = np.ravel(theta), _times(model.response.grid.breakpoints)
-    states = problem.names.own(problem.system.states) if states is None else states
+    states = problem.names.corners.own(problem.system.states) if states is None else states
     around = _tube(model, decision, times, states)
     answered = {} if model.feedback is None else _answered(model, decision, times, draws, states)
     longest = 0.0 if program.activity is None else float(program.activity.sum())
@@ -145,7 +145,7 @@ def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     model = experiment.model
     if model is None or model.problem.system.states <= MOST_STATES:
         return None
-    problem, own = model.problem, model.problem.names.own(model.problem.system.states)
+    problem, own = model.problem, model.problem.names.corners.own(model.problem.system.states)
     if len(own) <= MOST_STATES:
         return own
     rough = _tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own)

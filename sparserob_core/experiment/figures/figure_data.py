@@ -164,7 +164,7 @@ class FigureData:
     @property
     def of_states(self) -> str:
         """What a title adds where not every state is shown."""
-        drawn, known = len(self.drawn_states), len(self.names.own(self.state.shape[0]))
+        drawn, known = len(self.drawn_states), len(self.names.corners.own(self.state.shape[0]))
         return "" if drawn == known else f", {drawn} of {known} states"
 
     def control_label(self, channel: int) -> str:

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.explanation import in_numbers
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_horizon, stretched
@@ -246,12 +246,11 @@ def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
     shares = model.control.breakpoints / model.control.horizon
     middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
     for cut in result.dual.cuts:
-        family = model.program.formulated(cut.family, cut.formulation)
         constraint = model.constraint(model.program.family(cut.family))
-        if family is None or constraint is None:
+        if constraint is None:
             continue
-        said = family.explanation(cut.index, cut.row)
-        if isinstance(said, TimedExplanation) and cut.multiplier > 0.0:
+        said = in_numbers(model.program, cut.family, cut.formulation, cut.index, cut.row)
+        if said is not None and cut.multiplier > 0.0:
             known = said.parameter is not None and said.parameter.size > 0
             parameter = said.parameter if known and said.parameter is not None else middle
             moved = 0.0

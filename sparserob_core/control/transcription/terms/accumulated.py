@@ -92,11 +92,11 @@ def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: st
     return found, end
 
 
-def _called(name: str, H: Array, G: Array, corners: Corners | None) -> list[str]:
+def _called(name: str, H: Array, G: Array, corners: Corners) -> list[str]:
     """What the rows of an integral are called: by their numbers where there are several, and by the parameters beside
     the time at whose corner they are; by their numbers alone where that does not tell them apart."""
     numbered = [name] if len(H) == 1 else [f"{name} {row + 1}" for row in range(len(H))]
-    if corners is None:
+    if not corners:
         return numbered
     rows = np.hstack([np.array([corners.without(h) for h in H]), G])
     _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)

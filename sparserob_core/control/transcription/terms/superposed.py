@@ -59,11 +59,11 @@ def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
     return [system.dependence.rows(corner) for corner in _corners(system.dependence)]
 
 
-def corners_of(problem: OptimalControlProblem) -> Corners | None:
-    """The corners of a problem as it is stated; ``None`` where it has no parameters beside the time."""
+def corners_of(problem: OptimalControlProblem) -> Corners:
+    """The corners of a problem as it is stated; none where it has no parameters beside the time."""
     system, rows = problem.system, at_corners(problem)
     if rows is None or not isinstance(system, VaryingSystem) or system.parameters is None:
-        return None
+        return Corners()
     box, reached = system.parameters, system.dependence.reached
     ends = [
         sorted({low, high}) if any(one) else [low]
