@@ -190,3 +190,52 @@ def test_errors_of_a_piece_count_through_the_system_that_acts_then(tmp_path: Pat
         "execution": 0.05,
     }
     assert verified(tmp_path / "run", problem, pieces(4))["cost"] == pytest.approx(0.45 / 0.95, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("integral", "cost"),
+    [
+        # the first piece of 0.5 gives 0.875 of its height to the integral of x, of which 0.95 for sure
+        ({"H": [[1]], "lower": [-1.2]}, 0.5 * 0.8 / (0.95 * 0.875)),
+        # and what is commanded is counted as it is
+        ({"H": [[1]], "G": [[0.5]], "lower": [-1.2]}, 0.5 * 0.8 / (0.95 * 0.875 + 0.25)),
+        ({"H": [[1]], "G": [[0.5]], "lower": [-1.2], "from": 0.5}, 0.5 * 0.3 / (0.95 * 0.625 + 0.25)),
+        ({"G": [[-1]], "lower": [-0.3], "from": 0.5}, 0.0),
+    ],
+)
+def test_an_integral_counts_what_is_commanded_and_what_errors_make_of_the_state(
+    integral: dict[str, Any], cost: float, tmp_path: Path
+) -> None:
+    # x' = u from -1, for 2
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0]], "B": [[1]]},
+        "horizon": 2.0,
+        "initial_state": [-1],
+        "control": {"box": 1.0},
+        "integral": [integral],
+        "execution": 0.05,
+    }
+    assert verified(tmp_path / "run", problem, pieces(4))["cost"] == pytest.approx(cost, rel=1e-7, abs=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.0, 0.5])
+def test_a_budget_is_one_of_commands(delay: float, tmp_path: Path) -> None:
+    # x' = u from -1 to at most 0.1 from 0: 0.9 / 0.95 is commanded, and no less suffices
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0]], "B": [[1]], "delay": delay},
+        "horizon": 2.0,
+        "initial_state": [-1],
+        "control": {"box": 1.0},
+        "terminal": [{"box": 0.1}],
+        "integral": [{"G": [[1]], "to": 2.0 - delay, "upper": [0.9 / 0.95 + 1e-7]}],
+        "execution": 0.05,
+    }
+    assert verified(tmp_path / "run", problem, pieces(4))["cost"] == pytest.approx(0.9 / 0.95, rel=1e-6)
+    problem["integral"][0]["upper"] = [0.9 / 0.95 - 1e-4]
+    config = {"problem": problem, "dictionaries": {"control": pieces(4)}, "observers": []}
+    assert sr.run(config, out=tmp_path / "none", figures=False).result.status == "infeasible"
+    assert check(tmp_path / "none").status == "verified"

@@ -72,9 +72,10 @@ def test_a_margin_varies_it() -> None:
     assert margin.lower == pytest.approx(0.5, abs=1e-5) and margin.upper == pytest.approx(0.5, abs=1e-5)
 
 
-def test_it_is_itself_in_other_units_and_refuses_what_is_not_proven_of_it(run: sr.Outcome) -> None:
+def test_it_is_itself_in_other_units_and_stands_beside_errors_of_execution(run: sr.Outcome, tmp_path: Path) -> None:
     units = Units(2.0, np.array([8.0]), np.array([32.0, 4.0]), np.array([1.0]), np.zeros(0), 1.0)
     (entry,) = run.experiment.transcription.stated.in_units(units).store
     assert entry.G.tolist() == [[64.0, 0.0]] and entry.stop == 0.5
-    with pytest.raises(sr.InputError, match="integrals"):
-        sr.run(CONFIG, {"problem.execution": 0.1}, quiet=True)
+    erring = sr.run(CONFIG, {"problem.execution": 0.01}, out=tmp_path / "run", quiet=True, figures=False)
+    assert erring.result.cost == pytest.approx(0.6 + 2.0 * (1.0 / 0.99 - 0.6), abs=1e-6)
+    assert sr.check(tmp_path / "run", plugins=[TERM]).status == "verified"

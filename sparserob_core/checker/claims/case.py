@@ -414,7 +414,8 @@ class Case:
                 pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][
                     : acts.size - 1 if pieces else 0
                 ]
-            return VaryingExecution(self.changing, np.asarray(shares, dtype=float), acts, pieces)
+            numb = self.problem.commanded
+            return VaryingExecution(self.changing, np.asarray(shares, dtype=float), acts, pieces, numb=numb)
         return Execution(self.problem, np.asarray(shares, dtype=float), self.control.breakpoints, pieces)
 
     def erring(self, c: Array, time: float) -> tuple[Array | None, arb]:

@@ -101,7 +101,7 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
         for row, (h, g, (lower, upper)) in enumerate(zip(H, G, bounds, strict=True)):
             name, unit = called + (f" {row + 1}" if len(H) > 1 else ""), _unit(problem.names, h, g)
             made = [Coordinate(h, g, entry.start, entry.stop, name, unit)]
-            if g.any() and late:
+            if g.any() and (late or problem.execution is not None):  # errors are no part of what is counted
                 both = [f"{name} of states", f"{name} of controls"] if h.any() else [name]
                 made = [Coordinate(0.0 * h, g, entry.start + late, judged, both[-1], unit)]
                 made = [Coordinate(h, 0.0 * g, entry.start, entry.stop, both[0], unit)] * (len(both) - 1) + made
@@ -130,6 +130,7 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
         integral=(),
         cost=_cost(problem.cost, size - d),
         names=_named(problem, coordinates),
+        commanded=tuple(d + i for i, one in enumerate(coordinates) if one.g.any() and problem.execution is not None),
         measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, size - d)))),
     )
 

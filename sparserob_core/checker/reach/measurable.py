@@ -453,7 +453,7 @@ class Execution:
 
         (flow,) = flows(self.problem.system, [])
         A, B, m = flow.parts["A"][0], flow.parts["B"][0], self.shares.size
-        B = stacked([row[:m] for row in B.tolist()])
+        B = stacked([[x * (i not in self.problem.commanded) for x in row[:m]] for i, row in enumerate(B.tolist())])
         both = stacked([[*b, *more] for b, more in zip(B.tolist(), (A * B).tolist(), strict=True)])
         horizon = float(self.breakpoints[-1])
         return Kernel.of(A, both, arb(horizon), OwnUnits.of(A, horizon, np.abs(middles(B)).sum(axis=1)))

@@ -159,10 +159,11 @@ def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | N
 
 
 def _followed(case: Case, asked: Asked) -> Worst | None:
-    """The row by its adjoint, where the system is known and does not change; ``None`` elsewhere."""
+    """The row by its adjoint, where the system is known and does not change, and the control is delivered as it is
+    commanded; ``None`` elsewhere."""
     system = case.problem.system
     if case.problem.execution is not None and case.theta.any():
-        raise Unchecked("worst cases of a control that is delivered with errors are not derived")
+        return None
     if not isinstance(system, LinearSystem) or system.parameter_count or not case.alike:
         return None
     return followed(case, asked.window.split(asked.direction)[0])
@@ -186,6 +187,10 @@ def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Wor
         raise Broken("the deviation of the initial state is not shown to be in its set")
     changes, signal = _signal(case, entry)
     low, high = beside(case, window, asked.direction, time, time)
+    if case.execution is not None:  # the worst errors are enclosed, whatever they are
+        errors = case.execution.added(window.split(asked.direction)[0], time)
+        slack = 2.0 * HALF_ULP * (abs(low) + abs(high) + abs(errors[1]))
+        low, high = low + errors[0] - slack, high + errors[1] + slack
     if followed is not None:
         value = followed.along(time, deviation, changes, signal)
         return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high

@@ -113,7 +113,8 @@ class OptimalControlProblem(Term):
     ``execution``: a share of the control, from 0 to 1, one for each: what is delivered differs from the command by at
     most that share of it, any function of time, and every constraint on the state holds nonetheless; of nothing
     nothing is missing. What a mixed constraint says of the control, the set of the control, that of its steps and the
-    cost are about the command. ``None``: what is commanded is delivered.
+    cost are about the command, and what integrals say of it. ``None``: what is commanded is delivered. ``commanded``:
+    states that add up what is commanded, which no error reaches; those of a larger problem, made of integrals.
 
     ``weights``: a positive number, one for each control, or rows of a time and the weights from then on, which are not
     negative: prices, or a supply that is free for a while. The first time is 0.
@@ -144,6 +145,7 @@ class OptimalControlProblem(Term):
     measurements: Measurements | None = field(default=None, metadata=TERMS)
     repeat: bool | Repeating = field(default=False, metadata=UNITLESS)
     execution: npt.ArrayLike | None = field(default=None, metadata=UNITLESS)
+    commanded: tuple[int, ...] = field(default=(), metadata=UNITLESS)
     disturbance_breakpoints: Breakpoints | None = field(default=None, metadata=measured(lambda of: of.time, _pieces))
 
     __repr__ = noun
@@ -282,7 +284,6 @@ class OptimalControlProblem(Term):
             is not None
             and not self.measurable.is_box
             and (bool(self.system.switches) or self.system.delay > 0.0),
-            "integrals of state and control": bool(self.sums),
             "curved sets of states": any(one.halfspaces() is None for one in sets),
         }
         for beside, given in refused.items():

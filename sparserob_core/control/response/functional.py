@@ -104,6 +104,13 @@ class WorstCase:
         """The control on the pieces of its dictionary."""
         return self.dictionary.control(decision[: self.coefficients])
 
+    @shaped
+    def decided_by(self, theta: Float[Array, "m N"]) -> Float[Array, " n"]:
+        """The decision of which a control's coefficients are ``theta``."""
+        if self.execution is None:
+            return theta.ravel()
+        return np.concatenate([theta.ravel(), np.abs(self.dictionary.control(theta.ravel())).ravel()])
+
     @cached_property
     def known(self) -> Array:
         """What acts through the columns of ``B`` where nothing is decided, ``(m + constants, L)``: a drift, and the

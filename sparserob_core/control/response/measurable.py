@@ -549,11 +549,13 @@ class MeasurableCellSupport(KnownCellSupport):
 @dataclass(frozen=True, eq=False)
 class Execution:
     """The ``shares (m,)`` of the commanded control by which what is delivered may differ; ``breakpoints (K + 1,)`` are
-    the command's, ``response`` is that of a known system."""
+    the command's, ``response`` is that of a known system. ``felt (d,)``: 0 of states that add up what is commanded,
+    and do nothing else, 1 of others."""
 
     response: Response
     breakpoints: Array
     shares: Array
+    felt: Array
 
     def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion) -> Support:
         """What the worst errors of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time."""
@@ -581,7 +583,7 @@ class Execution:
     def matrices(self) -> tuple[Array, Array]:
         """``A (d, d)``, ``B (d, m)``."""
         A, B, _ = self.response.system.modes[0].matrices(np.zeros((1, 0)))
-        return A[0], B[0][:, : self.shares.size]
+        return A[0], self.felt[:, None] * B[0][:, : self.shares.size]
 
     @cached_property
     def _supports(self) -> list[MeasurableSupport | None]:
@@ -844,6 +846,7 @@ class VaryingExecution(Execution):
         pieces = np.flatnonzero(asked[:, acting].any(axis=0))
         if not pieces.size or not times.size:
             return found
+        directions = directions * self.felt
         each = max(1, AT_ONCE // (pieces.size * self.kernel.terms[0].size + acting.size * directions.shape[1]))
         for begin in range(0, times.size, each):
             part = slice(begin, begin + each)
@@ -1013,7 +1016,7 @@ class VaryingMeasurable:
         far = np.maximum(box.upper - self.middle, self.middle - box.lower)
         far = np.where(self.middle == 0.0, far, np.where(box.upper > box.lower, np.nextafter(far, np.inf), 0.0))
         ends = self.response.grid.breakpoints[[0, -1]]
-        return VaryingExecution(self.response, ends, far, disturbing=True)
+        return VaryingExecution(self.response, ends, far, np.ones(self.response.system.states), disturbing=True)
 
     @property
     def command(self) -> Array:

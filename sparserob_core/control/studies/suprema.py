@@ -179,11 +179,12 @@ def followed(
     problem: OptimalControlProblem, dictionaries: tuple[Dictionary, Dictionary], theta: Array, row: Row
 ) -> WorstRow | None:
     """The row by its adjoint; ``None`` where the system has parameters or pieces, or changes with time, or where
-    disturbances are of a kind that adds up otherwise."""
+    disturbances are of a kind that adds up otherwise, or there are errors of execution."""
     control, disturbance = dictionaries
     system, d = problem.system, problem.system.states
     alike = isinstance(problem.disturbance_class, str) and problem.disturbance_breakpoints is None
-    if not isinstance(system, LinearSystem) or system.parameter_count or not alike:
+    erring = problem.execution is not None and theta.any()  # what stands still is delivered as it is commanded
+    if not isinstance(system, LinearSystem) or system.parameter_count or not alike or erring:
         return None
     changes: Array | None = None
     if problem.disturbance is not None and problem.disturbance_class == "piecewise_constant":
@@ -295,7 +296,7 @@ def _of_program(
     model = prepare(alone, *dictionaries)
     own = model.program.own_units
     assert own is not None
-    family, decision = own.program.families[0], theta.ravel() / own.decision
+    family, decision = own.program.families[0], model.functionals.decided_by(theta) / own.decision
     units, unit = np.asarray(family.index_units), family.row_unit(0)
     middle = (family.index_set.lower + family.index_set.upper) / 2
     times = np.linspace(family.index_set.lower[0], family.index_set.upper[0], LOOKS)

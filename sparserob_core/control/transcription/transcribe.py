@@ -31,7 +31,6 @@ from sparserob_core.control.transcription.program import OpenLoop, held_nominall
 from sparserob_core.control.transcription.record import Acting, Posed, Transcription
 from sparserob_core.control.transcription.steps import refuse_without_steps
 from sparserob_core.control.transcription.terms.accumulated import accumulated
-from sparserob_core.control.transcription.terms.in_time import in_time
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import OwnUnits, SemiInfiniteProgram
@@ -90,7 +89,7 @@ def prepare(
             )
     require_representable(problem)
     stated, disturbance = _on_one_grid(problem, disturbance)
-    problem = in_time(accumulated(stated))
+    problem = accumulated(stated)
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
     if problem.execution is not None and mask.any():
@@ -146,11 +145,13 @@ def _functionals(
     if problem.execution is not None:
         from sparserob_core.control.response.measurable import Execution, VaryingExecution
 
-        shares, early = np.asarray(problem.execution), None if grid.before is None else np.abs(grid.before)
+        shares, felt = np.asarray(problem.execution), np.ones(problem.system.states)
+        felt[list(problem.commanded)] = 0.0
+        early = None if grid.before is None else np.abs(grid.before)
         execution = (
-            VaryingExecution(response, control.breakpoints, shares, before=early)
+            VaryingExecution(response, control.breakpoints, shares, felt, before=early)
             if system.varies
-            else Execution(response, control.breakpoints, shares)
+            else Execution(response, control.breakpoints, shares, felt)
         )
     functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)

@@ -67,10 +67,6 @@ def bound(
     problem, shape = accumulated(problem), (problem.system.controls, dictionaries[0].functions)
     if given is not None:
         _require_fitting(given, shape, loaded, _answers(loaded, problem, dictionaries[0]))
-        if problem.execution is not None and given.any():  # what stands still is delivered as it is commanded
-            expected = "none, for worst cases with the control of a run: errors of execution are not in them yet"
-            got = f"{np.asarray(problem.execution).tolist()}"
-            raise loaded.located(("problem",), InputError(path="execution", expected=expected, got=got))
     deadline = Deadline(loaded.config.limits.seconds if seconds is None else float(seconds))
 
     def told(text: str, done: int, total: int) -> None:

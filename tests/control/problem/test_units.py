@@ -114,7 +114,7 @@ def test_every_field_of_every_term_says_its_unit_and_what_is_left_of_it() -> Non
 
 # What has no unit, by its field: shares, choices, and what a row of the user's is bounded by in the user's own unit.
 NUMBERS = {
-    "disturbance_class", "title", "names", "repeat", "execution", "path.name", "path.h", "integral.lower",
+    "disturbance_class", "title", "names", "repeat", "execution", "commanded", "path.name", "path.h", "integral.lower",
     "integral.upper", "integral.name", "cost.group", "cost.l1", "disturbances",
 }  # fmt: skip
 
@@ -151,7 +151,7 @@ def problems() -> list[sr.OptimalControlProblem]:
         sr.OptimalControlProblem(**system, disturbance_class="measurable"),
         sr.OptimalControlProblem(
             system=sr.LinearSystem([[0.5, 2.0], [-3.0, 0.25]], [[0.75], [1.5]]), horizon=3.0, initial_state=[1.5, -0.5],
-            control=sr.Box([-3.0], [1.25]), execution=[0.125],
+            control=sr.Box([-3.0], [1.25]), execution=[0.125], commanded=(1,),
         ),
         sr.OptimalControlProblem(
             system=sr.LinearSystem([[0.5, 2.0], [-3.0, 0.25]], [[0.75], [1.5]]), horizon=3.0, initial_state=[1.5, -0.5],

@@ -372,11 +372,24 @@ def test_bad_input_is_named(stated: object, arguments: dict, named: str) -> None
     assert named in str(told.value)
 
 
-def test_a_run_with_errors_of_execution_is_refused_and_its_plant_without_control_is_not(tmp_path: Path) -> None:
-    stated = config(pieces=4, initial_state=[0.5, 0], execution=[0.05], terminal=[{"box": [0.4, 0.4]}])
-    outcome = sr.run(stated, out=tmp_path / "run", figures=False)
-    with pytest.raises(sr.InputError, match=r"execution: .*0\.05"):
-        sr.bound(outcome)
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.0, 0.5])
+def test_worst_cases_of_a_run_have_the_worst_errors_of_execution(delay: float, tmp_path: Path) -> None:
+    # x' = u from -1 to at most 0.1 from 0: 0.9 / 0.95 is commanded, of which 0.95 to 1.05 arrive
+    stated = config(
+        pieces=4,
+        system={"A": [[0]], "B": [[1]], "delay": delay},
+        initial_state=[-1],
+        control={"box": [1]},
+        execution=[0.05],
+        terminal=[{"box": [0.1]}],
+    )
+    sr.run(stated, out=tmp_path / "run", figures=False)
+    found = sr.bound(tmp_path / "run", out=tmp_path / "bound")
+    least, most = sorted(found.rows, key=lambda row: row.lower)
+    assert [least.lower, least.upper] == pytest.approx([-0.1, -0.1], abs=1e-8)
+    assert [most.lower, most.upper] == pytest.approx([1.05 * 0.9 / 0.95 - 1.0] * 2, abs=1e-8)
+    assert set(verdicts(tmp_path / "bound")) == {"holds"}
     assert sr.bound(stated).rows
 
 

@@ -35,7 +35,7 @@ TIMES_KEPT = 4096  # times at which what errors make of the states is remembered
 class VaryingExecution:
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for. It enters through the columns of ``[B E]`` from the ``first`` one on; the
-    errors are known but for ``off (m,)``."""
+    errors are known but for ``off (m,)``, and do not reach the ``numb`` states, which add up what is commanded."""
 
     law: VaryingFlow
     shares: Array
@@ -43,6 +43,7 @@ class VaryingExecution:
     pieces: Sequence[arb_mat]
     first: int = 0
     off: Array | None = None
+    numb: Sequence[int] = ()
     _kernels: dict[tuple[float, float], Enclosed] = field(default_factory=dict, repr=False)
     _onward: dict[int, Enclosed] = field(default_factory=dict, repr=False)
     _added: dict[tuple[float, bytes], tuple[Array, Array]] = field(default_factory=dict, repr=False)
@@ -125,6 +126,7 @@ class VaryingExecution:
         """``int |c'Phi(t, s) B_j(s)| ds`` for ``rows (n, d)`` over those of the ``pieces`` between marks that begin
         before the time: between ``(q, n, m)`` and ``(q, n, m)``; and which pieces these are, ``(q,)``."""
         m, begins = self.shares.size, np.array(self.marks[:-1])
+        rows = np.where(np.isin(np.arange(rows.shape[1]), list(self.numb)), 0.0, rows)
         which = pieces[begins[pieces] < time]
         if not which.size:
             none = np.zeros((0, len(rows), m))

@@ -15,6 +15,7 @@ from sparserob_core.control.problem.system import LinearSystem, System
 from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
 from sparserob_core.control.sets.sets import Polytope, cylinder
 from sparserob_core.control.term import SAME_TIME
+from sparserob_core.control.transcription.terms.in_time import in_time
 from sparserob_core.control.transcription.terms.larger import larger
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -38,10 +39,11 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same problem without integrals: each row of them is a state more, or the sum of two, known at the beginning
     and not measured, that is bounded at one time. The system stays a single one where it is one and all windows begin
     at 0: integrals then go on to the horizon, since nothing looks at them again. Parameters beside the time became
-    states before (`superposed`), of which there are integrals too."""
+    states before (`superposed`), of which there are integrals too; beside errors of execution pieces of the system, and
+    a delay, become one that changes with time (`in_time`)."""
     problem = superposed(in_rows(problem))
     if not problem.integral:
-        return problem
+        return in_time(problem)
     running, ends, d = list[Running](), list[Accumulated](), problem.system.states
     for entry, name in zip(problem.integral, problem.called("integral"), strict=True):
         rows, end = _running(problem, entry, name)
@@ -51,7 +53,7 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
     if not problem.system.switches and all(one.start == 0.0 for one in running):
         running = [replace(one, stop=problem.horizon) for one in running]
     k = len(running)
-    return larger(
+    found = larger(
         problem,
         k,
         system=_system(problem.system, running, problem.horizon),
@@ -59,7 +61,9 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
         terminal=[cylinder(end, d + k) for end in problem.terminal],
         integral=(),
         names=_names(problem.names, d, running),
+        commanded=_commanded(problem, running),
     )
+    return in_time(found)
 
 
 def in_rows(problem: OptimalControlProblem) -> OptimalControlProblem:
@@ -76,20 +80,27 @@ def in_rows(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: str) -> tuple[list[list[Running]], float]:
     """The states that the rows of an integral are sums of, and the time at which all of these are complete. Where the
-    control acts later than it is commanded, its part is integrated as much later."""
+    control acts later than it is commanded, its part is integrated as much later; where it is missed by errors of
+    execution, which are not counted, it is a state of its own too."""
     H, G, start, stop, delay = np.asarray(entry.H), np.asarray(entry.G), entry.start, entry.stop, problem.system.delay
     assert stop is not None
     end = min(stop + delay, problem.horizon) if G.any() else stop
     found = []
     for called, h, g in zip(_called(name, H, G, problem.names.corners), H, G, strict=True):
         unit = _unit(measured_in(np.append(h, g), problem.names, h.size).strip(), problem.names.time)
-        if delay == 0.0 or not g.any():
+        if (delay == 0.0 and problem.execution is None) or not g.any():
             found.append([Running(h, g, start, stop, called, unit)])
             continue
         late = Running(np.zeros_like(h), g, start + delay, end, called, unit)
         early = Running(h, np.zeros_like(g), start, stop, f"{called} of states", unit)
         found.append([early, replace(late, name=f"{called} of controls")] if h.any() else [late])
     return found, end
+
+
+def _commanded(problem: OptimalControlProblem, running: list[Running]) -> tuple[int, ...]:
+    """The numbers of the states that add up what is commanded, where something else may be delivered."""
+    d = problem.system.states
+    return () if problem.execution is None else tuple(d + i for i, one in enumerate(running) if one.g.any())
 
 
 def _called(name: str, H: Array, G: Array, corners: Corners) -> list[str]:

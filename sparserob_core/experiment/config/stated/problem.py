@@ -31,6 +31,7 @@ WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
     "terminal", "title", "initial_control", "control_step", "names", "cost", "disturbances",
     "measurements", "repeat", "execution", "disturbance_breakpoints",
+    "commanded",
 }  # fmt: skip
 """The fields of a problem that are written beside lists of constraints; another one is refused, not lost."""
 CALLED = {"start": "from", "stop": "to"}
