@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from scipy.optimize import linprog
+from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
@@ -118,8 +118,8 @@ class Walk:
         return on, off, rest + float(np.abs(np.einsum("nd,ndm->nm", rows, self.moved[:n])).sum(axis=0) @ self.far)
 
 
-def least_cost(problem: dict[str, Any]) -> float:
-    """The cost by a linear program in ``u = a - b``, its rows at every fine step."""
+def rows_of(problem: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``G [a, b] <= h`` of ``u = a - b`` at every fine step, and prices of both."""
     walk, G, h = Walk(problem), [], []
     last = PIECES * FINE
     begin = round(problem["path"][0]["from"] / walk.step)
@@ -132,7 +132,32 @@ def least_cost(problem: dict[str, Any]) -> float:
                 G.append(np.concatenate([(on + off).ravel(), (off - on).ravel()]))
                 h.append(bound - rest)
     prices = np.tile(np.repeat(problem["weights"], PIECES), 2) * HORIZON / PIECES
+    return np.array(G), np.array(h), prices
+
+
+def least_cost(problem: dict[str, Any]) -> float:
+    """The cost by a linear program."""
+    G, h, prices = rows_of(problem)
     found = linprog(prices, A_ub=G, b_ub=h, bounds=(0, 1), method="highs")
+    assert found.success
+    return float(found.fun)
+
+
+def least_count(problem: dict[str, Any], letters: bool) -> float:
+    """The weighted time of action by a mixed-integer program; with ``letters`` ``u`` is -1, -0.5, 0, 0.5 or 1."""
+    G, h, prices = rows_of(problem)
+    n = prices.size  # a, b, twice a whole number with letters, at most 1; and whether a + b is not 0
+    either = np.hstack([np.eye(n // 2), np.eye(n // 2), -np.eye(n // 2)])
+    rows = np.vstack([np.hstack([G, np.zeros((len(h), n // 2))]), either])
+    halves = 0.5 if letters else 1.0
+    rows[:, :n] *= halves
+    found = milp(
+        np.concatenate([np.zeros(n), prices[: n // 2]]),
+        constraints=LinearConstraint(rows, -np.inf, np.concatenate([h, np.zeros(n // 2)])),
+        integrality=np.repeat([float(letters), 1.0], [n, n // 2]),
+        bounds=Bounds(0, np.repeat([1.0 / halves, 1.0], [n, n // 2])),
+        options={"mip_rel_gap": 0.0},
+    )
     assert found.success
     return float(found.fun)
 
@@ -239,3 +264,15 @@ def test_a_budget_is_one_of_commands(delay: float, tmp_path: Path) -> None:
     config = {"problem": problem, "dictionaries": {"control": pieces(4)}, "observers": []}
     assert sr.run(config, out=tmp_path / "none", figures=False).result.status == "infeasible"
     assert check(tmp_path / "none").status == "verified"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("letters", [False, True])
+@pytest.mark.parametrize("name", ["one system", "pieces and delay"])
+def test_the_sparsest_control_is_that_of_a_mixed_integer_program(name: str, letters: bool, tmp_path: Path) -> None:
+    problem = {**PROBLEM, **CASES.get(name, {})}
+    method = {"name": "sparsest", "nodes": 600, **({"alphabet": [-1.0, -0.5, 0.0, 0.5, 1.0]} if letters else {})}
+    config = {"problem": problem, "dictionaries": {"control": pieces(PIECES)}, "observers": [], "method": method}
+    result = sr.run(config, out=tmp_path / "run", figures=False).result
+    assert result.status == "certified" and result.cost == pytest.approx(least_count(problem, letters), rel=1e-6)
+    assert check(tmp_path / "run").status == "verified"

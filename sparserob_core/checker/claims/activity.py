@@ -221,10 +221,11 @@ def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], row
     from flint import arb
 
     total, slopes = case.duality.summed(rows, None)
-    for k, (length, slope) in enumerate(zip(_lengths(case), slopes, strict=True)):
+    sizes = case.duality.charged(rows, [[arb(0)] * case.problem.system.controls] * len(slopes))
+    for k, (length, slope, charged) in enumerate(zip(_lengths(case), slopes, sizes, strict=True)):
         here = [parts.get((c, k), ANY) for c in range(len(slope))]
         counts = [arb(float(c)) * length if feasible else arb(0) for c in case.price.counts]
-        total = total + _least_of_part(case, here, counts, slope)
+        total = total + _least_of_part(case, here, counts, slope, charged)
     if not feasible:
         if not total > 0:
             raise Broken(f"tree: multipliers of a part prove {float(total.lower()):.3g}, expected a positive number")
@@ -236,22 +237,23 @@ def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], row
     return max(0.0, bound)
 
 
-def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb]) -> arb:
-    """At most the minimum of what one piece counts and the slopes add, over the controls' set within a part."""
+def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb], sizes: Sequence[arb]) -> arb:
+    """At most the minimum of what one piece counts and the slopes, and ``sizes`` of absolute values, add, over the
+    controls' set within a part."""
     from flint import arb
 
     if case.problem.control.is_box or case.letters is not None:
         box, total = case.problem.control.bounding_box(), arb(0)
-        for part, count, s, low, high in zip(parts, counts, slope, box.lower, box.upper, strict=True):
+        for part, count, s, size, low, high in zip(parts, counts, slope, sizes, box.lower, box.upper, strict=True):
             ends = _values(case, part, float(low), float(high))
             if not ends:
                 return arb("inf")  # nothing is in this part
-            heights = [(count if part[2] or v != 0.0 else arb(0)) + s * arb(v) for v in ends]
+            heights = [(count if part[2] or v != 0.0 else arb(0)) + s * arb(v) + size * arb(abs(v)) for v in ends]
             total = total + reduce(lambda one, other: one.min(other), heights)
         return total
     certain = sum((count for part, count in zip(parts, counts, strict=True) if part[2]), arb(0))
     priced = [arb(0) if part[2] else count for part, count in zip(parts, counts, strict=True)]
-    return certain + _least(case, _ranges(case), priced, slope, [part[:2] == (0.0, 0.0) for part in parts])
+    return certain + _least(case, _ranges(case), priced, slope, [part[:2] == (0.0, 0.0) for part in parts], sizes)
 
 
 def _values(case: Case, part: Part, low: float, high: float) -> list[float]:

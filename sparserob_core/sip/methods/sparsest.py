@@ -32,7 +32,7 @@ from sparserob_core.sip.proof.verdict import verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.counting import DUST, count, count_of, counted_below, prices_of
+from sparserob_core.sip.working.counting import DUST, completed, count, count_of, counted_below, counting, prices_of
 from sparserob_core.sip.working.ledger import unproven
 from sparserob_core.sip.working.securing import PAID
 
@@ -77,7 +77,7 @@ class SparsestMethod(Method, Options):
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         if program.finite.blocks is not None and self.alphabet is not None:
             raise InputError("method: sparsest.alphabet spells channels one by one; expected a cost without groups")
-        if program.activity is None or program.n != program.activity.size:
+        if program.activity is None or counting(program) != program.activity.size:
             raise InputError(
                 "method: sparsest counts pieces, for which a control needs a function per piece; expected a dictionary"
                 " such as piecewise_constant"
@@ -96,8 +96,8 @@ class SparsestMethod(Method, Options):
         """The program with bounds as narrow as the alphabet is, and its letters in the program's units."""
         if self.alphabet is None:
             return program, None
-        base, size = program.finite, program.n
-        if base.S is not None and (abs(base.S[:size] - _identity(size))).max() > 0.0:
+        base, size = program.finite, counting(program)
+        if base.S is not None and (abs(base.S[:size] - _identity(size, program.n))).max() > 0.0:
             raise InputError(
                 "method: sparsest.alphabet needs a dictionary whose coefficients are the control's values; expected"
                 " piecewise_constant"
@@ -228,7 +228,7 @@ class _Search:
     def _spelt(self, image: Array) -> Array:
         assert self.letters is not None
         nearest = np.abs(image[: len(self.letters), None] - self.letters).argmin(axis=1)
-        return np.asarray(self.letters[np.arange(nearest.size), nearest])
+        return completed(self.program, self.letters[np.arange(nearest.size), nearest])
 
     def _exactly(self, x: Array) -> bool:
         """Prove a decision of letters, or impose what it violates."""
@@ -409,7 +409,7 @@ def _none(program: SemiInfiniteProgram, result: Result, letters: Sequence[float]
     return replace(result, sparsest=tree, cost_scale=0.0)
 
 
-def _identity(size: int) -> object:
+def _identity(size: int, columns: int) -> object:
     from scipy.sparse import csc_array, eye_array
 
-    return csc_array(eye_array(size))
+    return csc_array(eye_array(size, columns))

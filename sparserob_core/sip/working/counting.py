@@ -84,6 +84,26 @@ def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np
     return np.asarray(np.abs(coefficients @ values) > ROUNDED * (np.abs(coefficients) @ np.abs(values)))
 
 
+def counting(program: SemiInfiniteProgram) -> int:
+    """How many entries of a decision make the images that count: the first ones, all that there are unless bounds of
+    absolute values follow them."""
+    base, images = program.finite, 0 if program.activity is None else program.activity.size
+    return program.n if base.S is None else int(np.unique(base.S.tocsr()[:images].indices).size)
+
+
+def completed(program: SemiInfiniteProgram, entries: Array) -> Array:
+    """The decision ``(n,)`` that begins with ``entries``, and whose others are as small as bounds of the images
+    allow."""
+    base, size = program.finite, entries.size
+    if program.n == size:
+        return entries
+    assert base.S is not None
+    rows, rest = base.lower - base.S[:, :size] @ entries, base.S[:, size:].tocoo()
+    found = np.zeros(program.n - size)
+    np.maximum.at(found, rest.col, rows[rest.row] / rest.data)
+    return np.concatenate([entries, found])
+
+
 def count(program: SemiInfiniteProgram, x: Array) -> float:
     """The count of a decision ``x (n,)``, in the user's units: entries that make one vector count together."""
     base = program.finite

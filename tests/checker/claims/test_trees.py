@@ -63,20 +63,23 @@ def test_a_part_counts_what_no_control_in_it_goes_below(name: str) -> None:
     for parts in product((ANY, OFF, ON), repeat=2):
         off, on = (np.array([part == kind for part in parts]) for kind in (OFF, ON))
         allowed = (inside[:, off] == 0.0).all(axis=1)
-        for _ in range(8):
+        for number in range(8):
             counts, slope = rng.uniform(0.2, 2.0, 2), rng.normal(size=2) * rng.choice([0.3, 3.0])
-            bound = activity._least_of_part(case, parts, numbers(counts), numbers(slope))
+            sizes = rng.uniform(0.1, 1.0, 2) * (number % 2)
+            bound = activity._least_of_part(case, parts, numbers(counts), numbers(slope), numbers(sizes))
             if not allowed.any():
                 assert bound == arb("inf")
                 continue
-            whole = ((inside != 0.0) | on) @ counts + inside @ slope
+            whole = ((inside != 0.0) | on) @ counts + inside @ slope + np.abs(inside) @ sizes
             least, found = float(whole[allowed].min()), float(bound.mid())
             assert found <= least + 1e-12
             if shape.is_box:
                 assert found == pytest.approx(least)
             else:
                 # a value that has to be 0 is as dear as what its slope would bring
-                prices = np.where(on, counts, np.where(off, np.abs(slope * inside), np.abs(inside) / reach * counts))
+                charged = np.abs(inside) * sizes
+                costly = np.where(on, counts + charged, np.abs(inside) / reach * counts + charged)
+                prices = np.where(off, np.abs(slope * inside), costly)
                 shares = prices.sum(axis=1) + inside @ slope
                 assert found == pytest.approx(float(shares.min()), abs=0.03 * (counts.sum() + np.abs(slope).sum()))
 
@@ -86,8 +89,8 @@ def test_letters_are_all_that_a_part_of_an_alphabet_offers() -> None:
     for part, letters in (((-2.0, -0.5, False), [-2.0, -0.5]), ((0.0, 1.0, False), [0.0, 1.0]), (ANY, case.letters)):
         assert activity._values(case, part, -2.0, 2.0) == list(letters or ())
         for slope in (-0.7, 0.1, 3.0):
-            found = activity._least_of_part(case, [part], numbers([1.0]), numbers([slope]))
-            assert float(found.mid()) == min((v != 0.0) + slope * v for v in letters or ())
+            found = activity._least_of_part(case, [part], numbers([1.0]), numbers([slope]), numbers([0.25]))
+            assert float(found.mid()) == min((v != 0.0) + slope * v + 0.25 * abs(v) for v in letters or ())
     node = {"channel": 0, "piece": 1, "at": [-0.5, 0.0]}
     low, high = activity._divided(case, node, {(0, 1): (-2.0, 1.0, False)})
     assert low == {(0, 1): (-2.0, -0.5, False)} and high == {(0, 1): (0.0, 1.0, False)}
