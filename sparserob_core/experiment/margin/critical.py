@@ -3,7 +3,7 @@ slack where it does not."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, final
 
@@ -13,6 +13,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.scaling import Scaling
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.sip.events import Notify
+from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -28,12 +29,13 @@ PROBES = 80  # factors at most at which the slack is computed
 @dataclass(frozen=True)
 class Critical:
     """``found``: the critical factor is between ``good`` (seems feasible) and ``bad`` (seems not); ``always``,
-    ``never`` feasible; or ``unknown``."""
+    ``never`` feasible; or ``unknown``. ``cuts``: the constraints that mattered, in the user's units."""
 
     status: Literal["found", "always", "never", "unknown"]
     good: float = np.nan
     bad: float = np.nan
     message: str = ""
+    cuts: Sequence[Cut] = ()
 
 
 def critical_factor(
@@ -86,9 +88,14 @@ def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools,
         return Critical("always", good=scaling.highest)
     if scaling.sense == "smallest" and good <= width:
         return Critical("always", good=0.0)
-    return Critical(
-        "found", good, max(good, bad) if scaling.sense == "largest" else min(good, max(result.lower_bound, 0.0))
-    )
+    bad = max(good, bad) if scaling.sense == "largest" else min(good, max(result.lower_bound, 0.0))
+    return Critical("found", good, bad, cuts=_in_users_units(programs.program(1.0), result.indices))
+
+
+def _in_users_units(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> list[Cut]:
+    """The ``cuts`` of a program in its own units in those of the user."""
+    units = {one.name: 1.0 if one.index_units is None else one.index_units for one in program.families}
+    return [replace(cut, index=cut.index * units[cut.family]) for cut in cuts]
 
 
 def _by_slack(

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, TypeAlias, final
 
 import numpy as np
 
 from sparserob_core.brief import brief
+from sparserob_core.control.loop.resolving import shifted
 from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.critical import Critical, critical_factor
 from sparserob_core.experiment.margin.points import Point, Points
 from sparserob_core.experiment.margin.scaling import Scaling, Sense
+from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.own_units import solve_in_own_units
+from sparserob_core.sip.methods.own_units import answered_in_own_units
+from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import Result, Status
+from sparserob_core.sip.working.ledger import prover_of
 
 Answer: TypeAlias = Literal["certified", "unbounded", "infeasible", "undecided"]
 FEASIBLE: tuple[Status, ...] = ("certified", "verified")
@@ -32,6 +38,9 @@ STEPS = (
     16.0,
     64.0,
 )
+# The same where only what the constraints that matter exclude is run: ends that are small beside what moves the state
+# are told apart no more closely.
+FARTHER = (*STEPS, 256.0, 1024.0, 4096.0)
 
 
 Sides: TypeAlias = tuple[Answer, str, Point | None, Point | None]
@@ -89,7 +98,8 @@ class Margin:
 @dataclass(eq=False)
 class MarginSearch:
     """One search. ``programs``: those of ordinary runs, by their factor; ``joined``: the same in units that do not
-    depend on it, where the factor enters linearly. ``width``: how close the two sides are to be, relative to the factor
+    depend on it, where the factor enters linearly. ``cuts``: the constraints that matter at the critical factor, in the
+    user's units. ``width``: how close the two sides are to be, relative to the factor
     if that is above 1. ``beyond``: what tells, of the ``results`` by their factor, above
     which factor nothing exists that answers the disturbance in whatever way, and why no smaller one was sought."""
 
@@ -104,6 +114,7 @@ class MarginSearch:
     points: list[Point] = field(default_factory=list)
     seen: dict[float, str] = field(default_factory=dict)
     results: dict[float, Result] = field(default_factory=dict)
+    cuts: Sequence[Cut] = ()
     beyond: Callable[[dict[float, Result]], tuple[float, Ended | None]] | None = None
 
     def margin(self, count: int) -> Margin:
@@ -112,7 +123,9 @@ class MarginSearch:
         sides: Sides | None = None
         try:
             self.told.say(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
-            sides = self._sides(self._found())
+            found = self._found()
+            self.cuts = found.cuts
+            sides = self._sides(found)
             feasible = sides[2]
             curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
         except KeyboardInterrupt as pressed:
@@ -214,21 +227,42 @@ class MarginSearch:
     def _proven(self, factor: float, outward: float, wanted: tuple[Status, ...]) -> Point | None:
         """The nearest run beside the critical factor that proves what is wanted of that side."""
         width = self.width * (max(1.0, abs(factor)) if self.scaling.affine else 1.0)
-        for step in STEPS:
-            beside = float(np.clip(factor + outward * step * width, 0.0, self.scaling.highest))
-            point = self.run(beside)
+        tried = [float(np.clip(factor + outward * step * width, 0.0, self.scaling.highest)) for step in FARTHER]
+        first = None
+        if "infeasible" in wanted:  # a run where nothing says so yet looks long for what it cannot find
+            first = next((i for i, beside in enumerate(tried) if self._excludes(beside)), None)
+        begun = () if first is None else self.cuts
+        for beside in tried[: len(STEPS)] if first is None else tried[first:]:
+            point = self.run(beside, begun)
             if point.status in wanted:
                 return point
         return None
 
-    def run(self, factor: float) -> Point:
-        """An ordinary run at a factor, made once; a factor at which the problem is not defined fails."""
+    def _excludes(self, factor: float) -> bool:
+        """Whether the constraints that matter at the critical factor alone leave nothing at another one."""
+        if not self.cuts:
+            return False
+        program = self.programs.program(factor)
+        program = program if program.own_units is None else program.own_units.program
+        rows = Rows.none(program.n)
+        for index, row, family in shifted(self.cuts, 0.0, program):
+            rows = rows.joined(rows_at(program, family, index, row))
+        relaxed = RelaxedProgram(program, self.tools.solver, deadline=self.tools.deadline)
+        return relaxed.solve(rows, 0.0).status == "infeasible"
+
+    def _close(self, begun: Sequence[Cut], program: SemiInfiniteProgram, tools: Tools) -> Result:
+        """The run of a program in its own units that has ``begun`` with these constraints."""
+        return self.method.close(program, tools, prover_of(program, tools), shifted(begun, 0.0, program))
+
+    def run(self, factor: float, begun: Sequence[Cut] = ()) -> Point:
+        """An ordinary run at a factor, made once, that has ``begun`` with these constraints; a factor at which the
+        problem is not defined fails."""
         for point in self.points:
             if point.factor == factor:
                 return point
         amount, tools = self.scaling.amount(factor), replace(self.tools, notify=self.told.begin(factor))
         try:
-            result = solve_in_own_units(self.method, self.programs.program(factor), tools)
+            result = answered_in_own_units(partial(self._close, begun), self.programs.program(factor), tools)
         except InputError as error:
             point = Point(factor, amount, "failed", str(error), -np.inf, np.inf)
             self.told.end(point)

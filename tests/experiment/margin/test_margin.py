@@ -90,6 +90,22 @@ def test_the_largest_initial_state_is_what_the_control_can_bring_back():
     assert_encloses(sr.margin(config(terminal=[{"box": [0.5, None]}]), of="initial_state"), 2.5)
 
 
+@pytest.mark.parametrize("far", [1e3, 3e4])
+def test_where_double_precision_does_not_tell_two_ends_apart_no_run_is_made_between_them(far: float) -> None:
+    """Beside a way of 1e3 or 3e4 a set of 0.1 is small: the box of 0.05 + 10 * 0.005 fills it at the factor 1."""
+    stated = config(
+        horizon=10.0,
+        initial_state={"centre": [-far, 0.0], "box": [0.05, 0.005]},
+        control={"box": far / 10},
+        terminal=[{"box": [0.1, 1.0]}],
+    )
+    stated["dictionaries"]["control"]["pieces"] = 10
+    points: list[str] = []
+    found = sr.margin(stated, of="initial_state", notify=lambda event: points.append(getattr(event, "text", "")))
+    assert found.status == "certified" and found.lower <= 1.0 <= found.upper <= 1.0 + 4e-8 * far + 1e-4
+    assert not [text for text in points if "refuted" in text]
+
+
 def test_a_path_set_must_hold_the_initial_state():
     assert_encloses(sr.margin(config(path=[{"box": [4.0, None]}]), of="path.0"), 0.25)
 
