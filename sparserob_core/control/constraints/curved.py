@@ -25,7 +25,7 @@ from sparserob_core.control.enclosures.combination import Combination, combinati
 from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.response.functional import Leg, WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.reference import Moving, Reference
+from sparserob_core.control.response.reference import STILL, Moving, Reference
 from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -56,7 +56,7 @@ class CurvedConstraint(StateConstraint):
     stop: float
     parameters: ParameterIndex
     unit: float = 1.0
-    reference: Reference | None = None
+    reference: Reference = STILL
     shared: CurvedConstraint | None = field(default=None, repr=False)
 
     @property
@@ -82,9 +82,7 @@ class CurvedConstraint(StateConstraint):
     ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         nu = self.parameters.count
         directions = unit(self.set, indices[:, 1 + nu :]) / self.unit
-        rhs = self.set.support(directions)
-        if self.reference is not None:
-            rhs = rhs + (directions * self.reference.at(indices[:, 0])).sum(axis=1)
+        rhs = self.set.support(directions) + (directions * self.reference.at(indices[:, 0])).sum(axis=1)
         return indices[:, 0], directions, self.parameters.clamp(indices[:, 1 : 1 + nu]), rhs
 
     @shaped
@@ -144,7 +142,7 @@ class CurvedConstraint(StateConstraint):
         indices, first = self._inside(indices), 1 + self.parameters.count
         times = indices[:, 0]
         along = self.functionals.turning(x, times, self.parameters.clamp(indices[:, 1:first]))
-        moves = np.zeros((times.size, self.set.dimension)) if self.reference is None else self.reference.at(times)
+        moves = self.reference.at(times)
 
         def height(z: Array, which: np.ndarray) -> Array:
             c = unit(self.set, z) / self.unit
@@ -244,8 +242,7 @@ class CurvedConstraint(StateConstraint):
 
     @shaped
     def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k d"]:
-        still = np.zeros((times.size, self.set.dimension))
-        return still if self.reference is None else -self.reference.at(times)
+        return np.zeros(self.set.dimension) - self.reference.at(times)
 
     @shaped
     def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " d"] | None = None) -> Float[Array, " n"]:
@@ -268,7 +265,7 @@ class CurvedConstraint(StateConstraint):
             lengthening = np.concatenate([np.zeros(nu), self._lengthening(H, shortest / self.unit)])
             control = self.functionals.dictionary.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
-            moving = None if self.reference is None else Moving(self.reference, H)
+            moving = Moving(self.reference, H) if self.reference.moves else None
 
             def cell(leg: Leg) -> CellEnclosure:
                 sigma = self.functionals.support_over(leg, H, joined)

@@ -172,8 +172,7 @@ class FeedbackConstraint(Source):
         found = np.concatenate(
             [flat.H[rows] @ self.loop.states(x, times, pieces) for rows, pieces in self._halves(times)], axis=1
         )
-        if flat.reference is not None:
-            found[:, :, 0] += flat.moved(times)
+        found[:, :, 0] += flat.moved(times)
         if flat.gains is not None:
             found += np.einsum("rm,krmq->krq", flat.gains, self.loop.controls(x)[flat.commanded(times)])
         return np.asarray(found)

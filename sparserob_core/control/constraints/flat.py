@@ -27,7 +27,7 @@ from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, en
 from sparserob_core.control.response.functional import LEGS_KEPT, Leg, WorstCase
 from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.reference import Direct, Moving, Reference
+from sparserob_core.control.response.reference import STILL, Direct, Moving, Reference
 from sparserob_core.control.response.response import LONG, Outputs, Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
@@ -58,7 +58,7 @@ class Samples:
     h: Array
     window: tuple[float, float]
     parameters: ParameterIndex
-    reference: Reference | None = None
+    reference: Reference = STILL
     gains: Array | None = None
     undivided: tuple[Samples, Array] | None = None
     """Those of which they are, and what their rows are divided by, ``(r,)``."""
@@ -92,8 +92,7 @@ class Samples:
         where the commanded control of a mixed constraint changes, and where a system that changes with time is another
         polynomial of it."""
         start, stop = self.window
-        found = [self._response.propagator.marks]
-        found += [] if self.reference is None else [self.reference.times]
+        found = [self._response.propagator.marks, self.reference.times]
         found += [] if self.gains is None else [self.functionals.dictionary.breakpoints]
         every = np.concatenate(found)
         return np.unique(every[(every > start) & (every < stop)])
@@ -192,7 +191,7 @@ class FlatConstraint(StateConstraint):
     stop: float
     parameters: ParameterIndex
     shared: Samples | None = field(default=None, repr=False)
-    reference: Reference | None = None
+    reference: Reference = STILL
     gains: Array | None = None
 
     @staticmethod
@@ -202,7 +201,7 @@ class FlatConstraint(StateConstraint):
         rows: Flat,
         window: tuple[float, float],
         parameters: ParameterIndex,
-        reference: Reference | None = None,
+        reference: Reference = STILL,
     ) -> FlatConstraint:
         """The rows of a constraint; those of a mixed one for the control before and after a jump."""
         H, G, h = rows
@@ -256,7 +255,7 @@ class FlatConstraint(StateConstraint):
     ) -> Float[Array, " k"]:
         parameters = self.parameters.clamp(indices[:, 1:])
         answer: Array = self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
-        if self.reference is None and self.gains is None:
+        if not self.reference.moves and self.gains is None:
             return answer
         answer += self.beside(x, indices[:, 0])[np.arange(rows.size), rows]
         return answer
@@ -280,8 +279,6 @@ class FlatConstraint(StateConstraint):
     @shaped
     def moved(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
         """``-H r(t)``."""
-        if self.reference is None:
-            return np.zeros((times.size, self.h.size))
         return Moving(self.reference, self.H).at(times)
 
     @shaped
@@ -397,7 +394,7 @@ class FlatConstraint(StateConstraint):
             rows = self.samples.proven
             rhs, H = np.zeros((rows, legs[0].space.size)), self.H[:rows]
             rhs[:, 0] = self.h[:rows]
-            moving = None if self.reference is None else Moving(self.reference, H)
+            moving = Moving(self.reference, H) if self.reference.moves else None
             direct = None if self.gains is None else Direct(self.gains[:rows], self.functionals.dictionary, control)
             known = self.samples.support_over(legs, low, high)
             if self.functionals.execution is not None:  # of a known system, which has one leg
@@ -444,7 +441,7 @@ class FlatConstraint(StateConstraint):
         answer: Array = along - self.samples.margins
         if self.functionals.execution is not None:
             answer = answer + self._executed(self.functionals.execution, x)
-        beside = self.reference is not None or self.gains is not None
+        beside = self.reference.moves or self.gains is not None
         return answer + self.beside(x, self.times).T if beside else answer
 
     def _executed(self, execution: Execution, x: Array) -> Array:

@@ -158,7 +158,7 @@ class Sensitivity:
             control = self.constraint.functionals.control(x)
             in_time = in_time + execution.slope(control, times[:, 0], at.direction)[:, None]
         reference = self.constraint.reference
-        if reference is not None:
+        if reference.moves:
             in_time = (
                 in_time - (at.direction * reference.slope(times[:, 0], self.constraint.start)).sum(axis=1)[:, None]
             )

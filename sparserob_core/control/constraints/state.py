@@ -11,7 +11,7 @@ from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.reference import Reference
+from sparserob_core.control.response.reference import STILL, Reference
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Separation
@@ -31,7 +31,7 @@ class StateConstraint(Source):
     start: float
     stop: float
     parameters: ParameterIndex
-    reference: Reference | None = None
+    reference: Reference = STILL
     gains: Array | None = None
     """``G (r, m)`` of a mixed constraint."""
 

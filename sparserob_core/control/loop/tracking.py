@@ -67,7 +67,7 @@ def trackable(own: Transcription) -> bool:
         pieces = pieces and model.kind == "piecewise_constant" and model.starts is not None and model.starts.size == K
     if not (plain and linear and pieces) or K * K * problem.system.states * problem.system.controls > NUMBERS:
         return False
-    flat = all(isinstance(one, FlatConstraint) and one.gains is None and one.reference is None
+    flat = all(isinstance(one, FlatConstraint) and one.gains is None and not one.reference.moves
                for one in own.constraints)  # fmt: skip
     box, ends = problem.control.bounding_box(), [t for one in own.constraints for t in (one.start, one.stop)]
     places = np.array(ends) * K / problem.horizon

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
@@ -15,21 +15,34 @@ from sparserob_core.sip.convex_set import Array
 @final
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """``r(t)``, linear between ``points (q, d)`` at increasing ``times (q,)``; constant beyond them."""
+    """``r(t)``, linear between ``points (q, d)`` at increasing ``times (q,)``; constant beyond them, and 0 all the time
+    where there are none: ``d`` is 1 then, for every state."""
 
-    times: Array
-    points: Array
+    times: Array = field(default_factory=lambda: np.zeros(0))
+    points: Array = field(default_factory=lambda: np.zeros((0, 1)))
 
     @staticmethod
-    def of(rows: object) -> Reference | None:
-        """That of rows of a time and a point, ``(q, 1 + d)``; ``None`` for none."""
+    def of(rows: object) -> Reference:
+        """That of rows of a time and a point, ``(q, 1 + d)``; `STILL` for none."""
         table = None if rows is None else np.asarray(rows, dtype=float)
-        return None if table is None else Reference(table[:, 0], table[:, 1:])
+        return STILL if table is None else Reference(table[:, 0], table[:, 1:])
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is any point."""
+        return self.times.size > 0
 
     @shaped
     def at(self, times: Float[Array, " k"]) -> Float[Array, "k d"]:
         """``r (k, d)``."""
+        if not self.moves:
+            return np.zeros((times.size, 1))
         return np.stack([np.interp(times, self.times, column) for column in self.points.T], axis=1)
+
+    @shaped
+    def along(self, times: Float[Array, " k"], H: Float[Array, "r d"]) -> Float[Array, "k r"]:
+        """``H r(t)``, ``(k, r)``."""
+        return self.at(times) @ H.T if self.moves else np.zeros((times.size, len(H)))
 
     @shaped
     def slope(self, times: Float[Array, " k"], start: float) -> Float[Array, "k d"]:
@@ -49,7 +62,14 @@ class Reference:
     @property
     def size(self) -> Array:
         """The largest ``|r_i|``, ``(d,)``."""
-        return np.asarray(np.abs(self.points).max(axis=0))
+        return np.asarray(np.abs(self.points).max(axis=0, initial=0.0))
+
+    def reach(self, H: Array) -> Array:
+        """The largest sum of absolute numbers in ``H r(t)``, ``(r,)``."""
+        return np.asarray(np.abs(H) @ self.size if self.moves else np.zeros(H.shape[:-1]))
+
+
+STILL = Reference()  # of a set that stays where it is
 
 
 @final
@@ -62,12 +82,12 @@ class Moving:
 
     def at(self, times: Array) -> Array:
         """``-H r(t)``, ``(k, r)``."""
-        return -(self.reference.at(times) @ self.H.T)
+        return 0.0 - self.reference.along(times, self.H)  # no negative zeros
 
     @property
     def size(self) -> Array:
         """The largest sum of absolute numbers in that, ``(r,)``."""
-        return np.abs(self.H) @ self.reference.size
+        return self.reference.reach(self.H)
 
 
 @final

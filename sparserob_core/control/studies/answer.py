@@ -175,7 +175,7 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
         now = times[part].size
         at = np.tile(times[part], count), np.repeat(along, now, axis=0), np.repeat(p, now, axis=0)
         values = model.functionals.values(theta, *at).reshape(len(every), len(lattice), now).max(axis=1)
-        np.maximum.at(found, (rows, part), values)
+        np.maximum.at(found[:, part], rows, values)
     return found
 
 

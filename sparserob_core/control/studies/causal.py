@@ -135,7 +135,8 @@ class CausalSearch:
     ) -> None:
         self.model, self.loop, self.decision = model, model.answering.loop, decision
         flat = [one for one in model.constraints if isinstance(one, FlatConstraint)]
-        self.constraints = [one for one in flat if one.gains is None and one.reference is None]  # fewer: a bound still
+        # a bound of fewer constraints is one still
+        self.constraints = [one for one in flat if one.gains is None and not one.reference.moves]
         grid, disturbance = model.response.grid, model.functionals.disturbance
         places = np.zeros(0, dtype=int) if disturbance is None or disturbance.starts is None else disturbance.starts
         self.starts = grid.breakpoints[places]

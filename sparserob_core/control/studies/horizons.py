@@ -25,7 +25,7 @@ from sparserob_core.control.response.disturbance import DisturbanceModel, distur
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport, summed
 from sparserob_core.control.response.initial_support import InitialSupport
 from sparserob_core.control.response.lifted import LiftedSystem, lift
-from sparserob_core.control.response.reference import Reference
+from sparserob_core.control.response.reference import STILL, Reference
 from sparserob_core.control.response.response import TimeGrid, merge_grids
 from sparserob_core.control.transcription.own_units import extent, rough_units
 from sparserob_core.errors import InputError, NotEnclosable
@@ -50,7 +50,7 @@ class Multiplier:
     limit: float
     earliest: float = 0.0
     uncertain: bool = True
-    reference: Reference | None = None
+    reference: Reference = STILL
     gain: Array | None = None
     piece: tuple[float, float] = (0.0, 1.0)
 
@@ -68,11 +68,9 @@ class Multiplier:
 
     def highest(self, share: float, low: float, high: float) -> float:
         """The largest limit at that share of the horizons in ``[low, high]``."""
-        if self.reference is None:
-            return self.limit
         times = np.array([share * low, share * high])
         times = np.concatenate([times, self.reference.kinks(*times)])
-        return self.limit + float((self.reference.at(times) @ self.direction).max())
+        return self.limit + float(self.reference.along(times, self.direction[None]).max())
 
 
 def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControlProblem:

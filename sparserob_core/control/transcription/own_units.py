@@ -11,6 +11,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.reference import Moving
 from sparserob_core.control.sets.directions import sampled
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -97,7 +98,7 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     times = window_times(functionals, constraint.start, constraint.stop)
     moved = constraint.reference
     if sides is not None:
-        beside = None if moved is None else -(moved.at(times) @ sides[0].T)
+        beside = Moving(moved, sides[0]).at(times) if moved.moves else None
         found = reaches(functionals, constraint.parameters, control, sides[0], times, beside, constraint.gains)
         return units_of_sides(*constraint_sides(constraint), *found)
     box = constraint.index_set
@@ -105,11 +106,11 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     indices = np.hstack([np.tile(box.lower[: box.dimension - z.shape[1]], (z.shape[0], 1)), z])
     directions = constraint.functionals_at(indices)[1]
     _, added = reaches(functionals, constraint.parameters, control, np.eye(directions.shape[1]), times)
-    added = added if moved is None else added + moved.size
+    added = added + moved.size
     if (np.abs(directions) @ added).max() <= 1.0 / RESOLVED:  # a sum along c is at most |c| times those along the axes
         return np.ones(1)
     _, added = reaches(functionals, constraint.parameters, control, directions, times)
-    added = added if moved is None else added + np.abs(directions) @ moved.size
+    added = added + moved.reach(directions)
     return np.maximum(1.0, power_of_two(np.array([RESOLVED * added.max()])))
 
 

@@ -55,8 +55,7 @@ def _added(model: Transcription, result: Result) -> float:
             rows.append((cut.multiplier, said.time, said.direction, said.parameter if known else middle))
             if said.gain is not None:
                 besides += cut.multiplier * float(np.abs(said.gain) @ _far(model.problem.control))
-            if constraint.reference is not None:
-                besides += cut.multiplier * float(np.abs(said.direction) @ constraint.reference.size)
+            besides += cut.multiplier * float(constraint.reference.reach(said.direction))
     for axis, price in zip(fixed(model.problem)[0], result.dual.mu, strict=False):
         rows.append((abs(float(price)), model.problem.horizon, axis, middle))
     if not rows:

@@ -259,9 +259,8 @@ def _limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array
             continue
         normals, bounds = _lines(entry.set, pair, around)
         stop, moved = end if entry.stop is None else float(entry.stop), Reference.of(entry.relative_to)
-        kinks = np.empty(0) if moved is None else moved.kinks(entry.start, stop)
-        times = np.unique(np.concatenate([np.linspace(entry.start, stop, STEPS), kinks]))
-        off = np.zeros((times.size, 2)) if moved is None else moved.at(times)[:, pair]
+        times = np.unique(np.concatenate([np.linspace(entry.start, stop, STEPS), moved.kinks(entry.start, stop)]))
+        off = moved.along(times, np.eye(entry.set.dimension)[list(pair)])
         limit = Limit(name=printable(name), normals=normals, times=times, bounds=bounds + off @ normals.T)
         if len(normals):
             yield replace(limit, is_wall=not limit.moves and entry.start <= 0.0 and stop >= end)
@@ -290,7 +289,7 @@ def _walls(model: Transcription) -> Iterator[Wall]:
     for entry in [*problem.of_states, *(one for one in model.problem.of_states if isinstance(one, Accumulated))]:
         stop = end if entry.stop is None else entry.stop
         moved = Reference.of(entry.relative_to)
-        if moved is None:
+        if not moved.moves:
             yield from (replace(wall, final=stop >= end) for wall in _sides(entry.set, entry.start, stop))
             continue
         times = np.concatenate([[entry.start], moved.kinks(entry.start, stop), [stop]])

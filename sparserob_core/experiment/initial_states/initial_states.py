@@ -182,8 +182,7 @@ def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, 
     held = [entry for entry in problem.of_states if entry.start == 0.0]
     view, states, polygons = 10.0 * float(np.abs(found.outer - middle).max()), list(found.states), []
     for entry in held:
-        moved = Reference.of(entry.relative_to)
-        off = np.zeros(found.origin.size) if moved is None else moved.at(np.zeros(1))[0]
+        off = Reference.of(entry.relative_to).along(np.zeros(1), np.eye(found.origin.size))[0]
         polygon = section(entry.set, found.origin - off, found.states, middle - off[states], view)
         polygons.append(polygon + off[states])
     return tuple(polygons)

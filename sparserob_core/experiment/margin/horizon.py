@@ -253,9 +253,7 @@ def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
         if said is not None and cut.multiplier > 0.0:
             known = said.parameter is not None and said.parameter.size > 0
             parameter = said.parameter if known and said.parameter is not None else middle
-            moved = 0.0
-            if constraint.reference is not None:
-                moved = float(constraint.reference.at(np.array([said.time]))[0] @ said.direction)
+            moved = float(constraint.reference.along(np.array([said.time]), said.direction[None])[0, 0])
             within = (0.0, 1.0) if said.piece is None else (float(shares[said.piece]), float(shares[said.piece + 1]))
             found.append(
                 Multiplier(

@@ -196,8 +196,8 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
 
 def _of_largest(problem: OptimalControlProblem, sizes: Array) -> str:
     """The unit of the states with the largest of the ``sizes (d,)``, where these share one."""
-    names = problem.names
-    units = {names.state_units[one] for one in np.flatnonzero(sizes == sizes.max())} if names.state_units else set()
+    known, largest = problem.names.state_units, np.flatnonzero(sizes == sizes.max()).tolist()
+    units = {known[one] for one in largest if known}
     return units.pop() if len(units) == 1 else ""
 
 

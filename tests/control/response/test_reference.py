@@ -13,7 +13,7 @@ ROWS = [[0.5, 0.0, 1.0], [1.0, 2.0, 1.0], [2.0, 0.0, -3.0]]
 
 def test_a_reference_is_linear_between_its_points_and_stands_still_beyond() -> None:
     made = Reference.of(ROWS)
-    assert made is not None and Reference.of(None) is None
+    assert made.moves and not Reference.of(None).moves
     times = np.array([0.0, 0.5, 0.75, 1.0, 1.25, 2.0, 3.0])
     assert made.at(times) == pytest.approx(np.array([[0, 1], [0, 1], [1, 1], [2, 1], [1.5, 0], [0, -3], [0, -3]]))
     # from the left at a kink, from the right at the start of a window

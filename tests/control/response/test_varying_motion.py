@@ -19,7 +19,7 @@ from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.disturbance import disturbance_model
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.reference import Reference
+from sparserob_core.control.response.reference import STILL, Reference
 from sparserob_core.control.response.response import Response, merge_grids
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.control.sets.sets import Ellipsoid
@@ -72,7 +72,7 @@ def test_no_violation_in_a_cell_is_above_its_bound(seed, plant, bound, begun, gr
     bound = "box" if noise == "walsh" and bound == "ellipsoid" else bound
     rng = np.random.default_rng(seed)
     worst = functionals(plant, GRIDS[grid], NOISES[noise], bound, begun)
-    moved = Reference(np.array([0.0, 1.1, HORIZON]), rng.normal(size=(3, 2))) if seed % 2 else None
+    moved = Reference(np.array([0.0, 1.1, HORIZON]), rng.normal(size=(3, 2))) if seed % 2 else STILL
     sides = rng.normal(size=(3, 2)), rng.normal(size=3)
     constraint = FlatConstraint("path", worst, *sides, 0.2, HORIZON, ParameterIndex(None), reference=moved)
     x = rng.normal(size=worst.variables)
