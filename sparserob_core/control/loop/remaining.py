@@ -17,17 +17,12 @@ from sparserob_core.sip.convex_set import Array
 
 def refuse_remaining(model: Transcription) -> None:
     """Raise `InputError` for a problem whose remaining horizon is no problem of the same kind, in one sentence."""
-    problem = model.problem
-    disturbed = problem.disturbance is not None
+    problem, classes = model.problem, model.problem.classes
     reasons = {
         "a control in indicators of its pieces (piecewise_constant)": not model.control.is_indicators,
         "a disturbance that takes any value on each of its pieces, since what is left of another depends on what has"
-        " been": disturbed
-        and (
-            problem.disturbance_class == "l1_ball"
-            or (problem.disturbance_class == "piecewise_constant" and not model.disturbance.is_complete)
-        ),
-        "disturbances of one class": disturbed and not isinstance(problem.disturbance_class, str),
+        " been": "l1_ball" in classes or (classes == {"piecewise_constant"} and not model.disturbance.is_complete),
+        "disturbances of one class": len(classes) > 1,
         "disturbances on the pieces of one dictionary": problem.disturbance_breakpoints is not None,
         "integrals of controls alone, and none beside feedback: what states add up to between measurements is not"
         " known": any(model.feedback is not None or np.any(entry.H) for entry in in_rows(model.stated).integral),

@@ -61,7 +61,7 @@ class Plan:
             return None
         if problem.names.corners is not None:  # parameters beside the time are states by now, that nobody measures
             return None
-        if problem.disturbance is not None and problem.disturbance_class != "piecewise_constant":
+        if problem.classes - {"piecewise_constant"}:
             return None
         steps, grid = response.steps(KNOWN), response.grid
         acting, pushes, middle = np.append(control, np.ones(grid.constants)), list[Array](), state

@@ -187,6 +187,14 @@ class OptimalControlProblem(Term):
         sealed(self)
 
     @property
+    def classes(self) -> frozenset[DisturbanceClass]:
+        """Of which classes the disturbances are; none where there are none."""
+        if self.disturbance is None:
+            return frozenset()
+        kinds = self.disturbance_class
+        return frozenset({kinds} if isinstance(kinds, str) else kinds)
+
+    @property
     def measurable(self) -> ConvexSet | None:
         """The set of the measurable disturbances, 0 along the columns of others; ``None`` where there are none."""
         return apart(self.disturbance, self.disturbance_class, "measurable")

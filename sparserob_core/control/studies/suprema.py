@@ -182,19 +182,18 @@ def followed(
     disturbances are of a kind that adds up otherwise, or there are errors of execution."""
     control, disturbance = dictionaries
     system, d = problem.system, problem.system.states
-    alike = isinstance(problem.disturbance_class, str) and problem.disturbance_breakpoints is None
+    classes = problem.classes
+    alike = len(classes) <= 1 and problem.disturbance_breakpoints is None
     erring = problem.execution is not None and theta.any()  # what stands still is delivered as it is commanded
     if not isinstance(system, LinearSystem) or system.parameter_count or not alike or erring:
         return None
     changes: Array | None = None
-    if problem.disturbance is not None and problem.disturbance_class == "piecewise_constant":
+    if classes == {"piecewise_constant"}:
         jumps = np.flatnonzero(disturbance.changes) + 1
         if disturbance.functions != jumps.size + 1:
             return None
         changes = disturbance.breakpoints[[0, *jumps, -1]]
-    elif problem.disturbance is not None and (
-        problem.disturbance_class != "measurable" or problem.disturbance.halfspaces() is None
-    ):
+    elif problem.disturbance is not None and (classes != {"measurable"} or problem.disturbance.halfspaces() is None):
         return None
     forced = system.forced
     A, B, E = (part[0] for part in forced.matrices(np.zeros((1, 0))))

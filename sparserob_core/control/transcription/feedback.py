@@ -232,22 +232,20 @@ def refuse(
 ) -> None:
     """Raise `InputError` for what a policy is not built for, in one sentence; ``uncertain``: the system has parameters,
     which may be states by now."""
-    disturbed = problem.disturbance is not None
-    paths = problem.windows
+    paths, classes = problem.windows, problem.classes
     sets = [entry.set for entry in paths] + problem.terminal_sets
     steps = [] if problem.control_step is None else [problem.control_step]
     curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
-    kind, bound = problem.disturbance_class, problem.disturbance
-    measurable = bound is not None and kind == "measurable"
+    bound, measurable = problem.disturbance, classes == {"measurable"}
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
         ),
         "system without uncertain parameters: else what is measured is not the disturbance alone": uncertain,
-        "disturbance of one class, piecewise_constant or measurable, not "
-        f"{kind if isinstance(kind, str) else ' and '.join(sorted(set(kind)))}": disturbed
-        and kind not in ("piecewise_constant", "measurable"),
+        f"disturbance of one class, piecewise_constant or measurable, not {' and '.join(sorted(classes))}": len(classes)
+        > 1
+        or "l1_ball" in classes,
         "disturbance on the pieces of one dictionary, not on some of its own": problem.disturbance_breakpoints
         is not None,
         f"measurable disturbance in a set with known corners, which the {bound.kind if bound else ''} has not": bool(
@@ -256,7 +254,7 @@ def refuse(
         f"set with flat sides for states and controls under measurable disturbances, which the "
         f"{' and the '.join(curved)} has not": measurable and bool(curved),
         "cost other than worst under measurable disturbances": measurable and cost == "worst",
-        "disturbance that takes any value on each of its pieces": disturbed
+        "disturbance that takes any value on each of its pieces": bool(classes)
         and not measurable
         and not disturbance.is_complete,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
