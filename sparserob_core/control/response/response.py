@@ -19,7 +19,6 @@ import numpy as np
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.flows import Leaps
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, Transitions, exponential, transitions
-from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.shapes import Float, Int, shaped
@@ -198,21 +197,6 @@ def merge_grids(
     acting, pushing = np.searchsorted(begin, middles) - 1, np.searchsorted(disturbance, middles) - 1
     mode = np.searchsorted(switches, middles) if switches else np.arange(middles.size) if varying else None
     return TimeGrid(points, acting, pushing, before if delay > 0.0 else None, constants, mode, varying=varying)
-
-
-def grid_of(problem: OptimalControlProblem, control: Array, disturbance: Array) -> TimeGrid:
-    """The merged grid of a problem whose control and whose disturbance change at ``control (K + 1,)`` and at
-    ``disturbance (M + 1,)``; where nobody says what the control was before time 0, it was 0."""
-    system, before = problem.system, problem.initial_control
-    return merge_grids(
-        control,
-        disturbance,
-        system.delay,
-        np.zeros(system.controls) if before is None else np.asarray(before, dtype=float),
-        system.forced.controls - system.controls,
-        system.switches,
-        system.varies,
-    )
 
 
 def _joined(points: Array, others: Array) -> Array:

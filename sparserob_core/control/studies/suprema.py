@@ -17,10 +17,10 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.response import grid_of
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal
+from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.control.transcription.transcribe import prepare, windows_of
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import sealed

@@ -17,7 +17,8 @@ import numpy as np
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.response.response import Propagator, TimeGrid, grid_of
+from sparserob_core.control.response.response import Propagator, TimeGrid
+from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
