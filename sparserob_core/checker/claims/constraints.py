@@ -116,12 +116,18 @@ def _along_rows(case: Case, window: Window) -> Proven:
     return Proven(bound, share, count, 1)
 
 
-def followed(case: Case, c: Array) -> Worst:
-    """The worst of the row ``c (d,)`` of a known system, by its adjoint; one adjoint serves a row and its opposite."""
+def followed(case: Case, c: Array, driven: bool = True) -> Worst:
+    """The worst of the row ``c (d,)`` of a known system, by its adjoint; one adjoint serves a row and its opposite. Not
+    ``driven``: without the control that the certificate decides on, of which there is none where nothing is
+    feasible."""
     problem, made = case.problem, case.adjoints
     c = c + 0.0  # no -0, of which the bytes of an opposite row would be others
     opposite = (0.0 - c).tobytes()
-    table = Enclosed.of(stacked([list(row) for row in zip(*(u.entries() for u in case.scene.control), strict=True)]))
+    if driven:
+        table = Enclosed.of(stacked([list(row) for row in zip(*(u.entries() for u in case.scene.control), strict=True)]))
+    else:
+        inputs = problem.system.controls + (problem.system.c is not None)
+        table = Enclosed(*np.zeros((2, inputs, len(case.grid) - 1)))
     jumps = None if case.measurable else case.changes
     if c.tobytes() not in made:
         made[c.tobytes()] = made[opposite].reversed() if opposite in made else Adjoint.of(case.motion, c)

@@ -172,7 +172,7 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
     made for a duration, which of hundreds of states takes a minute each."""
     from flint import arb
 
-    worst, problem, delay = followed(case, c), case.problem, case.problem.system.delay
+    worst, problem, delay = followed(case, c, driven=False), case.problem, case.problem.system.delay
     m, begins = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
     state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
     begun = balls(np.asarray(problem.initial_state, dtype=float))

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from sparserob_core.control.enclosures.decoupling import pace
+from sparserob_core.control.enclosures.matrix_exponential import EPSILON
 from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription
@@ -26,13 +28,12 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
     A row ``c'x(t) <= b`` is a sum of what the initial state, every piece of the control and every piece of the
     disturbance bring to ``c'x(t)``. The absolute values of these, at their largest, times the multipliers of the rows
     and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). What a multiplier
-    of the wrong sign may be off by is subtracted too (`_neglected`). Transitions of a system that changes with time are
-    off by the share that their expansion leaves out, too.
+    of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their own
+    (`_moving`).
     """
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
-    expansion = model.response.propagator.expansion
-    share = SHARE if expansion is None else SHARE + expansion.slack
+    share = SHARE + _moving(model)
     lost = share * (_added(model, result) + _quadratic(model, result) + result.lower_bound)
     lost += _neglected(model, result)
     lowered = max(0.0, result.lower_bound - lost)
@@ -42,6 +43,18 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
         return answer
     message = f"the constraints are proven for the whole continuum; rounding leaves a gap of {answer.gap:.1e}"
     return replace(answer, status="verified", message=message)
+
+
+def _moving(model: Transcription) -> float:
+    """The share that transitions may be off by: of a system that changes with time, what their expansion leaves out;
+    else a rounding for every time in which the system moves by its size, since those over a long time are squares of
+    those over a short one (Moler and Van Loan 2003, method 3)."""
+    expansion = model.response.propagator.expansion
+    if expansion is not None:
+        return expansion.slack
+    middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
+    fastest = max(pace(mode.matrices(middle[None])[0][0]) for mode in model.response.system.modes)
+    return EPSILON * fastest * model.problem.horizon
 
 
 def _added(model: Transcription, result: Result) -> float:

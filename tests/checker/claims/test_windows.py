@@ -418,12 +418,16 @@ def test_a_status_follows_from_the_claims_under_it():
     assert claims.relative_gap(case_of(certificate={"cost": -1.0}), -1.0, -4.0) == 0.75
 
 
-def test_infeasibility_needs_a_sum_that_is_positive():
-    """``x(2) <= -1.1`` and ``|u| <= 1``: at best -1 + 0.5."""
+@pytest.mark.parametrize("followed", [1, constraints.FOLLOWED])
+def test_infeasibility_needs_a_sum_that_is_positive(followed, monkeypatch):
+    """``x(2) <= -1.1`` and ``|u| <= 1``: at best -1 + 0.5. No decision is written then, also where rows are
+    followed."""
+    monkeypatch.setattr(constraints, "FOLLOWED", followed)
     entry = {"constraint": "terminal", "time": 2.0, "direction": [1.0], "parameter": [], "multiplier": 1.0}
 
     def judged(goal, **more):
         said = {"multipliers": {"constraints": [entry], "equalities": [], "pieces": None}, "status": "infeasible"}
+        said["decision"] = None
         return claims._infeasible(case_of(certificate={**said, **more}, terminal=[Box([-9.0], [goal])]))
 
     assert "at least 0.1" in judged(-0.6)
