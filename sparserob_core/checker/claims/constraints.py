@@ -123,11 +123,11 @@ def followed(case: Case, c: Array, driven: bool = True) -> Worst:
     problem, made = case.problem, case.adjoints
     c = c + 0.0  # no -0, of which the bytes of an opposite row would be others
     opposite = (0.0 - c).tobytes()
+    inputs = problem.system.controls + (problem.system.c is not None)
+    table = Enclosed(*np.zeros((2, inputs, len(case.grid) - 1)))
     if driven:
-        table = Enclosed.of(stacked([list(row) for row in zip(*(u.entries() for u in case.scene.control), strict=True)]))
-    else:
-        inputs = problem.system.controls + (problem.system.c is not None)
-        table = Enclosed(*np.zeros((2, inputs, len(case.grid) - 1)))
+        on_grid = [u.entries() for u in case.scene.control]
+        table = Enclosed.of(stacked([list(row) for row in zip(*on_grid, strict=True)]))
     jumps = None if case.measurable else case.changes
     if c.tobytes() not in made:
         made[c.tobytes()] = made[opposite].reversed() if opposite in made else Adjoint.of(case.motion, c)
