@@ -276,3 +276,43 @@ def test_the_sparsest_control_is_that_of_a_mixed_integer_program(name: str, lett
     result = sr.run(config, out=tmp_path / "run", figures=False).result
     assert result.status == "certified" and result.cost == pytest.approx(least_count(problem, letters), rel=1e-6)
     assert check(tmp_path / "run").status == "verified"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("units", [(1.0, 1.0, 1.0), (7.0, 0.03, 1100.0)])
+@pytest.mark.parametrize("turns", [1, 2])
+def test_the_gain_of_an_engine_is_unknown_and_it_is_missed_too(
+    units: tuple[float, float, float], turns: int, tmp_path: Path
+) -> None:
+    # x' = (1 + p) u from -1 to at most 0.25 from 0, |p| <= 0.1: of U 0.9 * 0.95 arrive for sure, 0.75 must
+    state, control, time = units
+    one = {"A": [[0]], "B": [[f"(1 + p) * {control * time / state!r}"]]}
+    every = [{"until": 2.0 * (k + 1) / turns / time, **one} for k in range(turns)]
+    problem = {
+        "name": "linear",
+        "system": {**(one if turns == 1 else {"pieces": every}), "parameters": {"p": [-0.1, 0.1]}},
+        "horizon": 2.0 / time,
+        "initial_state": [-1 / state],
+        "control": {"box": 1.0 / control},
+        "terminal": [{"box": 0.25 / state}],
+        "execution": 0.05,
+    }
+    cost = verified(tmp_path / "run", problem, pieces(4))["cost"] * control * time
+    assert cost == pytest.approx(0.75 / (0.9 * 0.95), rel=1e-8)
+    found = sr.simulate(tmp_path / "run", 100, "vertices")
+    assert not found.constraints[0].violated and found.constraints[0].largest > -0.15 / state
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        {"A": [["p"]], "B": [[1]], "parameters": {"p": [-0.1, 0.1]}},
+        {"A": [[0]], "B": [["(1 + p) * (1 + q)"]], "parameters": {"p": [-0.1, 0.1], "q": [-0.1, 0.1]}},
+        {"A": [[0]], "B": [["1 + p"]], "parameters": {"names": ["p"], "ellipsoid": {"centre": [0], "shape": [[0.1]]}}},
+    ],
+)
+def test_parameters_that_the_state_is_no_affine_function_of_are_refused(system: dict[str, Any]) -> None:
+    problem = {"name": "linear", "system": system, "horizon": 2.0, "initial_state": [-1], "control": {"box": 1.0}}
+    config = {"problem": {**problem, "execution": 0.05}, "dictionaries": {"control": pieces(2)}, "observers": []}
+    with pytest.raises(sr.InputError, match=r"execution.*affinely"):
+        sr.run(config, figures=False)

@@ -70,7 +70,7 @@ class Case:
         if self.given is None:
             object.__setattr__(self, "given", self.problem)
             object.__setattr__(self, "problem", self._returning(self.problem))
-        plain = spelt(self.problem)
+        plain = in_turns(spelt(self.problem))
         known = parted(plain)
         if known is not plain and self.policy is not None:
             raise Unchecked("the checker knows no feedback beside parameters and the time")

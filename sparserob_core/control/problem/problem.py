@@ -286,8 +286,7 @@ class OptimalControlProblem(Term):
             "fixed final values, which an error of execution misses: a terminal set such as box": bool(
                 self.terminal_equalities
             ),
-            "uncertain parameters, but for those beside the time t": bool(self.system.parameter_count)
-            and not self.system.varies,
+            "parameters, but for those in a box that the state depends on affinely": not self._is_affine(),
             "measurable disturbances in another set than a box where the system has pieces or a delay": self.measurable
             is not None
             and not self.measurable.is_box
@@ -298,6 +297,15 @@ class OptimalControlProblem(Term):
             if given:
                 raise InputError(path="execution", expected=f"none beside {beside}", got=f"{shares.tolist()}")
         return shares
+
+    def _is_affine(self) -> bool:
+        """Whether the state is an affine function of parameters in a box, or there are none."""
+        if isinstance(self.system, VaryingSystem) or not self.system.parameter_count:
+            return True
+        try:
+            return bool(VaryingSystem.made_of(self.system, self.horizon).parameter_count)
+        except InputError:
+            return False
 
     def _state(self) -> Array:
         d = self.system.states

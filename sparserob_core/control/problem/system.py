@@ -696,6 +696,25 @@ class VaryingSystem:
         later = tuple(zip(begins[1:], laws[1:], strict=True))
         return VaryingSystem(laws[0], float(pieces[-1][0]), delay, later, known.box)
 
+    @staticmethod
+    def made_of(system: LinearSystem | SwitchedSystem, horizon: float) -> VaryingSystem:
+        """A system that does not change, or takes turns, as one whose law is constant in every turn. Raises
+        `InputError` where its state is not an affine function of its parameters."""
+        begins, modes = [0.0, *system.switches], system.modes
+        ends, box = [*begins[1:], horizon], None if system.parameters is None else boxed(system.parameters)
+        laws = [
+            LinearSystem(
+                _at_any_time(mode.A),
+                _at_any_time(mode.B),
+                None if mode.E is None else _at_any_time(mode.E),
+                _and_time(begin, end, box),
+                (TIME, *mode.names[: 0 if box is None else box.dimension]),
+                None if mode.c is None else _at_any_time(mode.c),
+            )
+            for begin, end, mode in zip(begins, ends, modes, strict=True)
+        ]
+        return VaryingSystem(laws[0], horizon, system.delay, tuple(zip(begins[1:], laws[1:], strict=True)), box)
+
     @property
     def laws(self) -> tuple[tuple[float, float, LinearSystem], ...]:
         """Between which times which law holds."""
@@ -902,6 +921,14 @@ class _Later:
 
 def _later(entry: _Entry | None, begin: float) -> _Entry | None:
     return _Later(entry, begin) if callable(entry) else entry
+
+
+def _at_any_time(entry: Matrix) -> Matrix:
+    """A matrix, or a function of the parameters, as one of the time and of them."""
+    if not callable(entry):
+        return entry
+    function = entry
+    return lambda p: function(p[1:])
 
 
 def boxed(parameters: ConvexSet) -> Box:

@@ -18,6 +18,7 @@ from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.studies.simulate import worst_errors
+from sparserob_core.control.transcription.terms.in_time import in_time
 from sparserob_core.control.transcription.terms.superposed import at_corners
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
@@ -198,7 +199,7 @@ class ParametersInTime:
     @staticmethod
     def of(problem: OptimalControlProblem) -> ParametersInTime | None:
         """Those of a problem as it was stated; ``None`` where it has none."""
-        every, system = at_corners(problem), problem.system
+        every, system = at_corners(problem), in_time(problem).system
         if every is None or not isinstance(system, VaryingSystem) or system.parameters is None:
             return None
         return ParametersInTime(system.parameters, system.dependence, every)

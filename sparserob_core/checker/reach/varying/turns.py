@@ -1,25 +1,45 @@
-"""Systems that take turns, and what acts late, as one known system whose law is another in every turn: errors of
+"""Systems that take turns, what acts late, and parameters, as one system whose law is another in every turn: errors of
 execution are followed in the time, not in the age of a command."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any, final
 
+from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import TIME, LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class Anytime:
+    """A function of the parameters as one of the time and of them."""
+
+    function: Callable[[Any], object]
+
+    def __call__(self, p: Any) -> object:
+        return self.function(p[1:])
+
+
 def in_turns(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with such a system where it has errors of execution beside turns or a delay; it itself elsewhere."""
+    """The problem with such a system where it has errors of execution beside turns, a delay or parameters; it itself
+    elsewhere."""
     system = problem.system
     late = isinstance(system, SwitchedSystem) or (isinstance(system, LinearSystem) and system.delay > 0.0)
-    if problem.execution is None or not late or system.parameter_count:
+    if problem.execution is None or isinstance(system, VaryingSystem) or not (late or system.parameter_count):
         return problem
-    ends = [0.0, *system.switches, problem.horizon]
-    laws = [
-        (start, LinearSystem(one.A, one.B, one.E, Box([start], [stop]), (TIME,), one.c))
-        for (start, stop), one in zip(pairwise(ends), system.modes, strict=True)
-    ]
-    return replace(problem, system=VaryingSystem(laws[0][1], problem.horizon, system.delay, tuple(laws[1:])))
+    bound, names = system.parameters, tuple(system.names)
+    if not (bound is None or isinstance(bound, Box)):
+        raise Unchecked("beside errors of execution the checker knows boxes of parameters")
+    ends, laws = [0.0, *system.switches, problem.horizon], list[tuple[float, LinearSystem]]()
+    for (start, stop), one in zip(pairwise(ends), system.modes, strict=True):
+        box = Box([start], [stop]) if bound is None else Box([start, *bound.lower], [stop, *bound.upper])
+        parts = {name: one.entry(name) for name in ("A", "B", "E", "c")}
+        made: dict[str, Any] = {name: Anytime(part) if callable(part) else part for name, part in parts.items()}
+        laws.append((start, LinearSystem(made["A"], made["B"], made["E"], box, (TIME, *names), made["c"])))
+    later = tuple(laws[1:])
+    return replace(problem, system=VaryingSystem(laws[0][1], problem.horizon, system.delay, later, bound))

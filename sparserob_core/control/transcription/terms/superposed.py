@@ -14,6 +14,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import TIME, LinearSystem, VaryingSystem
 from sparserob_core.control.problem.terms.windows import everywhere
 from sparserob_core.control.sets.sets import Equality, cylinder
+from sparserob_core.control.transcription.terms.in_time import in_time
 from sparserob_core.control.transcription.terms.larger import larger
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
@@ -25,7 +26,9 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same problem without parameters beside the time. The states of one in the middle of their box stay the first
     ones, after which comes what each parameter adds, per half of its interval; both obey known equations. A bound of
     the state holds for all parameters where it holds at the corners; a curved one is one constraint for each of them.
-    Halves of intervals are rounded outwards."""
+    Halves of intervals are rounded outwards. Beside errors of execution parameters of any system are such (`in_time`).
+    """
+    problem = in_time(problem)
     system = problem.system
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return problem
@@ -53,7 +56,7 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
 def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
     """The stated states at every corner of the box of parameters beside the time, as rows ``(d, size)`` on those of one
     in the middle and on what the parameters add; ``None`` where there are no such parameters."""
-    system = problem.system
+    system = in_time(problem).system
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return None
     return [system.dependence.rows(corner) for corner in _corners(system.dependence)]
@@ -61,7 +64,7 @@ def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
 
 def corners_of(problem: OptimalControlProblem) -> Corners:
     """The corners of a problem as it is stated; none where it has no parameters beside the time."""
-    system, rows = problem.system, at_corners(problem)
+    system, rows = in_time(problem).system, at_corners(problem)
     if rows is None or not isinstance(system, VaryingSystem) or system.parameters is None:
         return Corners()
     box, reached = system.parameters, system.dependence.reached
