@@ -209,8 +209,8 @@ class Controller:
     def _beside(self) -> int:
         """How many states after these hold what parameters beside the time add, which is nothing where a state is
         measured."""
-        corners = self._planned.model.problem.names.corners
-        return 0 if corners is None else corners.rows[0].shape[1] - self._states
+        first, end = self._planned.model.problem.names.corners.added
+        return end - first
 
     @property
     def _observer(self) -> Observer | None:

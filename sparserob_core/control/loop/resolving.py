@@ -59,7 +59,7 @@ class Plan:
         problem, response = self.known.problem, self.known.response
         if problem.system.parameters is not None or problem.system.delay > 0.0 or problem.system.switches:
             return None
-        if problem.names.corners is not None:  # parameters beside the time are states by now, that nobody measures
+        if problem.names.corners:  # parameters beside the time are states by now, that nobody measures
             return None
         if problem.classes - {"piecewise_constant"}:
             return None
