@@ -120,6 +120,10 @@ class TimedExplanation(Explanation):
             self.where if self.names.corners else "",
         )
 
+    def parameter_or(self, middle: Array) -> Array:
+        """Its parameter; the ``middle`` of a constraint without uncertainty."""
+        return middle if self.parameter is None or self.parameter.size == 0 else self.parameter
+
     def short(self) -> str:
         return f"{self.statement}{self._at}"
 

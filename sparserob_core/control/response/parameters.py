@@ -30,6 +30,11 @@ class ParameterIndex:
         assert self.set is not None
         return self.set.bounding_box()
 
+    @property
+    def middle(self) -> Array:
+        """A point in the interior of the set, ``(nu,)``; of a known system the only one there is."""
+        return np.zeros(0) if self.set is None else self.set.interior_point()
+
     def clamp(self, parameters: Array) -> Array:
         """Points ``(k, nu)`` of the box mapped onto the set: kept where inside, else drawn along the ray to an interior
         point."""

@@ -264,7 +264,7 @@ def _ends(problem: OptimalControlProblem, functionals: WorstCase, parameters: Pa
     """Terminal equalities as rows; refused where the uncertainty reaches the state, since nothing could then satisfy
     them."""
     A, b = [np.zeros((0, functionals.variables))], [np.zeros(0)]
-    middle = np.zeros((1, 0)) if parameters.set is None else parameters.set.interior_point()[None]
+    middle = parameters.middle[None]
     (directions, values), added = fixed(problem), added_up(problem, functionals)
     for up, value, size in zip(directions, values, added, strict=True):
         time = np.array([problem.horizon])

@@ -59,13 +59,12 @@ def _moving(model: Transcription) -> float:
 
 def _added(model: Transcription, result: Result) -> float:
     """The sum over all rows with a multiplier of multiplier times the numbers that are added up to the row."""
-    middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
+    middle = model.parameters.middle
     rows, besides = [], 0.0
     for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         constraint = model.constraint(model.program.family(cut.family))
         if said is not None and constraint is not None and cut.multiplier > 0.0:
-            known = said.parameter is not None and said.parameter.size > 0
-            rows.append((cut.multiplier, said.time, said.direction, said.parameter if known else middle))
+            rows.append((cut.multiplier, said.time, said.direction, said.parameter_or(middle)))
             if said.gain is not None:
                 besides += cut.multiplier * float(np.abs(said.gain) @ _far(model.problem.control))
             besides += cut.multiplier * float(constraint.reference.reach(said.direction))

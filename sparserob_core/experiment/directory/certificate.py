@@ -241,11 +241,7 @@ def _parameter(problem: OptimalControlProblem, said: TimedExplanation) -> Array:
     if bound is None:
         return np.zeros(0)
     middle = bound.interior_point()
-    return (
-        middle
-        if said.parameter is None or said.parameter.size == 0
-        else _inside(bound, np.asarray(said.parameter), middle)
-    )
+    return _inside(bound, np.asarray(said.parameter_or(middle)), middle)
 
 
 def _direction(said: TimedExplanation) -> dict[str, Any]:

@@ -244,15 +244,13 @@ def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
     problem, found = model.problem, []
     starts = {one.name: one.start for one in model.constraints[: len(problem.path)]}  # terminal sets come after them
     shares = model.control.breakpoints / model.control.horizon
-    middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
+    middle = model.parameters.middle
     for cut in result.dual.cuts:
         constraint = model.constraint(model.program.family(cut.family))
         if constraint is None:
             continue
         said = in_numbers(model.program, cut.family, cut.formulation, cut.index, cut.row)
         if said is not None and cut.multiplier > 0.0:
-            known = said.parameter is not None and said.parameter.size > 0
-            parameter = said.parameter if known and said.parameter is not None else middle
             moved = float(constraint.reference.along(np.array([said.time]), said.direction[None])[0, 0])
             within = (0.0, 1.0) if said.piece is None else (float(shares[said.piece]), float(shares[said.piece + 1]))
             found.append(
@@ -260,7 +258,7 @@ def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
                     weight=float(cut.multiplier),
                     share=min(1.0, said.time / problem.horizon),
                     direction=said.direction,
-                    parameter=np.asarray(parameter, dtype=float),
+                    parameter=np.asarray(said.parameter_or(middle), dtype=float),
                     limit=said.sign * said.limit - moved,
                     earliest=starts.get(cut.family, 0.0),
                     reference=constraint.reference,
