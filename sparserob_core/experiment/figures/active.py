@@ -12,7 +12,6 @@ from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from sparserob_core.control.transcription.record import Transcription
-    from sparserob_core.experiment.assemble import ControlExperiment
     from sparserob_core.sip.evidence import Cut
 
 NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
@@ -32,21 +31,19 @@ class Active:
         return self.times if self.states is None else self.times[self.states[:, component]]
 
 
-def active_of(experiment: ControlExperiment, cuts: Sequence[Cut]) -> Active:
+def active_of(model: Transcription, cuts: Sequence[Cut]) -> Active:
     """Where imposed constraints that carry a multiplier are active; of a policy those on the state."""
-    return marks_of(
-        experiment.transcription, [cut for cut in cuts if cut.multiplier > 0.0 and _told(experiment, cut.family)]
-    )
+    return marks_of(model, [cut for cut in cuts if cut.multiplier > 0.0 and _told(model, cut.family)])
 
 
-def stored_active(experiment: ControlExperiment, solution: Mapping[str, Array]) -> Active:
+def stored_active(model: Transcription, solution: Mapping[str, Array]) -> Active:
     """The same from ``solution.npz``; none where it has no multipliers."""
     if not {"times", "multipliers", "families", "rows"} <= set(solution):
-        return marks_of(experiment.transcription, ())
+        return marks_of(model, ())
     multipliers = solution["multipliers"]
     kept = multipliers > NOTHING * multipliers.max(initial=0.0)
     found = zip(*(solution[name][kept].tolist() for name in ("families", "times", "rows")), strict=True)
-    return _marks(experiment.transcription, [one for one in found if _told(experiment, one[0])])
+    return _marks(model, [one for one in found if _told(model, one[0])])
 
 
 def marks_of(model: Transcription, cuts: Sequence[Cut]) -> Active:
@@ -67,7 +64,6 @@ def _marks(model: Transcription, found: Sequence[tuple[str, float, int]]) -> Act
     return Active(times, states)
 
 
-def _told(experiment: ControlExperiment, family: str) -> bool:
+def _told(model: Transcription, family: str) -> bool:
     """Whether the first coordinate of a family's indices is a time: under feedback those of states."""
-    model = experiment.transcription
     return model.feedback is None or family in {one.name for one in model.constraints}

@@ -34,7 +34,7 @@ COLOURS = {
 def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
     """Draw loops over the tube of their plan into a file (.png, .pdf, .svg); raises `InputError` when it cannot be
     written."""
-    active = stored_active(finished.experiment, finished.solution)
+    active = stored_active(finished.experiment.transcription, finished.solution)
     status = str(finished.summary["status"])
     data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
     with style():

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from sparserob_core.errors import InputError, SparseRobError
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble
+from sparserob_core.experiment.assemble import Experiment, assemble
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.finished import read_finished, stored_run
 from sparserob_core.experiment.figures.active import active_of
@@ -92,10 +92,11 @@ def drawings(
     from sparserob_core.experiment.figures.climb_figure import write_climb
     from sparserob_core.experiment.figures.drawing import draw_experiment
 
-    if isinstance(experiment, ControlExperiment) and result.status == "infeasible":
+    model = experiment.model
+    if model is not None and result.status == "infeasible":
         yield lambda: draw_clash(experiment, result, directory)
-    elif isinstance(experiment, ControlExperiment) and result.decision is not None:
-        active, decision = active_of(experiment, result.indices), np.asarray(result.decision, dtype=float).ravel()
+    elif model is not None and result.decision is not None:
+        active, decision = active_of(model, result.indices), np.asarray(result.decision, dtype=float).ravel()
         yield lambda: draw_experiment(
             experiment,
             decision,
@@ -131,11 +132,11 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
     from sparserob_core.experiment.figures.run_figures import run_pictures
 
     known: dict[str, Callable[[], Figure | None]] = {}
-    if isinstance(experiment, ControlExperiment) and result.status == "infeasible":
+    model = experiment.model
+    if model is not None and result.status == "infeasible":
         known["clash"] = lambda: clash_figure(experiment, result)
-    elif isinstance(experiment, ControlExperiment) and result.decision is not None:
-        decision = np.asarray(result.decision, dtype=float).ravel()
-        active = active_of(experiment, result.indices)
+    elif model is not None and result.decision is not None:
+        decision, active = np.asarray(result.decision, dtype=float).ravel(), active_of(model, result.indices)
         data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status)
         known |= run_pictures(replace(data, push=switching(experiment, result)))
         worst = adversaries(experiment, decision)
@@ -195,7 +196,7 @@ def _cost_unit(experiment: Experiment) -> str:
     return "" if experiment.problem is None else experiment.problem.cost_unit
 
 
-def switching(experiment: ControlExperiment, result: Result) -> Array | None:
+def switching(experiment: Experiment, result: Result) -> Array | None:
     """How hard the constraints push the control, ``(m, K)``, as the multipliers of the lower bound say, or those of the
     imposed constraints; ``None`` where neither is known."""
     if result.status not in ("certified", "verified"):

@@ -29,7 +29,7 @@ def write_simulation(
 
     Raises `InputError` when the file cannot be written.
     """
-    active = stored_active(finished.experiment, finished.solution)
+    active = stored_active(finished.experiment.transcription, finished.solution)
     status = str(finished.summary["status"])
     data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
     if worst is not None:

@@ -312,6 +312,7 @@ def test_whatever_is_wrong_with_an_array_is_an_error_of_the_input_or_none(
 ) -> None:
     directory, change = Path(shutil.copytree(searched, tmp_path / "run")), WRONG[kind]
     inspection = Inspection.read(directory)
+    model = inspection._experiment.transcription
 
     def replayed() -> object:
         return list(events(inspection, "", directory, stored_result(StoredRun(directory))))
@@ -320,7 +321,10 @@ def test_whatever_is_wrong_with_an_array_is_an_error_of_the_input_or_none(
         return sr.compare([directory])
 
     readers: dict[str, tuple[Callable[[], object], ...]] = {
-        "solution.npz": (replayed, lambda: stored_active(inspection._experiment, StoredRun(directory).solution)),
+        "solution.npz": (
+            replayed,
+            lambda: stored_active(model, StoredRun(directory).solution),
+        ),
         "trace.npz": (replayed, compared),
         "rounds.npz": (replayed,),
         "evaluations.npz": (replayed, compared),

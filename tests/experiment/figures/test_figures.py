@@ -96,10 +96,10 @@ def test_a_constraint_says_which_states_it_bounds(bounds: dict[str, Any], about:
     assert isinstance(experiment, ControlExperiment)
     cuts = [sr.Cut("path", np.array([0.5, 0.0]), row, 1.0) for row in (0, 9)]
     cuts.append(sr.Cut("terminal", np.array([2.0]), 1, 0.0))
-    found = active_of(experiment, cuts)
+    found = active_of(experiment.transcription, cuts)
     assert found.times.tolist() == [0.5] and set(np.flatnonzero(found.states[0])) == about
     kept = {"families": np.array(["path", "terminal"]), "times": np.array([0.5, 2.0]), "rows": np.array([0, 1])}
-    stored = stored_active(experiment, {**kept, "multipliers": np.array([1.0, 1e-12])})
+    stored = stored_active(experiment.transcription, {**kept, "multipliers": np.array([1.0, 1e-12])})
     assert (stored.times.tolist(), stored.states.tolist()) == ([0.5], found.states.tolist())
 
 
