@@ -253,7 +253,7 @@ class ConvexSet(ABC):
         if flat is None:
             gauge = self.gauge(points)
             length = np.linalg.norm((points - self.interior_point()) @ self.normals.T, axis=-1)
-            inside = (gauge - 1.0) * self._inner_radius
+            inside = (gauge - 1.0) * (self._inner_radius if (gauge < 1.0).any() else 0.0)
             return np.asarray(np.where(gauge > 1.0, length * (1.0 - 1.0 / np.maximum(gauge, 1.0)), inside))
         H, h = flat
         if h.size == 0:
@@ -265,7 +265,12 @@ class ConvexSet(ABC):
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
         """Whether points ``(..., d)`` violate nothing by more than the absolute ``tolerance``."""
-        inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
+        points = np.asarray(points, dtype=float)
+        if tolerance < 0.0 or self.halfspaces() is not None:
+            return np.asarray(self.violation(points) <= tolerance)
+        inside: npt.NDArray[np.bool_] = np.array(self.gauge(points) <= 1.0)  # how deep is not asked
+        if not inside.all():
+            inside[~inside] = self.violation(points[~inside]) <= tolerance
         return inside
 
     @shaped

@@ -322,7 +322,7 @@ class OptimalControlProblem(Term):
         bound = checked_set("initial_set", self.initial_set, self.system.states, "states", bounded=True)
         axes = np.eye(bound.dimension)
         size = float(bound.reach(axes).max())
-        if float(bound.violation(np.zeros(bound.dimension))) > SAME * size:
+        if not bound.contains(np.zeros(bound.dimension), SAME * size):
             raise InputError(
                 path="initial_set",
                 expected="a set of deviations that holds 0, so that the centre is one of the initial states",

@@ -52,6 +52,9 @@ class Zonotope(ConvexSet):
     def interior_point(self) -> Array:
         return self.centre.copy()
 
+    def middle(self) -> Array:
+        return self.centre.copy()
+
     def linearisation_excess(self, centre: Array, spread: Array) -> Array:
         """``|a + b| - sign(a) (a + b) <= 2 max(|b| - |a|, 0)`` for every generator; ``|a + b|`` itself where ``a`` is
         0."""

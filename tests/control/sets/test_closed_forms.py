@@ -413,3 +413,12 @@ def test_few_sides_of_a_box_add_up_to_what_all_at_once_do(width, centred):
         plain = np.maximum(directions * box.upper, directions * box.lower).sum(axis=-1)
         np.testing.assert_array_equal(box.support(directions), plain)
         np.testing.assert_array_equal(box.reach(directions), np.maximum(plain, box.support(-directions)))
+
+
+def test_whether_points_of_many_coordinates_are_inside_does_not_ask_how_deep() -> None:
+    """How deep a zonotope is takes a linear program for each of them."""
+    bound = Zonotope(np.zeros(12), np.random.default_rng(3).normal(size=(20, 12))).in_units(np.full(12, 2.0))
+    assert bound.contains(np.zeros(12)) and not bound.contains(np.full(12, 1e3))
+    assert bound.contains(np.stack([np.zeros(12), bound.support_point(np.ones(12))])).all()
+    assert "_inner_radius" not in vars(bound)
+    assert bound.violation(np.zeros(12)) < 0.0 and "_inner_radius" in vars(bound)
