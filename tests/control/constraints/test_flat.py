@@ -163,6 +163,18 @@ def test_among_many_pieces_the_worst_violation_is_the_same_and_the_others_are_me
         np.testing.assert_allclose(found, many.violations, atol=1e-11)
 
 
+def test_along_a_wall_rows_of_many_entries_are_few(monkeypatch):
+    """``x' = u`` with u = 1 rises above its wall on all pieces but the first ones: one row for each, or as few as there
+    are entries for."""
+    functionals = worst_case(LinearSystem([[0.0]], [[1.0]]), uniform(40, 2.0), initial_state=[0.0])
+    constraint = FlatConstraint("path", functionals, np.array([[1.0]]), np.array([0.1]), 0.0, 2.0, ParameterIndex(None))
+    assert 35 <= (constraint.worst(np.ones(40)).violations > 0.0).sum() <= 40
+    monkeypatch.setattr(flat, "SPANNED", 400)
+    few = replace(constraint, shared=None).worst(np.ones(40))
+    assert 10 <= (few.violations > 0.0).sum() <= 12
+    assert few.violations[0] == pytest.approx(1.9)
+
+
 def test_a_window_that_starts_just_before_a_sample_is_searched():
     functionals = worst_case(LinearSystem([[0.0]], [[1.0]]), uniform(10, 1.0), initial_state=[0.0])
     for start in (0.3, np.nextafter(0.3, 0), 0.3 - 1e-14, 0.1 + 0.2):
