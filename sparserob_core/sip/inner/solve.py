@@ -296,9 +296,7 @@ def _tried(case: _Case) -> FiniteSolution:
             if believed is not None:
                 return believed
         if (form, factor) == attempts[0] and proof is None:
-            lacking = claim is not None and claim.status == "solved" and answer is not None
-            believed = _at_a_vertex(case) if lacking else None
-            believed = believed or _more_digits(case, claim)
+            believed = _sharper(case, claim, answer)
             if believed is not None:
                 return believed
         if case.blunt is not None:
@@ -310,10 +308,19 @@ def _tried(case: _Case) -> FiniteSolution:
     return _failed(case)
 
 
+def _sharper(case: _Case, claim: Claim | None, answer: Recovered | None) -> FiniteSolution | None:
+    """The first answer that is believed and sharp: more digits of the ``claim``, and a vertex, which comes first where
+    the solver has an answer that lacks digits, and last where it has none."""
+    solved = claim is not None and claim.status == "solved" and answer is not None
+    believed = _at_a_vertex(case) if solved else None
+    believed = believed or _more_digits(case, claim)
+    return believed if solved or believed is not None else _at_a_vertex(case)
+
+
 def _at_a_vertex(case: _Case) -> FiniteSolution | None:
     """The answer of the simplex method to a linear program, if it is believed and sharp: where an interior-point method
-    lacks digits, as with rows that are nearly parallel, a vertex is a system of equations. Nothing where a solver was
-    named."""
+    lacks digits, as with rows that are nearly parallel, or goes in circles, a vertex is a system of equations. Nothing
+    where a solver was named."""
     program = case.program
     if HIGHS not in case.solver.quick or program.P is not None or program.blocks is not None:
         return None

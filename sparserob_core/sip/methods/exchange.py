@@ -117,8 +117,15 @@ class Rounds:
         # Secure: where time runs out, prove a decision that keeps away from the constraints while there is some.
         imposed = secure_in_time(working, ledger, prover, answer, found, number)
 
-        # Exchange: impose them, drop what has been idle; tighten what is violated though imposed.
-        exchanged = not last and (working.exchange(answer, violated, number) or imposed or working.tighten(found))
+        # Exchange: impose them, drop what has been idle; of what is violated though imposed, solve a crude answer more
+        # closely, and tighten else.
+        crude = answer.solution.status != "optimal" and not feasible
+        exchanged = not last and bool(
+            working.exchange(answer, violated, number)
+            or imposed
+            or (crude and working.sharpen(ledger, answer))
+            or working.tighten(found)
+        )
         # Rest: what costs is put to 0 where that meets the lower bound and violates nothing.
         if not exchanged:
             answer, found = working.rested(ledger, answer, found, number)

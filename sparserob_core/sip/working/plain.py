@@ -122,7 +122,8 @@ class PlainRows(Working):
         if self.epsilon == 0.0 or not self.exact:
             return False
         plain = self._plain(ledger)
-        if not ledger.open(answer.solution.x) or not usable(plain):
+        crude = answer.solution.status != "optimal"
+        if not (crude or ledger.open(answer.solution.x)) or not usable(plain):
             return False
         self.epsilon, self.guess = 0.0, plain if self.program.n >= MANY else None
         return True

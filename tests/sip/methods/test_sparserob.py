@@ -130,7 +130,7 @@ def test_an_interrupted_search_returns_what_it_has_proven(tmp_path, monkeypatch)
 
 def test_a_search_at_its_limit_returns_what_it_has_proven_and_was_not_interrupted(tmp_path, monkeypatch):
     """The time is over after as many evaluations as prove something, however slow the machine is."""
-    evaluated, left = TupleValue.at, [300]
+    evaluated, left = TupleValue.at, [500]
 
     def counted(g, point):
         left[0] -= 1
