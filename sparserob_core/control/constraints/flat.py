@@ -28,7 +28,7 @@ from sparserob_core.control.response.functional import LEGS_KEPT, Leg, WorstCase
 from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Direct, Moving, Reference
-from sparserob_core.control.response.response import LONG, Outputs, Response, distinct_times
+from sparserob_core.control.response.response import Outputs, Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Separation
@@ -48,6 +48,9 @@ KEPT = 64  # separated constraints per row and round
 # of four controls had 268 rows in the first round where 64 say as much, and took twice the time.
 SPANNED = 2**19
 FEW = 8
+# Pieces from which maxima well below 0 are told as they were sampled. With a tenth of them ordinary runs tell less;
+# with ten times as many every round of a long one refines thousands.
+MANY = 1000
 FOUND_KEPT = 1  # decisions whose separation is remembered
 
 
@@ -318,7 +321,7 @@ class FlatConstraint(StateConstraint):
         found = heights
         times, predicted = vertices(values, positions, self.times)
         between = np.flatnonzero(times != indices[:, 0])  # the others are samples
-        if self.parameters.count or self.functionals.response.grid.pieces >= LONG:
+        if self.parameters.count or self.functionals.response.grid.pieces >= MANY:
             # among many samples, those well below 0 are only told
             promised = heights + 4.0 * (predicted - heights)
             between = between[promised[between] >= min(0.0, heights.max(initial=-np.inf))]

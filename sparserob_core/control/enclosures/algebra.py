@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparserob_core.control.enclosures.matrix_exponential import COEFFICIENTS, Transitions, exponential_rounding
+from sparserob_core.control.enclosures.matrix_exponential import COEFFICIENTS, exponential_rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
@@ -25,18 +25,10 @@ def lifted_matrix(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:
     return np.moveaxis(lifted, (0, 1), (-4, -2)).reshape(*coefficients.shape[:-3], size * d, size * d)
 
 
-def lifted_transitions(space: TaylorSpace, A: Array, rows: bool) -> Transitions:
-    """`transitions` of the lifted matrix of ``A (M, d, d)``; in the place of the function of that name."""
-
-    def of(matrix: Array, durations: Array) -> tuple[Array, Array]:
-        shape = np.broadcast_shapes(matrix.shape[:-2], durations.shape)
-        flows = [
-            lifted_matrix(space, part, rows)
-            for part in flows_of(space, A, np.broadcast_to(durations, shape).reshape(-1))
-        ]
-        return flows[0].reshape(*shape, *matrix.shape[-2:]), flows[1].reshape(*shape, *matrix.shape[-2:])
-
-    return of
+def lifted_transitions(space: TaylorSpace, A: Array, durations: Array, rows: bool) -> tuple[Array, Array]:
+    """`transitions` of the lifted matrix of ``A (M, d, d)`` over durations ``(k,)``, ``(k, M d, M d)`` each."""
+    flow, driven = (lifted_matrix(space, part, rows) for part in flows_of(space, A, durations))
+    return flow, driven
 
 
 def flows_of(space: TaylorSpace, A: Array, durations: Array) -> tuple[Array, Array]:

@@ -108,7 +108,7 @@ def decoupled(A: Array) -> Decoupling:
     d = A.shape[0]
     if d == 1 or not np.isfinite(A).all():
         return identity(d)
-    scale = _balance(A)
+    scale = balance(A)
     balanced = A * scale / scale[:, None]
     for found in _candidates(balanced):
         checked = _checked(scale[:, None] * found[0], *found[1:])
@@ -226,11 +226,11 @@ def _grouped(form: Array, basis: Array, clusters: list[np.ndarray]) -> tuple[Arr
 def pace(A: Array) -> float:
     """About how fast a system moves: the norm of ``A (d, d)`` in units of the states in which it is balanced, or as it
     is, whichever is less."""
-    scale = _balance(A)
+    scale = balance(A)
     return float(min(np.linalg.norm(A, 2), np.linalg.norm(A * scale / scale[:, None], 2)))
 
 
-def _balance(A: Array) -> Array:
+def balance(A: Array) -> Array:
     """Powers of two ``s (d,)`` such that rows and columns of ``A s_j / s_i`` are equally large (Osborne 1960)."""
     scale, start = _swept(A, np.ones(A.shape[0])), _near_one(A)
     # where many states are in a row, each next to its like, the sweeps stop early

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeAlias
-
 import numpy as np
 
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
 EPSILON = float(np.finfo(float).eps)
-
-# From matrices ``(..., d, d)`` and durations ``(...)``, broadcast together, to their exponentials and the integrals.
-Transitions: TypeAlias = Callable[[Array, Array], tuple[Array, Array]]
 
 # 1 / k!; beyond degree 18 nothing is left on the unit ball (1 / 19! < 1e-17)
 COEFFICIENTS = 1.0 / np.cumprod([1.0, *range(1, 19)])

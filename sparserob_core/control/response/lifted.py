@@ -41,7 +41,7 @@ from sparserob_core.control.enclosures.decoupling import (
     identity,
 )
 from sparserob_core.control.enclosures.flows import Flows
-from sparserob_core.control.enclosures.matrix_exponential import Transitions, rounding
+from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.system import LinearSystem, System
 from sparserob_core.control.response.response import TINY, Response, TimeGrid
@@ -245,16 +245,8 @@ class LiftedSystem:
         drive = LinearSystem(self.row_matrix, np.zeros((size, 1)))
         return Response(drive, grid, np.zeros(size), self._propagate(rows=True))
 
-    def _propagate(self, rows: bool) -> Transitions:
-        """The exponentials of the lifted matrix: mode by mode where there is one coefficient, in the algebra of
-        polynomials otherwise."""
-        if self.space.nu:
-            return lifted_transitions(self.space, self.A, rows=rows)
-        return lambda matrix, durations: decoupled_transitions(
-            self.decoupling,
-            self.A[0],
-            np.broadcast_to(durations, np.broadcast_shapes(matrix.shape[:-2], durations.shape)),
-        )
+    def _propagate(self, rows: bool) -> LiftedExponentials:
+        return LiftedExponentials(self, rows)
 
     def nodes(self, control: Array) -> Array:
         """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
@@ -620,6 +612,28 @@ class LiftedSystem:
         out of the space, ``(M, ...)``."""
         leaves = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
         return np.asarray(np.tensordot(leaves.astype(float), coefficients, axes=1))
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedExponentials:
+    """`Exponentials` of the lifted matrix, on ``along_rows`` or on columns: mode by mode where there is one
+    coefficient, in the algebra of polynomials otherwise."""
+
+    lifted: LiftedSystem
+    along_rows: bool
+
+    def rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
+        """`Exponentials.rows`, of functionals."""
+        assert self.along_rows
+        flown, driven = self.lifted.flown(rows[:, None], durations)
+        return flown[:, 0], driven[:, 0]
+
+    def transitions(self, durations: Array) -> tuple[Array, Array]:
+        """`Exponentials.transitions`."""
+        lifted = self.lifted
+        if lifted.space.nu:
+            return lifted_transitions(lifted.space, lifted.A, durations, rows=self.along_rows)
+        return decoupled_transitions(lifted.decoupling, lifted.A[0], durations)
 
 
 def _applied(bounds: NormBounds, norms: Array) -> Array:

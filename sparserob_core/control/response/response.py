@@ -17,26 +17,20 @@ from typing import NamedTuple
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.flows import Leaps
-from sparserob_core.control.enclosures.matrix_exponential import EPSILON, Transitions, exponential, transitions
+from sparserob_core.control.enclosures.flows import FEW_STATES, Exponentials, Leaps
+from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transitions
 from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
-LONG = 1000  # pieces from which the states are computed in blocks
-FEWEST = 64  # blocks in which states are computed, where there are that many
+# Blocks in which states are computed, where they are of two pieces and more. With a tenth of them what a block adds
+# from 0 is made of more products; ten times as many are ten times the steps from block to block.
+FEWEST = 64
 LITTLE = 0.5  # norm of A times the duration of a block, at most
 BLOCK = 32  # pieces of a block in which outputs are computed: what grows with it is as large as what does not
 TINY = float(np.finfo(float).tiny)
-KERNEL = 1_000_000  # numbers of what all ages give in all directions, up to which they are remembered
 STEP = 4 * EPSILON  # of the horizon: times that differ by less are a whole piece apart, or not at all
-FEW_STATES, FEW_NUMBERS = 8, 10_000  # up to which tables of parts of pieces, and of many pieces, are made
-TERMS = 20  # of such a series: 1 / 20! is below 1e-18
-SHORT, SERIES = 1.0, 1e-17  # norm of A times a part of a piece up to which a series is summed, and its last term
-AT_ONCE = 50_000  # numbers of a term of the series
-FEW = 128  # indices for which a table beats the loop over the pieces
-INSIDE_KEPT = 4  # sets of durations within pieces whose transitions are remembered
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
 FLOWS_KEPT = 2  # sets of times that a varying system has flown to: a picture asks for many rows at the same ones
 SAME_DURATION = 1e-15  # of the horizon: durations that differ by less are computed once
@@ -212,19 +206,29 @@ def _joined(points: Array, others: Array) -> Array:
 class Steps:
     """Matrices at ``v`` parameters, ``A (v, J, d, d)`` of every mode and ``B``, ``E`` of all modes side by side, and
     their transitions over whole pieces of ``q`` distinct modes and lengths: ``Phi = e^{A h}`` and
-    ``Gamma = int_0^h e^{A s} ds``, ``(v, q, d, d)`` each; ``inside``: those over parts of pieces, as far as they are
-    remembered."""
+    ``Gamma = int_0^h e^{A s} ds``, ``(v, q, d, d)`` each; ``modes (q,)``: of which mode these are."""
 
     A: Array
     B: Array
     E: Array
     Phi: Array
     Gamma: Array
-    inside: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
+    modes: np.ndarray
 
     @cached_property
-    def side_by_side(self) -> Array:
-        """``[Gamma, Phi] (v, q, d, 2 d)``: a row takes both in one product."""
+    def inputs(self) -> Array:
+        """The columns of ``B`` and of ``E`` of every mode, ``(v, J, d, m + mw)``."""
+        parts = (np.stack(np.split(part, self.A.shape[1], axis=-1), axis=1) for part in (self.B, self.E))
+        return np.concatenate(list(parts), axis=-1)
+
+    @cached_property
+    def pushed(self) -> Array:
+        """``[Gamma (B, E), Phi] (v, q, d, m + mw + d)``: a row takes both in one product."""
+        return np.concatenate([self.Gamma @ self.inputs[:, self.modes], self.Phi], axis=-1)
+
+    @cached_property
+    def driven(self) -> Array:
+        """The same of every direction that the state is driven in, ``[Gamma, Phi] (v, q, d, 2 d)``."""
         return np.concatenate([self.Gamma, self.Phi], axis=-1)
 
 
@@ -243,10 +247,10 @@ class Impulses:
     """What inputs through ``columns M (d, c)`` on a piece give to later states, by the age of the piece: ``e^{A i h}
     Gamma(h) M``; for a known system and equal pieces, whose response is a convolution with this.
 
-    No table of all ages is made where it would be large. Those of the first ``reach`` ages (baby steps) and rows that
-    went on by a multiple of ``reach`` (giant steps) are multiplied: ``O(sqrt(L) d^2)`` numbers for the steps, and one
-    product. Either are doubled, so that every step is a product of few transitions, however late it is: where powers of
-    one of them were taken, its rounding would grow with the number of pieces.
+    No table of all ages is made. Those of the first ``reach`` ages (baby steps) and rows that went on by a multiple of
+    ``reach`` (giant steps) are multiplied: ``O(sqrt(L) d^2)`` numbers for the steps, and one product. Either are
+    doubled, so that every step is a product of few transitions, however late it is: where powers of one of them were
+    taken, its rounding would grow with the number of pieces.
     """
 
     propagator: Propagator
@@ -254,10 +258,8 @@ class Impulses:
 
     @cached_property
     def reach(self) -> int:
-        """The number of baby steps, a power of two; all ages where their table is small."""
-        pieces, entries = self.propagator.grid.pieces, self.columns.size
-        places = (pieces - 1).bit_length()
-        return int(2 ** (places if pieces * entries <= KERNEL else places // 2 + 1))
+        """The number of baby steps, a power of two."""
+        return int(2 ** ((self.propagator.grid.pieces - 1).bit_length() // 2 + 1))
 
     @cached_property
     def steps(self) -> Array:
@@ -295,13 +297,18 @@ class Impulses:
 @dataclass(frozen=True, eq=False)
 class Propagator:
     """What the responses of one system on one time grid share, from whatever initial state: transition matrices, and
-    functionals as weights. ``propagate`` takes the place of `transitions` for matrices with a structure."""
+    functionals as weights. ``propagate``: the exponentials of a known system whose matrix has a structure.
+
+    What a functional gives to every piece has two ways: of a known system on equal pieces it depends on the age of a
+    piece alone (`Impulses`); else rows go back from piece to piece.
+    """
 
     system: System
     grid: TimeGrid
-    propagate: Transitions | None = None
+    propagate: Exponentials | None = None
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
     _flows: dict[bytes, Flow] = field(default_factory=dict, repr=False)
+    _exponentials: dict[int, Exponentials] = field(default_factory=dict, repr=False)
 
     @cached_property
     def which(self) -> np.ndarray:
@@ -341,9 +348,32 @@ class Propagator:
                 np.stack([one[0] for one in every], axis=1),
                 *(np.concatenate([one[part] for one in every], axis=2) for part in (1, 2)),
             )
-            Phi, Gamma = self._transitions(A[:, self._modes], self.lengths[None, :])
-            remember(self._steps, key, Steps(A, B, E, Phi, Gamma), STEPS_KEPT)
+            Phi, Gamma = self._transitions(A, self._modes, self.lengths)
+            remember(self._steps, key, Steps(A, B, E, Phi, Gamma, self._modes), STEPS_KEPT)
         return self._steps[key]
+
+    def _transitions(self, A: Array, modes: np.ndarray, durations: Array) -> tuple[Array, Array]:
+        """``e^{A r}`` and its integral, ``(v, q, d, d)`` each, of ``modes (q,)`` over ``durations (q,)``."""
+        if self._depends:
+            return transitions(A[:, modes], durations[None])
+        found = np.empty((2, 1, durations.size, *A.shape[2:]))
+        for mode in np.unique(modes):
+            mine = modes == mode
+            found[0, 0, mine], found[1, 0, mine] = self.exponentials(mode).transitions(durations[mine])
+        return found[0], found[1]
+
+    @cached_property
+    def _depends(self) -> bool:
+        """Whether the system depends on parameters."""
+        return isinstance(self.system, VaryingSystem) or self.system.parameters is not None
+
+    def exponentials(self, mode: int = 0) -> Exponentials:
+        """Those of a mode of a known system."""
+        if self.propagate is not None:
+            return self.propagate
+        if mode not in self._exponentials:
+            self._exponentials[mode] = Leaps(self.system.modes[mode].matrices(np.zeros((1, 0)))[0][0])
+        return self._exponentials[mode]
 
     def _varying_weights(self, expansion: Expansion, times: Array, directions: Array) -> Weights:
         """`weights` of a system that changes with time, without an input matrix for every index."""
@@ -401,7 +431,7 @@ class Propagator:
         A = expansion.average(self.grid.breakpoints)
         Gamma = np.eye(A.shape[1]) * lengths[:, None, None]
         B, E = (np.hstack(list(part / lengths[:, None, None])) for part in (flow.control, flow.disturbance))
-        return Steps(A[None], B[None], E[None], flow.state[None], Gamma[None])
+        return Steps(A[None], B[None], E[None], flow.state[None], Gamma[None], self._modes)
 
     def _varying_adjoint(
         self, expansion: Expansion, times: Array, directions: Array
@@ -437,74 +467,106 @@ class Propagator:
         """
         if self.expansion is not None:
             return self._varying_adjoint(self.expansion, times, directions)
-        unique, which = unique_rows(parameters)
-        steps = self.steps(unique)
-        pieces = self.grid.locate(times)
-        if self.uniform and not parameters.shape[1] and times.size <= FEW:
-            return self._adjoint_of_few(steps, times, directions, pieces)
-        order = np.argsort(-pieces, kind="stable")
-        within = np.clip(times - self.grid.breakpoints[pieces], 0.0, None)
-        Phi, Gamma = self._partial(steps, which, within, pieces)
-        d = directions.shape[1]
-        rows = np.ascontiguousarray(directions[order], dtype=float)[:, None, :]
-        gains = np.zeros((times.size, self.grid.pieces, d))
-        gains[np.arange(times.size), pieces[order]] = (rows @ Gamma[order])[:, 0]
-        rows = rows @ Phi[order]
-        which, sorted_pieces = which[order], pieces[order]
-        known = steps.Phi.shape[0] == 1
-        last = int(sorted_pieces[0])
-        begun = np.searchsorted(-sorted_pieces, -np.arange(last)).tolist()  # how many functionals reach back to a piece
-        alike = steps.side_by_side[which, 0] if self.uniform and not known else None
-        for piece in range(last - 1, -1, -1):
-            active = begun[piece]
-            if alike is not None:
-                over = alike[:active]
-            else:
-                over = steps.side_by_side[0 if known else which[:active], self.which[piece]]
-            both = rows[:active] @ over
-            gains[:active, piece], rows[:active] = both[:, 0, :d], both[..., d:]
-        back = np.empty_like(order)
-        back[order] = np.arange(order.size)
-        return rows[back, 0], gains[back], steps.B[which[back]], steps.E[which[back]]
+        if self.aged(parameters.shape[1]):
+            free, (gains,) = self._by_age(times, directions, self._every_state)
+            which, steps = np.zeros(times.size, dtype=int), self.steps(np.zeros((1, 0)))
+        else:
+            free, gains, steps, which = self._piece_by_piece(times, directions, parameters, drives=True)
+        return free, gains, steps.B[which], steps.E[which]
 
     @shaped
     def weights(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Weights:
         """The functional ``c'x(t)`` of each index as weights on what is given and on inputs: `adjoint` and
-        `TimeGrid.through`, without ``(k, L, d)`` numbers where the system is known and the pieces are equal."""
+        `TimeGrid.through`, without ``(k, L, d)`` numbers."""
         if self.expansion is not None:
             return self._varying_weights(self.expansion, times, directions)
         if self.aged(parameters.shape[1]):
-            return self._weights_by_age(times, directions)
-        free, gains, B, E = self.adjoint(times, directions, parameters)
-        return Weights(free, self.grid.through(gains, B), self.grid.through(gains, E))
+            channels = self.steps(np.zeros((1, 0))).B.shape[2]
+            free, (control, disturbance) = self._by_age(times, directions, self.inputs, channels)
+            return Weights(free, control, disturbance)
+        free, both, steps, _ = self._piece_by_piece(times, directions, parameters, drives=False)
+        channels = steps.B.shape[2] // steps.A.shape[1]
+        return Weights(free, both[..., :channels], both[..., channels:])
+
+    def _piece_by_piece(
+        self, times: Array, directions: Array, parameters: Array, drives: bool
+    ) -> tuple[Array, Array, Steps, np.ndarray]:
+        """What functionals give to the initial state ``(k, d)`` and to every input on every piece, ``(k, L, m + mw)``,
+        or to what ``drives`` it, ``(k, L, d)``; with the steps at the distinct parameters, and which each has."""
+        unique, which = unique_rows(parameters)
+        steps, pieces = self.steps(unique), self.grid.locate(times)
+        order = np.argsort(-pieces, kind="stable")
+        at, within = pieces[order], np.clip(times - self.grid.breakpoints[pieces], 0.0, None)[order]
+        rows, last = self._inside(steps, which[order], at, directions[order], within)
+        over = steps.driven if drives else steps.pushed
+        if not drives:
+            last = (last[:, None] @ steps.inputs[which[order], self.grid.modes[at]])[:, 0]
+        found = np.zeros((times.size, self.grid.pieces, last.shape[1]))
+        found[np.arange(times.size), at] = last
+        known, width, first = over.shape[0] == 1, last.shape[1], int(at[0]) if at.size else 0
+        begun = np.searchsorted(-at, -np.arange(first)).tolist()  # how many functionals reach back to a piece
+        mine = which[order]
+        alike = over[mine, 0][:, None] if self.uniform and not known else None
+        for piece in range(first - 1, -1, -1):
+            active, length = begun[piece], self.which[piece]
+            if known:
+                both = rows[:active] @ over[0, length]
+            else:
+                each = over[mine[:active], length] if alike is None else alike[:active, 0]
+                both = (rows[:active, None] @ each)[:, 0]
+            found[:active, piece], rows[:active] = both[:, :width], both[:, width:]
+        back = np.empty_like(order)
+        back[order] = np.arange(order.size)
+        return rows[back], found[back], steps, which
+
+    def _inside(
+        self, steps: Steps, which: np.ndarray, pieces: np.ndarray, rows: Array, within: Array
+    ) -> tuple[Array, Array]:
+        """``c'e^{A r}`` and ``c'Gamma(r)``, ``(k, d)`` each, of ``rows (k, d)`` over parts ``within (k,)`` of their
+        pieces: no matrix is made for a time where no parameter is uncertain."""
+        modes = self.grid.modes[pieces]
+        if not self._depends:
+            found = np.empty((2, *rows.shape))
+            for mode in np.unique(modes):
+                mine = modes == mode
+                found[0, mine], found[1, mine] = self.exponentials(mode).rows(rows[mine], within[mine])
+            return found[0], found[1]
+        horizon = self.grid.breakpoints[-1]
+        cases, each = np.unique(np.stack([which, modes, np.round(within / horizon, 15)]), axis=1, return_inverse=True)
+        flows = transitions(steps.A[cases[0].astype(int), cases[1].astype(int)], cases[2] * horizon)
+        flown, driven = ((rows[:, None] @ part[each.reshape(-1)])[:, 0] for part in flows)
+        return flown, driven
 
     def aged(self, parameters: int) -> bool:
         """Whether what a piece gives depends on its age alone, with so many ``parameters``."""
         return not parameters and self.uniform
 
-    def _weights_by_age(self, times: Array, directions: Array) -> Weights:
+    def _by_age(self, times: Array, directions: Array, impulses: Impulses, *ends: int) -> tuple[Array, list[Array]]:
+        """What functionals give to the initial state ``(k, d)`` and to the columns of ``impulses`` on every piece, in
+        parts of these that ``ends`` divide, ``(k, L, c)`` each."""
         pieces, steps = self.grid.locate(times), self.steps(np.zeros((1, 0)))
         rows, entered = self._over_parts(steps, directions, times - self.grid.breakpoints[pieces])
-        count, channels = int(pieces.max(initial=0)), steps.B.shape[2]
+        count = int(pieces.max(initial=0))
         every, signs = np.arange(times.size), np.ones(times.size)
         apart, which = rows, every
-        if times.size > 1 and self.inputs.reach < self.grid.pieces:
+        if times.size > 1 and rows.shape[1] > FEW_STATES:
             # later times are shifts of one impulse response, and an opposite row has the opposite one
             signs = np.where(rows[every, np.abs(rows).argmax(axis=1)] < 0.0, -1.0, 1.0)
-            apart, which = unique_rows(rows * signs[:, None])
-        by_age = self.inputs.of(apart, count)
-        control = np.zeros((times.size, self.grid.pieces, channels))
-        disturbance = np.zeros((times.size, self.grid.pieces, steps.E.shape[2]))
+            apart, which = _apart(rows * signs[:, None])
+        by_age, last = impulses.of(apart, count), entered @ impulses.columns
+        limits = [0, *ends, last.shape[1]]
+        parts = [slice(*pair) for pair in pairwise(limits)]
+        found = [np.zeros((times.size, self.grid.pieces, part.stop - part.start)) for part in parts]
         for number, (piece, row, sign) in enumerate(zip(pieces.tolist(), which.tolist(), signs.tolist(), strict=True)):
             if piece:
                 backwards = by_age[row, piece - 1 :: -1]
-                np.multiply(backwards[:, :channels], sign, out=control[number, :piece])
-                np.multiply(backwards[:, channels:], sign, out=disturbance[number, :piece])
-        last = entered @ self.inputs.columns
-        control[every, pieces], disturbance[every, pieces] = last[:, :channels], last[:, channels:]
-        return Weights(self._leapt(rows, pieces), control, disturbance)
+                for gains, part in zip(found, parts, strict=True):
+                    np.multiply(backwards[:, part], sign, out=gains[number, :piece])
+        for gains, part in zip(found, parts, strict=True):
+            gains[every, pieces] = last[:, part]
+        return self._leapt(rows, pieces), found
 
     @cached_property
     def inputs(self) -> Impulses:
@@ -513,27 +575,13 @@ class Propagator:
         return Impulses(self, np.concatenate([steps.B[0], steps.E[0]], axis=1))
 
     def _over_parts(self, steps: Steps, rows: Array, within: Array) -> tuple[Array, Array]:
-        """``c'e^{A r}`` and ``c'Gamma(r)`` of ``rows (k, d)`` over parts ``within (k,)`` of pieces of a known system,
-        ``(k, d)`` each. Short parts by the exponential series on the rows: no matrix is built."""
+        """``c'e^{A r}`` and ``c'Gamma(r)`` of ``rows (k, d)`` over parts ``within (k,)`` of equal pieces of a known
+        system, ``(k, d)`` each."""
         length, least = float(self.lengths[0]), STEP * float(self.grid.breakpoints[-1])
         whole = np.abs(within - length) <= least
         if whole.all():
             return rows @ steps.Phi[0, 0], rows @ steps.Gamma[0, 0]
-        within = np.where(np.abs(within) <= least, 0.0, np.where(whole, length, within))
-        A = steps.A[0, 0]
-        size = float(np.linalg.norm(A)) * float(within.max())
-        if size > SHORT:
-            return self._jumps.rows(rows, within)
-        if A.shape[0] <= FEW_STATES:  # a table of the series takes fewer calls than the series on the rows
-            powers = (within / length)[:, None] ** np.arange(TERMS)
-            both = (powers @ self._series_of_parts).reshape(within.size, 2, *A.shape)
-            moved = (rows[:, None, None] @ both)[:, :, 0]
-            return moved[:, 0], moved[:, 1] * within[:, None]
-        count = max(1, AT_ONCE // rows.shape[1])
-        if len(rows) <= count:
-            return _series(A, rows, within, size)
-        found = [_series(A, rows[i : i + count], within[i : i + count], size) for i in range(0, len(rows), count)]
-        return np.concatenate([flown for flown, _ in found]), np.concatenate([driven for _, driven in found])
+        return self.exponentials().rows(rows, np.where(np.abs(within) <= least, 0.0, np.where(whole, length, within)))
 
     @shaped
     def backwards(
@@ -543,44 +591,17 @@ class Propagator:
         that are alike together, then over whole ones."""
         (k, r), d = (times.size, directions.shape[0]), directions.shape[1]
         if not self.aged(parameter.size):
-            moved = Leaps(self.steps(parameter[None]).A[0, 0]).rows(np.tile(directions, (k, 1)), np.repeat(times, r))
+            known = Leaps(self.steps(parameter[None]).A[0, 0]) if self._depends else self.exponentials()
+            moved = known.rows(np.tile(directions, (k, 1)), np.repeat(times, r))
             return moved[0].reshape(k, r, d)
         pieces = self.grid.locate(times)
         within, which = self.grid.distinct(np.maximum(times - self.grid.breakpoints[pieces], 0.0))
-        inside = self._jumps.rows(np.tile(directions, (within.size, 1)), np.repeat(within, r))[0]
+        inside = self.exponentials().rows(np.tile(directions, (within.size, 1)), np.repeat(within, r))[0]
         rows = inside.reshape(-1, r, d)[which].reshape(-1, d)
         return self._leapt(rows, np.repeat(pieces, r)).reshape(k, r, d)
 
-    @cached_property
-    def _jumps(self) -> Leaps:
-        """What a known system makes of rows over parts of pieces on which it moves far."""
-        return Leaps(self.steps(np.zeros((1, 0))).A[0, 0])
-
-    @cached_property
-    def _series_of_parts(self) -> Array:
-        """Coefficients ``(TERMS, 2 d^2)`` of ``e^{A r}`` and ``int_0^r e^{A s} ds / r`` in powers of the share of a
-        piece that ``r`` is; for a known system and equal pieces."""
-        A = self.steps(np.zeros((1, 0))).A[0, 0] * self.lengths[0]
-        terms = [np.eye(A.shape[0])]
-        for order in range(1, TERMS):
-            terms.append(terms[-1] @ A / order)
-        return np.array([[one, one / (order + 1)] for order, one in enumerate(terms)]).reshape(TERMS, -1)
-
-    @cached_property
-    def _flown(self) -> Array:
-        """``e^{A i h}`` for ``i = 0, ..., L - 1``, ``(L, d, d)``, each the product of the leaps that it is made of."""
-        flown, done = np.empty((self.grid.pieces, *self.leaps.shape[1:])), 1
-        flown[0] = np.eye(flown.shape[1])
-        for leap in self.leaps:
-            more = min(done, flown.shape[0] - done)
-            flown[done : done + more] = flown[:more] @ leap
-            done += more
-        return flown
-
     def _leapt(self, rows: Array, pieces: np.ndarray) -> Array:
         """``rows (k, d)`` that went on by so many whole ``pieces (k,)``, ``(k, d)``."""
-        if self.propagate is None and self.grid.pieces * rows.shape[1] ** 2 <= FEW_NUMBERS:
-            return np.asarray((rows[:, None] @ self._flown[pieces])[:, 0])
         free, together = rows.copy(), int(pieces[0]) if pieces.size and (pieces == pieces[0]).all() else None
         for place, leap in enumerate(self.leaps[: int(pieces.max(initial=0)).bit_length()]):
             if together is None:
@@ -590,39 +611,6 @@ class Propagator:
                 free = free @ leap
         return free
 
-    def _adjoint_of_few(
-        self, steps: Steps, times: Array, directions: Array, pieces: np.ndarray
-    ) -> tuple[Array, Array, Array, Array]:
-        """`adjoint` of a known system on equal pieces, without a loop over them: what a piece still gives depends on
-        its age only."""
-        within = np.clip(times - self.grid.breakpoints[pieces], 0.0, None)
-        Phi, Gamma = self._partial(steps, np.zeros_like(pieces), within, pieces)
-        rows = np.einsum("kd,kde->ke", directions, Phi)
-        gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
-        by_age = self._every_state.of(rows, int(pieces.max()))
-        for number, piece in enumerate(pieces.tolist()):
-            gains[number, :piece] = by_age[number, :piece][::-1]
-        gains[np.arange(times.size), pieces] = np.einsum("kd,kde->ke", directions, Gamma)
-        free = self._leapt(rows, pieces)
-        return free, gains, np.repeat(steps.B, times.size, axis=0), np.repeat(steps.E, times.size, axis=0)
-
-    def _partial(self, steps: Steps, which: np.ndarray, within: Array, pieces: np.ndarray) -> tuple[Array, Array]:
-        horizon = self.grid.breakpoints[-1]
-        shares = np.round(within / horizon, 15)
-        if steps.A.shape[:2] == (1, 1) and shares.size == 1:
-            return self._transitions(steps.A[:, 0], shares * horizon)
-        if steps.A.shape[:2] == (1, 1):
-            distinct, inverse = np.unique(shares, return_inverse=True)
-            key = distinct.tobytes()
-            if key not in steps.inside:  # mostly nothing or a whole piece, again and again
-                remember(steps.inside, key, self._transitions(steps.A[:, 0], distinct * horizon), INSIDE_KEPT)
-            Phi, Gamma = steps.inside[key]
-        else:
-            modes = np.zeros_like(which) if self.grid.mode is None else self.grid.mode[pieces]
-            cases, inverse = np.unique(np.stack([which, modes, shares]), axis=1, return_inverse=True)
-            Phi, Gamma = self._transitions(steps.A[cases[0].astype(int), cases[1].astype(int)], cases[2] * horizon)
-        return Phi[inverse.reshape(-1)], Gamma[inverse.reshape(-1)]
-
     @property
     def uniform(self) -> bool:
         """Whether all pieces of the grid are equally long, and of one mode."""
@@ -631,7 +619,7 @@ class Propagator:
     def block(self, steps: Steps) -> int:
         """How many equal pieces, a power of two, are taken together where the states of many are asked for; 1: none.
         No more than the system moves little on, so that what a block adds from 0 is not much larger than the states."""
-        if self.grid.pieces < LONG:
+        if self.grid.pieces < 2 * FEWEST:
             return 1
         size = np.abs(steps.A)
         pace = max(float(min(one.sum(axis=0).max(), one.sum(axis=1).max())) for one in size[:, 0])
@@ -652,7 +640,7 @@ class Propagator:
 
     def flows(self, durations: Array) -> tuple[Array, Array]:
         """``e^{A r}`` and its integral ``(k, d, d)`` for durations ``(k,)``; for a known system."""
-        return self._transitions(self.steps(np.zeros((1, 0))).A[0, 0], durations)
+        return self.exponentials().transitions(durations)
 
     def flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
         """`flows` of the systems that act on ``pieces (k,)`` of the grid."""
@@ -661,27 +649,20 @@ class Propagator:
         for mode in np.unique(modes):
             mine = modes == mode
             distinct, which = self.grid.distinct(durations[mine])
-            flow[mine], driven[mine] = (part[which] for part in self._transitions(A[mode], distinct))
+            flow[mine], driven[mine] = (part[which] for part in self.exponentials(mode).transitions(distinct))
         return flow, driven
-
-    def _transitions(self, A: Array, durations: Array) -> tuple[Array, Array]:
-        return (self.propagate or transitions)(A, durations)
 
     @cached_property
     def leaps(self) -> Array:
         """The transitions over 1, 2, 4, ... pieces, ``(q, d, d)``; for a known system and equal pieces."""
-        durations = 2.0 ** np.arange(self.grid.pieces.bit_length()) * self.lengths[0]
-        if self.propagate is not None:
-            return self.flows(durations)[0]
-        answer: Array = exponential(self.steps(np.zeros((1, 0))).A[0, 0] * durations[:, None, None])
-        return answer
+        return self.flows(2.0 ** np.arange(self.grid.pieces.bit_length()) * self.lengths[0])[0]
 
     def leaps_of(self, steps: Steps, count: int) -> list[Array]:
         """The transposed transitions ``(v, d, d)`` over 1, 2, 4, ... equal pieces, ``count`` of them."""
         if self.system.parameters is None and steps.A.shape[:2] == (1, 1):
             return [leap.T[None] for leap in self.leaps[:count]]
         durations = 2.0 ** np.arange(count) * self.lengths[0]
-        flows = self._transitions(steps.A[:, :1], durations[None])[0]
+        flows = self._transitions(steps.A, np.zeros(count, dtype=int), durations)[0]
         return [np.swapaxes(flows[:, place], 1, 2) for place in range(count)]
 
     @cached_property
@@ -737,7 +718,8 @@ class Outputs:
         pieces, durations, which = self.within
         if self.propagator.expansion is None and steps.A.shape[:2] == (1, 1):
             rows = np.tile(self.H, (durations.size, 1))
-            both = Leaps(steps.A[0, 0]).rows(rows, np.repeat(durations, self.H.shape[0]))
+            known = Leaps(steps.A[0, 0]) if self.points.shape[1] else self.propagator.exponentials()
+            both = known.rows(rows, np.repeat(durations, self.H.shape[0]))
             flown, driven = (part.reshape(1, durations.size, *self.H.shape) for part in both)
             return flown, driven
         if grid.mode is None:
@@ -759,9 +741,9 @@ class Outputs:
 
     def at(self, response: Response, control: Array) -> Array:
         """``(v, r, T)`` from the initial state of a response, under a control ``(m, K)`` on its own pieces."""
-        if self.propagator.aged(self.points.shape[1]) and self.propagator.grid.pieces >= LONG:
-            return self._in_blocks(response.initial_state, self.propagator.grid.inputs(control))[None]
         steps, grid = self.propagator.steps(self.points), self.propagator.grid
+        if self.propagator.aged(self.points.shape[1]) and self.propagator.block(steps) > 1:
+            return self._in_blocks(response.initial_state, grid.inputs(control))[None]
         if self._over_pieces is not None:
             flow, driven = self._over_pieces
             nodes, inputs = response.nodes(control, self.points)[0], grid.inputs(control).T
@@ -846,7 +828,7 @@ class Response:
     system: System
     grid: TimeGrid
     initial_state: Array
-    propagate: Transitions | None = None
+    propagate: Exponentials | None = None
     shared: Propagator | None = field(default=None, repr=False)
 
     @cached_property
@@ -884,7 +866,7 @@ class Response:
     def numbers(self, parameters: int) -> int:
         """How many numbers `weights` of one index make at once, with so many ``parameters``."""
         system, grid = self.system, self.grid
-        width = system.controls + system.disturbances if self.propagator.aged(parameters) else system.states
+        width = system.states if parameters else system.controls + system.disturbances
         return int(grid.pieces * width)
 
     def flows(self, durations: Array) -> tuple[Array, Array]:
@@ -1004,21 +986,6 @@ def _moved(states: Array, leap: Array) -> Array:
     return np.asarray(states.reshape(states.shape[0], -1, states.shape[3]) @ leap).reshape(states.shape)
 
 
-def _series(A: Array, rows: Array, times: Array, size: float) -> tuple[Array, Array]:
-    """``c'e^{A r}`` and ``c'int_0^r e^{A s} ds`` of ``rows (k, d)`` over ``times (k,)``, where ``|A r|`` is at most
-    ``size``."""
-    longest, terms, bound = float(times.max(initial=0.0)), [rows], 1.0
-    step = A * longest
-    while bound > SERIES:
-        bound *= size / len(terms)
-        terms.append(terms[-1] @ step / len(terms))
-    shares = (times[:, None] / (longest or 1.0)) ** np.arange(len(terms))
-    stacked = np.array(terms)
-    flown = np.einsum("kj,jkd->kd", shares, stacked)
-    driven = np.einsum("kj,jkd->kd", shares / np.arange(1, len(terms) + 1), stacked)
-    return flown, driven * times[:, None]
-
-
 @shaped
 def unique_rows(rows: Float[Array, "k n"]) -> tuple[Float[Array, "u n"], Int[np.ndarray, " k"]]:
     """The rows without copies, in increasing order, and which of them every row is.
@@ -1027,9 +994,17 @@ def unique_rows(rows: Float[Array, "k n"]) -> tuple[Float[Array, "u n"], Int[np.
     """
     if rows.shape[1] == 0 or rows.shape[0] == 1:
         return rows[:1], np.zeros(rows.shape[0], dtype=int)
+    distinct, met = _apart(rows)
+    unique, which = np.unique(distinct, axis=0, return_inverse=True)
+    return unique, which.reshape(-1)[met]
+
+
+def _apart(rows: Array) -> tuple[Array, np.ndarray]:
+    """The rows without copies, in the order in which they come first, and which of them every row is."""
     apart: dict[bytes, int] = {}
     met = np.array([apart.setdefault(row.tobytes(), len(apart)) for row in rows + 0.0], dtype=int)  # of zeros one
+    if len(apart) == len(rows):
+        return rows, met
     first = np.empty(len(apart), dtype=int)
     first[met[::-1]] = np.arange(met.size)[::-1]
-    unique, which = np.unique(rows[first], axis=0, return_inverse=True)
-    return unique, which.reshape(-1)[met]
+    return rows[first], met

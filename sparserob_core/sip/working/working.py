@@ -20,11 +20,11 @@ from sparserob_core.sip.result import SMALL_COST, Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above
 
-# The least margin but 0, and the largest, in units of the decision's bounds where those are below 1. A least one that
-# is a thousand times larger is more than a gap of 1e-10 pays for where rows are dear; one that is smaller is below
-# rounding. A largest one that is ten times smaller does not get beyond what solvers leave of a row (1e-7 at worst); one
-# that is ten times larger is seen in the sixth digit of a cost.
-SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6
+# The least margin but 0, and the largest, in units of the decision's bounds where those are below 1. The least one is
+# the rounding of rows: one that is five times larger costs most of the tolerated gap where rows are as dear as a
+# million, a smaller one is not seen. A largest one that is ten times smaller does not get beyond what solvers leave of
+# a row (1e-7 at worst); one that is ten times larger is seen in the sixth digit of a cost.
+SMALLEST_MARGIN, LARGEST_MARGIN = 2.0**-52, 1e-6
 # Share of a margin that leaves nothing feasible, which is tried next. With a tenth for it a set as thin as 1e-8 takes
 # three times as many programs; with a millionth for it the margin of such a set is below what solvers leave.
 THINNER = 1e-3

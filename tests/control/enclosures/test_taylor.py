@@ -187,7 +187,7 @@ def test_the_transitions_of_the_coefficients_are_those_of_the_lifted_matrix(nu, 
     A, durations = rng.normal(size=(space.size, 3, 3)), np.array([0.0, 0.3, 2.0])
     matrix = lifted_matrix(space, A, rows)
     for found, expected in zip(
-        lifted_transitions(space, A, rows)(matrix, durations), transitions(matrix, durations), strict=True
+        lifted_transitions(space, A, durations, rows), transitions(matrix, durations), strict=True
     ):
         assert np.allclose(found, expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
 

@@ -368,10 +368,8 @@ def test_states_and_rows_are_as_near_to_the_truth_as_spans_of_many_pieces_say(na
     """The truth is an exponential in balls of 400 bits. In blocks: states through a tree of parts, rows by age."""
     monkeypatch.setattr(lifted_module, "SPANS", 12)
     if blocks:
-        monkeypatch.setattr(response_module, "LONG", 1)
         monkeypatch.setattr(response_module, "FEWEST", 7)
         monkeypatch.setattr(response_module, "LITTLE", np.inf)
-        monkeypatch.setattr(response_module, "KERNEL", 0)
     functionals, lifting = known(name, "equal")
     lifted, A = lifting(), np.array(KNOWN[name][0])
     d, breaks = A.shape[0], functionals.response.grid.breakpoints

@@ -19,7 +19,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response import functional
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import lift
-from sparserob_core.control.response.response import FEW, Response, merge_grids
+from sparserob_core.control.response.response import Propagator, Response, merge_grids
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, simulated, uniform, walsh, worst_case
 
@@ -198,10 +198,10 @@ def test_ages_are_powers_of_the_transition():
 
 @pytest.mark.parametrize("states", [1, 2, 4])
 def test_functionals_asked_for_one_by_one_are_those_asked_for_all_at_once(states):
-    """Few of them are read off the kernel, many are carried from piece to piece; at breakpoints and ends too."""
+    """At breakpoints and ends too."""
     rng, breaks = np.random.default_rng(states), np.linspace(0, 2, 12)
     response = Response(random_system(rng, states), merge_grids(breaks, breaks), np.zeros(states))
-    times = np.concatenate([breaks, rng.uniform(0, 2, FEW)])
+    times = np.concatenate([breaks, rng.uniform(0, 2, 128)])
     given = (times, rng.normal(size=(times.size, states)), np.zeros((times.size, 0)))
     every = response.adjoint(*given)
     for one in range(times.size):
@@ -210,15 +210,16 @@ def test_functionals_asked_for_one_by_one_are_those_asked_for_all_at_once(states
 
 
 @pytest.mark.parametrize("states", [1, 4])
-def test_what_pieces_of_every_age_give_is_the_same_with_and_without_the_kernel(states):
+def test_what_pieces_give_by_their_age_is_what_rows_give_from_piece_to_piece(states):
     rng, breaks = np.random.default_rng(states), np.linspace(0, 2, 54)
     times, directions = rng.uniform(0, 2, 20), rng.normal(size=(20, states))
     times[:3] = 0.0, breaks[32], 2.0
     system, found = random_system(rng, states), []
-    for most in (0, 10**9):
-        with patch("sparserob_core.control.response.response.KERNEL", most):
+    given = times, directions, np.zeros((20, 0))
+    for aged in (True, False):
+        with patch.object(Propagator, "aged", lambda *_, aged=aged: aged):
             response = Response(system, merge_grids(breaks, breaks), np.zeros(states))
-            found.append(response.adjoint(times, directions, np.zeros((20, 0))))
+            found.append([*response.adjoint(*given), *response.weights(*given)])
     for one, other in zip(*found, strict=True):
         assert np.allclose(one, other, rtol=1e-12, atol=1e-13)
 
@@ -311,28 +312,20 @@ def test_states_in_blocks_are_those_of_the_recursion(states: int, pieces: int, m
     none = np.zeros((1, 0))
     assert response.propagator.block(response.steps(none)) > 1
     fast = response.states(control, none, disturbance)
-    with patch("sparserob_core.control.response.response.LONG", 10**9):
+    with patch("sparserob_core.control.response.response.FEWEST", 10**9):
         plain = response.states(control, none, disturbance)
     np.testing.assert_allclose(fast, plain, rtol=0.0, atol=1e-12 * np.abs(plain).max())
 
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10**6), states=st.integers(1, 8), pieces=st.integers(1, 60))
-def test_tables_of_few_states_weigh_as_the_series_on_rows_and_the_exponential_do(seed, states, pieces):
+def test_what_an_initial_state_gives_is_the_exponential(seed, states, pieces):
     rng = np.random.default_rng(seed)
     A, horizon = rng.normal(size=(states, states)) / np.sqrt(states), 3.0
     times, directions = rng.uniform(0.0, horizon, 5), rng.normal(size=(5, states))
     grid = np.linspace(0.0, horizon, pieces + 1)
 
-    def weights():
-        response = Response(LinearSystem(A, np.eye(states)), merge_grids(grid, grid), np.zeros(states))
-        return response.weights(times, directions, np.zeros((5, 0)))
-
-    by_table = weights()
-    home = "sparserob_core.control.response.response"
-    with patch(f"{home}.FEW_STATES", 0), patch(f"{home}.FEW_NUMBERS", 0):
-        by_rows = weights()
-    for one, other in zip(by_table, by_rows, strict=True):
-        assert np.abs(one - other).max() <= 1e-13 * np.abs(other).max()
+    response = Response(LinearSystem(A, np.eye(states)), merge_grids(grid, grid), np.zeros(states))
+    free = response.weights(times, directions, np.zeros((5, 0))).free
     exact = np.stack([expm(A.T * t) @ c for t, c in zip(times, directions, strict=True)])
-    assert np.abs(by_table.free - exact).max() <= 1e-12 * np.abs(exact).max()
+    assert np.abs(free - exact).max() <= 1e-12 * np.abs(exact).max()
