@@ -51,9 +51,13 @@ TINY = float(np.finfo(float).tiny)
 TABLES_KEPT = 4096  # directions and parameters whose integrals are remembered
 MOST_SHORT = 4096  # intervals that one is cut into before any is halved
 HALVINGS = 48  # of an interval across a kink of the integrand: what is left of it is below rounding
-AT_ONCE = 4_000_000  # numbers of polynomials, or of remembered lengths, that are made at once (32 MB)
+# numbers of polynomials, or of remembered lengths, that are made at once, or of kernels that are remembered (32 MB)
+AT_ONCE = 4_000_000
 KEPT = 8  # tables of lengths at sampled times, one for each constraint
 UNIT = Box([-1.0], [1.0])
+CUTS = 3  # at changes of a sign, before an interval is halved: a polynomial across a piece changes it once or twice
+SECANTS = 10  # steps to where a sign changes; with half of them what is left of a part is halved some times
+NEAR_END = 1e-9  # of an interval, from its ends: where a sign changes nearer to one, it is halved
 STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it shows what integrals are rounded to
 # Of the horizon: ages that differ by less are one where nothing is proven. Ten times as much would be seen in a
 # violation of 1e-9, a tenth of it is below what the difference of two times rounds to.
@@ -410,6 +414,53 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
     return total
 
 
+def absolute(terms: Array, accuracy: Array) -> Array:
+    """Lower and upper bounds ``(l, 2)`` of the integrals over ``[0, 1]`` of absolute values of polynomials with ``terms
+    (l, p + 1)``, as those of `integrated`, but cut where they change their signs: what is left of both parts is settled
+    at once, where halves would be cut some twenty times. Wherever they are cut, the bounds hold."""
+    total, owner = np.zeros((len(terms), 2)), np.arange(len(terms))
+    order = terms.shape[1] - 1
+    points, lengths = terms @ bezier(order).T, np.ones(len(terms))
+    for turn in range(HALVINGS + 1):
+        low, high = np.abs(points.mean(axis=1)) * lengths, np.abs(points).mean(axis=1) * lengths
+        open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
+        np.add.at(total, owner[~open_], np.stack([low, high], axis=1)[~open_])
+        points, owner, lengths = points[open_], np.tile(owner[open_], 2), lengths[open_]
+        if not owner.size:
+            break
+        at = _sign_changes(points) if turn < CUTS else np.full(len(points), 0.5)
+        points, lengths = _cut(points, at), np.concatenate([lengths * at, lengths * (1.0 - at)])
+    return total
+
+
+def _sign_changes(points: Array) -> Array:
+    """About where polynomials with Bernstein's coefficients ``points (l, p + 1)`` change their signs, ``(l,)``, by
+    secants of which the older end counts half (Illinois); the middle where both ends have one sign."""
+    order = points.shape[1] - 1
+    weights, powers = np.array([comb(order, k) for k in range(order + 1)]) * points, np.arange(order + 1)
+    a, b, fa, fb = np.zeros(len(points)), np.ones(len(points)), points[:, 0], points[:, -1]
+    crossing, at = fa * fb < 0.0, np.full(len(points), 0.5)
+    for _ in range(SECANTS):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = b - fb * (b - a) / (fb - fa)
+        at = np.where(crossing & (found > NEAR_END) & (found < 1.0 - NEAR_END), found, 0.5)
+        value = (weights * at[:, None] ** powers * (1.0 - at[:, None]) ** powers[::-1]).sum(axis=1)
+        turned = value * fb < 0.0
+        a, fa = np.where(turned, b, a), np.where(turned, fb, fa / 2.0)
+        b, fb = at, value
+    return at
+
+
+def _cut(points: Array, at: Array) -> Array:
+    """Bernstein's coefficients ``(l, p + 1)`` on both sides of ``at (l,)``, the first parts first (de Casteljau)."""
+    left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
+    share, rest = at[:, None], 1.0 - at[:, None]
+    for order in range(last + 1):
+        left[:, order], right[:, last - order] = row[:, 0], row[:, -1]
+        row = rest * row[:, :-1] + share * row[:, 1:]
+    return np.concatenate([left, right])
+
+
 @cache
 def bezier(order: int) -> Array:
     """From powers on ``[0, 1]`` to the coefficients of Bernstein's form, ``(order + 1, order + 1)``."""
@@ -733,6 +784,7 @@ class VaryingExecution(Execution):
     disturbing: bool = False
     before: Array | None = None
     _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
+    _ways: dict[bytes, tuple[Array, Kernel]] = field(default_factory=dict, repr=False)
 
     def none(self) -> VaryingExecution:
         """`Execution.none`; what is remembered is of these shares."""
@@ -863,8 +915,8 @@ class VaryingExecution(Execution):
         steps = motion.flow.state
         place = np.clip(np.searchsorted(grid.breakpoints, times, side="left") - 1, 0, grid.pieces - 1)
         distinct, where = np.unique(np.stack([times, grid.breakpoints[place]]), axis=1, return_inverse=True)
-        until, where = np.maximum(*distinct), where.reshape(-1)
-        begun = motion.expansion.flow(distinct[1], until).state
+        where = where.reshape(-1)
+        begun, kernel = self._begun(distinct)
         row, rows = np.zeros(directions.shape), np.empty((times.size, *directions.shape[1:], grid.pieces))
         first = np.einsum("ki,kij->kj", directions, begun[where])
         for k in range(int(place.max()) - 1, int(pieces[0]) - 1, -1):  # rows on the end of every piece
@@ -875,9 +927,18 @@ class VaryingExecution(Execution):
         piece = pieces[which]
         yield who, piece, self._along(self.kernel, piece, rows[who, :, piece], asked[:, self.acting[piece]])
         here = np.flatnonzero(np.isin(place, pieces) & np.greater(times, grid.breakpoints[place]))
-        kernel = motion.expansion.kernel(distinct[1], until)
         piece = place[here]
         yield here, piece, self._along(kernel, where[here], directions[here], asked[:, self.acting[piece]])
+
+    def _begun(self, distinct: Array) -> tuple[Array, Kernel]:
+        """Of times, and the breakpoints before them, ``(2, k)``: the transitions from these, ``(k, d, d)``, and the
+        kernel on the way; remembered, since the same times are asked for in many directions."""
+        key = distinct.tobytes()
+        if key not in self._ways:
+            until, expansion = np.maximum(*distinct), self.motion.expansion
+            found = expansion.flow(distinct[1], until).state, expansion.kernel(distinct[1], until)
+            remember(self._ways, key, found, max(1, AT_ONCE // (found[0].size + found[1].terms.size)))
+        return self._ways[key]
 
     def _along(self, kernel: Kernel, which: np.ndarray, rows: Array, asked: np.ndarray) -> Array:
         """Bounds ``(q, m, 2)`` of what intervals ``which (q,)`` of a kernel make of ``rows (q, d)`` on their ends, of
@@ -886,13 +947,14 @@ class VaryingExecution(Execution):
         sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which])
         lost = np.einsum("qd,qdm->qm", np.abs(rows) * units, kernel.sizes[which][..., columns])
         lost = lost * kernel.error[which, None]
-        lost = lost + rounding(rows.shape[1] + 2 * kernel.terms.shape[1] + HALVINGS) * sizes
+        # a cut rounds every coefficient four times for every order; halves, of half the length each, twice in all
+        lost = lost + rounding(rows.shape[1] + (2 + 4 * CUTS) * kernel.terms.shape[1] + HALVINGS) * sizes
         bounds = np.zeros((which.size, m, 2))
         for j, share in enumerate(self.shares):
             mine = np.flatnonzero(asked[j])
-            terms = np.einsum("qd,qpd->qp", rows[mine], kernel.terms[which[mine], :, :, columns[j]])[..., None]
+            terms = np.einsum("qd,qpd->qp", rows[mine], kernel.terms[which[mine], :, :, columns[j]])
             accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes[mine, j], TINY)
-            found = integrated(UNIT, terms, np.ones(mine.size), accuracy)
+            found = absolute(terms, accuracy)
             found = found + lost[mine, j, None] * [-1.0, 1.0]
             bounds[mine, j] = share * np.maximum(found, 0.0) * [1.0 / OUTWARD, OUTWARD]
         return bounds

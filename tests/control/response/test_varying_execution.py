@@ -3,6 +3,8 @@ forms, an integrator and the constant system; enclosed on cells of time, also wh
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
@@ -11,7 +13,12 @@ import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.problem.system import System, VaryingSystem
-from sparserob_core.control.response.measurable import Execution, VaryingExecution, VaryingExecutionCellSupport
+from sparserob_core.control.response.measurable import (
+    Execution,
+    VaryingExecution,
+    VaryingExecutionCellSupport,
+    absolute,
+)
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 from sparserob_core.sip.convex_set import Array
@@ -230,3 +237,26 @@ def test_the_bound_of_a_constraint_holds_on_every_cell_and_closes() -> None:
     assert isinstance(one, FlatConstraint)
     x = np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()])
     assert_bounded_on_cells(one, x)
+
+
+def test_integrals_of_absolute_values_are_enclosed_whatever_signs_the_polynomials_have() -> None:
+    rng = np.random.default_rng(3)
+    terms = rng.normal(size=(40, 9)) / (1.0 + np.arange(9))
+    terms[0], terms[1] = 0.0, np.eye(9)[1] - 0.25 * np.eye(9)[0]  # nothing, and u - 1/4, of which |.| is 5/16
+    terms[2] = 0.25 * np.eye(9)[0] - np.eye(9)[1] + np.eye(9)[2]  # (u - 1/2)^2, which changes no sign
+    sizes = np.abs(terms).sum(axis=1)
+    found = absolute(terms, np.maximum(1e-14 * sizes, 1e-300))
+    points = (np.arange(40_000) + 0.5) / 40_000
+    sampled = np.abs(np.polynomial.polynomial.polyval(points, terms.T)).mean(axis=1)
+    assert (np.abs(found - sampled[:, None]) <= 1e-7).all()
+    assert (found[:, 0] <= found[:, 1]).all() and (found[:, 1] - found[:, 0] <= 1e-13 * sizes + 1e-300).all()
+    assert found[:3].mean(axis=1) == pytest.approx([0.0, 5.0 / 16.0, 1.0 / 12.0], abs=1e-15)
+
+
+def test_what_is_remembered_of_times_is_what_was_made_of_them() -> None:
+    execution = model(VaryingSystem.of(*MATHIEU, HORIZON)).functionals.execution
+    assert isinstance(execution, VaryingExecution)
+    for c in ([1.0, 0.0], [0.0, 1.0], [1.0, 0.0]):
+        at = TIMES, np.tile(c, (TIMES.size, 1))
+        again = replace(execution, _ways={}, _lengths={})
+        assert (execution.lengths(*at) == again.lengths(*at)).all()
