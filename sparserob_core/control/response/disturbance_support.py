@@ -8,11 +8,10 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_of
-from sparserob_core.control.enclosures.taylor import Face, TaylorSpace
+from sparserob_core.control.enclosures.taylor import Combination, Face, TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem, Past
 from sparserob_core.control.response.response import Impulses

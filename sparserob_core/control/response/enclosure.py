@@ -16,7 +16,6 @@ from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
-from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import (
@@ -26,7 +25,7 @@ from sparserob_core.control.enclosures.polynomial import (
     polynomial_bound,
     quadratic_part,
 )
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.reference import Direct, Moving

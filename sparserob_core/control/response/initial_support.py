@@ -9,9 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.response.disturbance_support import Carried, carried, over_faces, summed
 from sparserob_core.control.response.lifted import KNOWN, LiftedSystem
 from sparserob_core.sip.convex_set import Array, ConvexSet

@@ -16,10 +16,9 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import over_faces, summed
 from sparserob_core.control.response.response import Propagator, TimeGrid

@@ -11,9 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from sparserob_core.control.enclosures.combination import combination
 from sparserob_core.control.enclosures.polynomial import face_of
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.taylor import TaylorSpace, combination
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.response.disturbance import disturbance_model
 from sparserob_core.control.response.disturbance_support import summed
