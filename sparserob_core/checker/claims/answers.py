@@ -20,6 +20,7 @@ from sparserob_core.checker.reach.effort import at_most
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import LoopBeside, MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along
@@ -121,7 +122,7 @@ class Answers:
             return LoopBeside(
                 *parts, beside=MeasurableLoop.alone(case.problem, parts[4], parts[5], case.control.pieces)
             )
-        if case.changing is not None:
+        if isinstance(case.changing, VaryingFlow):
             return VaryingLoop(*parts, law=case.changing)
         return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(*parts)
 

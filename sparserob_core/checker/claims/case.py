@@ -26,9 +26,11 @@ from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates
 from sparserob_core.checker.reach.varying.turns import in_turns
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
+from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -72,7 +74,8 @@ class Case:
             object.__setattr__(self, "problem", self._returning(self.problem))
         plain = in_turns(spelt(self.problem))
         known = parted(plain)
-        if known is not plain and self.policy is not None:
+        uncertain = isinstance(known.system, VaryingSystem) and known.system.parameters is not None
+        if (known is not plain or uncertain) and self.policy is not None:
             raise Unchecked("the checker knows no feedback beside parameters and the time")
         object.__setattr__(self, "problem", in_turns(integrating(known)))
         if self.problem.disturbance_breakpoints is not None:
@@ -267,17 +270,24 @@ class Case:
         return min(bisect_right(self.grid, time) - 1, len(self.grid) - 2)
 
     @cached_property
-    def varying(self) -> VaryingFlow:
-        """The flow of a system that changes with time; raises `Unchecked` for another one."""
+    def varying(self) -> VaryingFlow | SpreadFlow:
+        """The flow of a system that changes with time, over all of its parameters where these are no coordinates of its
+        state; raises `Unchecked` for another one."""
         system = self.problem.system
         if not isinstance(system, VaryingSystem):
             raise Unchecked("the system does not change with time")
-        return VaryingFlow(system, self.grid[-1])
+        return (VaryingFlow if system.parameters is None else SpreadFlow)(system, self.grid[-1])
 
     @property
-    def changing(self) -> VaryingFlow | None:
+    def changing(self) -> VaryingFlow | SpreadFlow | None:
         """`varying`; ``None`` where the system does not change with time."""
         return self.varying if isinstance(self.problem.system, VaryingSystem) else None
+
+    @cached_property
+    def spread(self) -> SpreadStates:
+        """All coefficients of the states over the parameters of a system that changes with time."""
+        assert isinstance(self.varying, SpreadFlow)
+        return SpreadStates(self.varying, self.scene)
 
     @cached_property
     def acting(self) -> list[float]:
@@ -391,6 +401,10 @@ class Case:
         half, ends = least + (most - least) / 2.0, np.array([0.0, self.grid[-1]])
         off = np.nextafter(np.maximum(most - half, half - least), np.inf)
         first = system.controls + (system.c is not None)
+        if not isinstance(self.changing, VaryingFlow):
+            raise Unchecked(
+                "the checker knows no measurable disturbances beside parameters that states are expanded in"
+            )
         return VaryingExecution(
             self.changing, half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off
         )
@@ -406,7 +420,7 @@ class Case:
         if system.parameter_count or self.answering:
             raise Unchecked("the checker knows errors of execution of known systems, without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
-        if self.changing is not None:
+        if isinstance(self.changing, VaryingFlow):
             acts = self.control.breakpoints
             if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
                 begins = acts[:-1] + system.delay
@@ -471,7 +485,9 @@ class Case:
 
     @cached_property
     def price(self) -> Price:
-        return Price(self.problem, self.control, self.clock, self.changing)
+        bound, changing = self.problem.system.parameters, self.changing
+        nominal = [] if bound is None else nominal_point(bound).tolist()
+        return Price(self.problem, self.control, self.clock, None if changing is None else changing.at(nominal))
 
     @cached_property
     def motion(self) -> Motion:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,8 @@ from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadTube
 from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
@@ -330,6 +333,9 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
     if case.looped:
         loop_tube = LoopTube(answers_of(case).loop, basis, gains)
         return lambda _: loop_tube
+    if isinstance(case.changing, SpreadFlow):
+        states = case.spread
+        return lru_cache(maxsize=TUBES_KEPT)(lambda box: SpreadTube(states, basis, box))
     if case.changing is not None:
         known_tube = VaryingTube(case.changing, case.scene, basis)
         return lambda _: known_tube
@@ -389,12 +395,14 @@ def missed(case: Case) -> list[tuple[arb, float]]:
 
 def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
     """The final state ``(d, 1)`` where no uncertainty reaches what is fixed of it, whatever the control."""
+    if isinstance(case.changing, SpreadFlow):
+        raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
     for state, _ in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
     middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
     basis = np.eye(case.problem.system.states)
-    if case.changing is not None:
+    if isinstance(case.changing, VaryingFlow):
         return list(VaryingTube(case.changing, scene, basis).nodes[-1].tolist())
     return list(Tube(flows(case.problem.system, middle), scene, basis).nodes[-1].parts[0].tolist())
 
@@ -412,7 +420,7 @@ def _reached(case: Case, state: int) -> bool:
     wide = _hull(case)
     every = (
         [case.changing.links]
-        if case.changing is not None
+        if isinstance(case.changing, VaryingFlow)
         else [expanded(mode, Monomials(len(wide), 1), wide, [1.0] * len(wide)) for mode in system.modes]
     )
     d, reaching = system.states, {state}

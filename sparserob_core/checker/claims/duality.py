@@ -22,6 +22,7 @@ from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
 from sparserob_core.checker.reach.lasting import Lasting, summed
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.spread import SpreadFlow
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -65,7 +66,7 @@ class Duality:
     problem: OptimalControlProblem
     control: Dictionary
     changes: list[float] | None
-    varying: VaryingFlow | None = None
+    varying: VaryingFlow | SpreadFlow | None = None
     held: ConvexSet | None = None
     lasting: Lasting | None = None
     _steps: dict[tuple[tuple[float, ...], int, tuple[float, float]], arb_mat] = field(default_factory=dict, repr=False)
@@ -111,7 +112,7 @@ class Duality:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
         it."""
         if self.varying is not None:
-            return self._varying_row(self.varying, direction, time, limit, disturbed)
+            return self._varying_row(self.varying.at(parameter), direction, time, limit, disturbed)
         every, delay = flows(self.problem.system, parameter), self.problem.system.delay
         parts = every[0].parts
         d, m, columns = parts["A"][0].nrows(), self.problem.system.controls, parts["B"][0].ncols()
@@ -138,7 +139,7 @@ class Duality:
         return Row(constant, slope)
 
     def _varying_row(self, flow: VaryingFlow, direction: Array, time: float, limit: arb, disturbed: bool) -> Row:
-        """`row` of a system that changes with time, which is known."""
+        """`row` of a system that changes with time, at a parameter that is known."""
         m, problem = self.problem.system.controls, self.problem
         delay, jumps = problem.system.delay, self.changes or []
         breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
@@ -174,7 +175,7 @@ class Duality:
             return []
         if self.varying is not None:
             begins = sorted({0.0, *(s for s in jumps if s < time)})
-            weights, row = self.varying.weights([*begins, time]), stacked([[_exact(c) for c in direction]])
+            weights, row = self.varying.at(()).weights([*begins, time]), stacked([[_exact(c) for c in direction]])
             given = {s: (row * one).entries() for s, one in zip(begins, weights.disturbance, strict=True)}
             late = [_exact(0.0)] * self.problem.system.disturbances
             return [given[s] if s < time else late for s in jumps]
@@ -188,7 +189,7 @@ class Duality:
         """What the initial state of a known system gives to ``c'x(t)``, ``(d,)``."""
         if self.varying is not None:
             row = stacked([[_exact(c) for c in direction]])
-            return list((row * self.varying.weights([0.0, time]).free).entries())
+            return list((row * self.varying.at(()).weights([0.0, time]).free).entries())
         return self._lags(flows(self.problem.system, ()), direction, time, {0.0})[0.0][: direction.size]
 
     def _lags(self, every: Sequence[Flow], direction: Array, time: float, since: set[float]) -> dict[float, list[arb]]:

@@ -44,7 +44,7 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     from flint import arb, arb_mat
 
     if case.changing is not None:
-        return _changed(case, case.changing, time, signal, deviation)
+        return _changed(case, case.changing.at(parameter.tolist()), time, signal, deviation)
     every = [flow.parts for flow in flows(case.problem.system, parameter.tolist())]
     wanted = case.problem.disturbance is not None
     w = _admissible(case, signal) if wanted else None
@@ -225,7 +225,7 @@ def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains
         return LoopTube(answers_of(case).loop, basis, gains)
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
     if case.changing is not None:
-        return VaryingTube(case.changing, scene, basis)
+        return VaryingTube(case.changing.at(parameter.tolist()), scene, basis)
     return Tube(flows(case.problem.system, parameter.tolist()), scene, basis)
 
 

@@ -15,6 +15,7 @@ from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, flows, held, stacked
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.spread import SpreadFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -58,7 +59,7 @@ class RowUnits:
     stop: float
     reference: Array | None = None
     acting: Array | None = None
-    varying: VaryingFlow | None = None
+    varying: VaryingFlow | SpreadFlow | None = None
 
     @cached_property
     def rows(self) -> Array:
@@ -216,7 +217,7 @@ class _Steps:
     parameter: tuple[float, ...]
     controls: int
     tick: float
-    varying: VaryingFlow | None
+    varying: VaryingFlow | SpreadFlow | None
     _known: dict[tuple[int, int], tuple[Array, Array, Array]] = field(default_factory=dict)
 
     def over(self, start: float, stop: float, leg: int) -> tuple[Array, Array, Array]:
@@ -225,7 +226,7 @@ class _Steps:
         from flint import arb
 
         if self.varying is not None:
-            Phi, Gamma, Delta = self.varying.over(start, stop)
+            Phi, Gamma, Delta = self.varying.at(self.parameter).over(start, stop)
             return _floats(Phi), _floats(Gamma), _floats(Delta)
         key = (leg, round((stop - start) / self.tick))
         if key not in self._known:

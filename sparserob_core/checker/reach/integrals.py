@@ -152,7 +152,7 @@ def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> Sy
         begin = until
     if isinstance(system, VaryingSystem):
         laws = [(start, law) for start, (_, law) in zip(begins, pieces, strict=False)]
-        return VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:]))
+        return VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:]), system.parameters)
     return SwitchedSystem(pieces, system.delay) if len(pieces) > 1 else replace(pieces[0][1], delay=system.delay)
 
 

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from sparserob_core.control.problem.terms.windows import PathConstraint
 
 NAMES = ("A", "B", "E", "c")
-FREE = -1  # the key of what no parameter multiplies
+FREE: tuple[int, ...] = ()  # the key of what no parameter multiplies; others are the numbers of those that do, in order
+MOST_FACTORS = 8  # parameters of which one product may be made; expansions of such systems have hundreds of parts
 
 
 @final
@@ -51,11 +52,12 @@ class Something:
 
 @final
 class Sum:
-    """``parts[FREE] + sum_j parts[j] s_j``; ``bent``: it is, or may be, something else."""
+    """A polynomial in the shares ``s_j``: each of the ``parts`` times those whose numbers are its key; ``bent``: it is,
+    or may be, something else."""
 
     __slots__ = ("bent", "parts")
 
-    def __init__(self, parts: dict[int, Any], bent: bool = False) -> None:
+    def __init__(self, parts: dict[tuple[int, ...], Any], bent: bool = False) -> None:
         self.parts, self.bent = parts, bent
 
     @property
@@ -85,12 +87,14 @@ class Sum:
         return Sum._of(other) + -self
 
     def __mul__(self, other: object) -> Sum:
-        more = Sum._of(other)
-        whole, factor = (self, more) if more.is_free else (more, self)
-        if not factor.is_free:
-            return Sum(self.parts, True)
-        by = factor.parts[FREE]
-        return Sum({key: value * by for key, value in whole.parts.items()}, whole.bent)
+        more, parts = Sum._of(other), dict[tuple[int, ...], Any]()
+        for one, value in self.parts.items():
+            for two, factor in more.parts.items():
+                key, made = tuple(sorted(one + two)), value * factor
+                if len(key) > MOST_FACTORS:
+                    return Sum(self.parts, True)
+                parts[key] = parts[key] + made if key in parts else made
+        return Sum(parts, self.bent or more.bent)
 
     def __truediv__(self, other: object) -> Sum:
         under = Sum._of(other)
@@ -103,9 +107,15 @@ class Sum:
 
     def __pow__(self, other: object) -> Sum:
         exponent = Sum._of(other)
-        if not (self.is_free and exponent.is_free):
+        if self.is_free and exponent.is_free:
+            return Sum({FREE: self.parts[FREE] ** exponent.parts[FREE]})
+        power = exponent.parts[FREE]
+        if not exponent.is_free or not isinstance(power, int | float) or power not in range(MOST_FACTORS + 1):
             return Sum(self.parts, True)
-        return Sum({FREE: self.parts[FREE] ** exponent.parts[FREE]})
+        found = Sum({FREE: 1.0})
+        for _ in range(int(power)):
+            found = found * self
+        return found
 
     def __rpow__(self, other: object) -> Sum:
         return Sum._of(other) ** self
@@ -162,23 +172,44 @@ class Parts:
             for low, high, middle in every
         ]
 
-    def tables(self, entry: object, time: object) -> list[np.ndarray]:
-        """``f_0, f_1, ..., f_nu`` of a matrix at a time; raises `Unchecked` where it is no such sum."""
+    def coefficients(self, entry: object, time: object) -> dict[tuple[int, ...], np.ndarray]:
+        """A matrix at a time as a polynomial in the shares, by their numbers, the constant one first; raises
+        `Unchecked` where it is none."""
         nothing: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
         p = np.empty(1 + len(self.middle), dtype=object)
         p[0] = Sum({FREE: time})
         for j, (value, scale) in enumerate(zip(self.middle, self.scales, strict=True)):
-            p[1 + j] = Sum({FREE: nothing + value, **({j: nothing + scale} if scale else {})})
+            p[1 + j] = Sum({FREE: nothing + value, **({(j,): nothing + scale} if scale else {})})
         with np.errstate(all="ignore"):
             whole = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
-        found = [np.zeros(whole.shape, dtype=object) for _ in p]
+        found = {FREE: np.zeros(whole.shape, dtype=object)}
         for place, value in np.ndenumerate(whole):
             one = Sum._of(value)
             if one.bent:
-                raise Unchecked("the checker knows parameters beside the time that the state depends on affinely")
+                raise Unchecked(
+                    "the checker knows parameters beside the time that the state depends on affinely, or that entries"
+                    " are polynomials in"
+                )
             for key, part in one.parts.items():
-                found[1 + key][place] = part
+                found.setdefault(key, np.zeros(whole.shape, dtype=object))[place] = part
         return found
+
+    def tables(self, entry: object, time: object) -> list[np.ndarray]:
+        """``f_0, f_1, ..., f_nu`` of a matrix at a time; raises `Unchecked` where it is no such sum."""
+        parts = self.coefficients(entry, time)
+        if any(len(key) > 1 and any(map(_may_be, table.ravel())) for key, table in parts.items()):
+            raise Unchecked("the checker knows parameters beside the time that the state depends on affinely")
+        none = np.zeros(parts[FREE].shape, dtype=object)
+        return [parts[FREE], *(parts.get((j,), none) for j in range(len(self.middle)))]
+
+    @cached_property
+    def is_affine(self) -> bool:
+        """Whether the state is an affine function of the parameters."""
+        try:
+            _ = self.moved
+        except Unchecked:
+            return False
+        return True
 
     @cached_property
     def moved(self) -> list[list[int]]:
@@ -251,11 +282,14 @@ class Larger:
 
 
 def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with coordinates for its parameters beside the time; it itself where there are none."""
+    """The problem with coordinates for its parameters beside the time; it itself where there are none that the state is
+    an affine function of."""
     system = problem.system
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return problem
     parts = Parts(system, tuple(system.parameters.interior_point().tolist()))
+    if not parts.is_affine:  # then it is expanded, box by box (`SpreadFlow`)
+        return problem
     d, more = system.states, parts.size - system.states
     corners = [parts.seen(shares) for shares in parts.corners()]
     measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set

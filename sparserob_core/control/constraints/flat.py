@@ -29,6 +29,7 @@ from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Direct, Moving, Reference
 from sparserob_core.control.response.response import Outputs, Response, distinct_times
+from sparserob_core.control.response.varying_motion import SpreadMotion
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Separation
@@ -407,6 +408,7 @@ class FlatConstraint(StateConstraint):
             known = self.samples.support_over(legs, low, high)
             if self.functionals.execution is not None:  # of a known system, which has one leg
                 (leg,) = legs
+                assert not isinstance(leg, SpreadMotion)  # beside which there are no such errors
                 errors = self.functionals.execution.over(control, H, leg)
                 known = [Supports((*(() if known[0] is None else known[0].parts), errors))]
             supports = iter(known)

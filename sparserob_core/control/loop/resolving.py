@@ -87,7 +87,7 @@ class Plan:
             else:
                 mode = system.modes[int(grid.modes[number])]
                 B = mode.matrices(mode.probes[:1])[1][0]
-            found = found + grid.lengths[number] * (B[:, : control.size] @ control)
+            found = found + grid.lengths[number] * (B[: found.size, : control.size] @ control)
         return found
 
     def caused(self, piece: int, state: Array, control: Array, after: Array) -> tuple[int, Array, Array, float] | None:
@@ -96,6 +96,8 @@ class Plan:
         much at most an error of the state grows in the value; ``None`` where the state does not tell it."""
         problem, response, signal = self.known.problem, self.known.response, self.known.functionals.disturbance
         numbers = np.flatnonzero(response.grid.control_piece == piece).tolist()
+        if response.propagator.spread is not None:  # which parameters did it is not known
+            return None
         if problem.disturbance is None or signal is None or signal.starts is None or len(numbers) != 1:
             return None
         steps, length = response.steps(KNOWN), int(response.which[numbers[0]])

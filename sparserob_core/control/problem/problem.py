@@ -256,6 +256,9 @@ class OptimalControlProblem(Term):
 
     def _check_uncertain(self, system: VaryingSystem) -> None:
         """Raise `InputError` for what is not proven of a system that changes with time and has parameters."""
+        if system.dependence is None:
+            self._check_expanded()
+            return
         for i, end in enumerate(self.terminal):
             if not isinstance(end, Equality):
                 continue
@@ -267,6 +270,22 @@ class OptimalControlProblem(Term):
                         expected="final values fixed of states that no parameter reaches, beside the time t",
                         got=f"{self.names.state(state)}, which {system.names[parameter]} reaches",
                     )
+
+    def _check_expanded(self) -> None:
+        """The same where the state is no affine function of the parameters."""
+        refused = {
+            "fixed final values": bool(self.terminal_equalities),
+            "measurable disturbances": self.measurable is not None,
+            "errors of execution": self.execution is not None and bool(np.any(np.asarray(self.execution, dtype=float))),
+        }
+        for beside, given in refused.items():
+            if given:
+                raise InputError(
+                    path="system.parameters",
+                    expected=f"none beside {beside} and the time t, or such that the state depends on affinely: to the"
+                    " first power in B, E and c, and in A where they multiply what depends on none",
+                    got="others",
+                )
 
     def _executed(self) -> Array | None:
         """The errors of execution, ``None`` where there are none; raises `InputError` for what they are not proven
@@ -303,7 +322,7 @@ class OptimalControlProblem(Term):
         if isinstance(self.system, VaryingSystem) or not self.system.parameter_count:
             return True
         try:
-            return bool(VaryingSystem.made_of(self.system, self.horizon).parameter_count)
+            return VaryingSystem.made_of(self.system, self.horizon).dependence is not None
         except InputError:
             return False
 

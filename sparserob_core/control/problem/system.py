@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
-from sparserob_core.control.enclosures.dependence import PARTS, Dependence, dependence
+from sparserob_core.control.enclosures.dependence import PARTS, Dependence, Spread, Superposed, dependence
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import (
     ExpressionMatrix,
@@ -600,7 +600,7 @@ class VaryingSystem:
     ``law``: a `LinearSystem` whose first parameter is the time: its matrices at ``p = (t,)`` are those at the time
     ``t``. ``later``: times, one after another, each with the law that holds from then on. ``delay``, as that of a
     `LinearSystem`: what was commanded acts through the ``B`` of the time at which it acts. ``parameters``: a box of
-    uncertain parameters, which follow the time in the laws, and of which the state must be an affine function; ``None``
+    uncertain parameters, which follow the time in the laws, and in which entries must be polynomials; ``None``
     where everything is known. Made of expressions by `of` and `taking_turns`. Raises `InputError`.
     """
 
@@ -630,28 +630,63 @@ class VaryingSystem:
             object.__setattr__(self, "law", drifting[0])
             object.__setattr__(self, "later", tuple(zip(times[1:-1], drifting[1:], strict=True)))
         if self.parameters is not None:
-            _ = self.dependence
+            _ = self._depends
+
+    @property
+    def dependence(self) -> Dependence | None:
+        """How the state depends on the parameters, where that is affinely."""
+        return None if isinstance(self._depends, int) else self._depends
 
     @cached_property
-    def dependence(self) -> Dependence:
-        """How the state depends on the parameters; raises `InputError` where that is not affinely."""
-        centre = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
+    def _depends(self) -> Dependence | int:
+        """That, or the largest degree of an entry; raises `InputError` for one that is no polynomial in them."""
         entries = [[law.entry(name) for name in PARTS] for _, _, law in self.laws]
-        ends = (centre, centre) if self.parameters is None else (self.parameters.lower, self.parameters.upper)
-        sides = ((centre, ends[1]), (ends[0], centre))
-        far = [[_difference(a, b) for a, b in zip(*side, strict=True)] for side in sides]
-        found = dependence(entries, centre, np.max(far, axis=0))
-        if isinstance(found, Dependence):
+        found = dependence(entries, *self.deviations)
+        if isinstance(found, Dependence | int):
             return found
         number, name, i, j = found
         entry = entries[number][PARTS.index(name)]
         raise InputError(
             path=(f"system.pieces.{number}" if self.later else "system") + f".{name}.{i}.{j}",
-            expected="parameters that the state depends on affinely, beside the time t: to the first power in B, E and"
-            " c, and in A where they multiply what depends on none; of others nothing is proven yet. What they do to"
-            " the state may be put into the disturbance, with a bound of the states",
+            expected="polynomials in the parameters, beside the time t; of others nothing is proven yet. What they do"
+            " to the state may be put into the disturbance, with a bound of the states",
             got=entry.entries[i][j].text if isinstance(entry, ExpressionMatrix) else "a function of them",
         )
+
+    @property
+    def deviations(self) -> tuple[Array, Array]:
+        """The middle of the parameters, and the most that each deviates from it by."""
+        if self.parameters is None:
+            return np.zeros(0), np.zeros(0)
+        centre, box = self.parameters.interior_point(), self.parameters
+        sides = ((centre, box.upper), (box.lower, centre))
+        return centre, np.max([[_difference(a, b) for a, b in zip(*ends, strict=True)] for ends in sides], axis=0)
+
+    @property
+    def powers(self) -> int | None:
+        """Of a system whose state is no affine function of its parameters, the largest degree of an entry in them."""
+        return self._depends if isinstance(self._depends, int) else None
+
+    def superposed(self, depends: Dependence | Spread) -> VaryingSystem:
+        """The known system of all states that a dependence tells of."""
+        laws = []
+        for begin, until, law in self.laws:
+            parts = {name: law.entry(name) for name in PARTS}
+            made = {name: Superposed(name, part, depends) for name, part in parts.items() if part is not None}
+            times = Box([begin], [until])
+            laws.append((begin, LinearSystem(made["A"], made["B"], made["E"], times, (TIME,), made.get("c"))))
+        return VaryingSystem(laws[0][1], self.horizon, self.delay, tuple(laws[1:]))
+
+    def at(self, parameter: Array) -> VaryingSystem:
+        """The known system at one parameter ``(nu,)``."""
+        if self.parameters is None:
+            return self
+        laws = []
+        for begin, until, law in self.laws:
+            A, B, E, c = (_at(law.entry(name), parameter) for name in PARTS)
+            assert A is not None and B is not None
+            laws.append((begin, LinearSystem(A, B, E, Box([begin], [until]), (TIME,), c)))
+        return VaryingSystem(laws[0][1], self.horizon, self.delay, tuple(laws[1:]))
 
     def with_parameters(self, parameters: ConvexSet) -> VaryingSystem:
         """The same system with its parameters in another box."""
@@ -745,7 +780,7 @@ class VaryingSystem:
         take turns may differ there as at any other time."""
         if self.later:
             return
-        every = [[part[0] for part in mode.forced.matrices(np.zeros((1, 0)))] for mode in self.modes]
+        every = [[part[0] for part in mode.forced.matrices(mode.probes[:1])] for mode in self.modes]
         sizes = [np.abs(parts).max(axis=0) for parts in zip(*every, strict=True)]
         ends = self.law.forced.matrices(self._points(np.array([[0.0], [self.horizon]])))
         for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
@@ -812,11 +847,18 @@ class VaryingSystem:
 
     @cached_property
     def modes(self) -> tuple[LinearSystem, ...]:
-        """The system as it is at several times, for what asks how large its numbers are; nothing is proven by them."""
+        """The system as it is at several times, for what asks how large its numbers are; nothing is proven by them. Of
+        parameters that the state depends on affinely they are those in the middle of the box."""
         found = list[LinearSystem]()
         # Chebyshev's points, closer to the ends: an entry that is 0 at evenly spaced times is seen
         shares = (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
         for begin, until, law in self.laws:
+            if self.powers is not None:
+                times = (begin + (until - begin) * shares[:, 0]).tolist()
+                every = [[_during(law.entry(name), time) for name in PARTS] for time in times]
+                bound, names = self.parameters, self.names
+                found += [LinearSystem(A, B, E, bound, names, c) for A, B, E, c in every]  # type: ignore[arg-type]
+                continue
             times = self._points(begin + (until - begin) * shares)
             A, B, E = law.matrices(times)
             drifts = [None] * LOOKS if self.c is None else list(law.forced.matrices(times)[1][:, :, -1:])
@@ -852,6 +894,44 @@ class VaryingSystem:
 
 
 System: TypeAlias = LinearSystem | SwitchedSystem | VaryingSystem
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _At:
+    """A function of the time, and of parameters after it, at one ``parameter (nu,)``."""
+
+    entry: Callable[..., object]
+    parameter: Array
+
+    def __call__(self, p: npt.NDArray[np.object_]) -> object:
+        whole = np.empty(1 + self.parameter.size, dtype=object)
+        whole[0], nothing = p[0], 0.0 * p[0]
+        for i, value in enumerate(self.parameter.tolist()):
+            whole[1 + i] = nothing + value
+        return self.entry(whole)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _During:
+    """A function of the time, and of parameters after it, at one ``time``, as one of the parameters."""
+
+    entry: Callable[..., object]
+    time: float
+
+    def __call__(self, p: npt.NDArray[np.object_]) -> object:
+        whole = np.empty(1 + len(p), dtype=object)
+        whole[0], whole[1:] = self.time, p
+        return self.entry(whole)
+
+
+def _during(entry: _Entry | None, time: float) -> _Entry | None:
+    return _During(entry, time) if callable(entry) else entry
+
+
+def _at(entry: _Entry | None, parameter: Array) -> _Entry | None:
+    return _At(entry, parameter) if callable(entry) else entry
 
 
 def _difference(low: float, high: float) -> float:
@@ -1064,11 +1144,14 @@ class SystemInUnits(LinearSystem):
         return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], units, c * mine["c"], time * earlier)
 
     def entry(self, name: str) -> _Entry | None:
-        base, factor, units = self.base.entry(name), self.factors[name], self.units
+        base, units = self.base.entry(name), self.units
+        if base is None:
+            return None
+        factor = self.factors[name]
         if callable(base):
             function = base
             return lambda p: np.asarray(function(np.asarray(p, dtype=object) * units), dtype=object) * factor
-        return None if base is None else base * factor
+        return base * factor
 
     def _shape(self, name: str) -> tuple[int, int]:
         return self.base._shape(name)

@@ -75,6 +75,10 @@ class Motion(Protocol):
         """About how fast it moves: cells of a time shorter than its reciprocal are short."""
 
     @property
+    def recentred(self) -> Array | None:
+        """What makes of the coefficients of its states those on the cell, ``(M, M)``; ``None`` where they are."""
+
+    @property
     def influence(self) -> Array:
         """How much every parameter has to do with what is left out, ``(nu,)``; it only guides the halving."""
 
@@ -157,6 +161,8 @@ class CellEnclosure:
         """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
         states = self._states(times, pieces)
         coefficients = np.einsum("ri,kai->kra", self._rows, states)
+        if self.lifted.recentred is not None:
+            coefficients = coefficients @ self.lifted.recentred.T
         if self.moving is not None:
             coefficients[:, :, 0] += self.moving.at(times + self.lifted.grid.elapsed)
         space = self.lifted.space

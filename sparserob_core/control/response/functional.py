@@ -21,7 +21,13 @@ from sparserob_core.control.response.disturbance_support import DisturbanceSuppo
 from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
 from sparserob_core.control.response.lifted import LiftedSystem, frozen, lift_legs
 from sparserob_core.control.response.response import Response, TimeGrid, Weights
-from sparserob_core.control.response.varying_motion import VaryingMotion, VaryingSupport
+from sparserob_core.control.response.varying_motion import (
+    SpreadMotion,
+    SpreadSupport,
+    Truncation,
+    VaryingMotion,
+    VaryingSupport,
+)
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -32,7 +38,7 @@ if TYPE_CHECKING:
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
 LEGS_KEPT = 256  # cells of parameters whose lifted systems are kept
-Leg: TypeAlias = LiftedSystem | VaryingMotion
+Leg: TypeAlias = LiftedSystem | VaryingMotion | SpreadMotion
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
 # Numbers of a product over many directions that are made at once (2 MB), so that they stay near the processor. With
 # sixteen times as many a curved wall is sampled in up to twice the time; with a fourth part of them in no less.
@@ -137,8 +143,13 @@ class WorstCase:
         if model is not None:
             zero = np.zeros(model.channels)
             model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
-        if isinstance(system, VaryingSystem):  # which is known
-            return replace(self, disturbance=model, initial=None, shared=None, execution=self._exactly)
+        if isinstance(system, VaryingSystem):
+            response = self.response
+            if system.parameters is not None:
+                fixed = system.at(system.parameters.interior_point())
+                response = Response(fixed, response.grid, response.initial_state)
+            exact = self._exactly
+            return replace(self, response=response, disturbance=model, initial=None, shared=None, execution=exact)
         middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
         modes = [LinearSystem(*(part[0] for part in mode.matrices(middle))) for mode in system.modes]
         ends = (*system.switches, float(self.response.grid.breakpoints[-1]))
@@ -347,10 +358,13 @@ class WorstCase:
         model, measurable = self.disturbance, self.measurable
         by_block = None if model is None else model.on_blocks
         if measurable is not None:
-            if joined is not None or (isinstance(lifted, LiftedSystem) and lifted.space.nu):
+            if joined is not None or isinstance(lifted, SpreadMotion) or lifted.space.nu:
                 raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
             found += measurable.over(H, lifted)
-        if isinstance(lifted, VaryingMotion):
+        if isinstance(lifted, SpreadMotion):
+            found += [] if by_block is None else [SpreadSupport.of_disturbance(lifted, by_block, rows, joined)]
+            found += [] if self.initial is None else [SpreadSupport.of_initial(lifted, self.initial, rows, joined)]
+        elif isinstance(lifted, VaryingMotion):
             found += [] if by_block is None else [VaryingSupport.of_disturbance(lifted, by_block, rows, joined)]
             found += [] if self.initial is None else [VaryingSupport.of_initial(lifted, self.initial, rows, joined)]
         else:
@@ -452,13 +466,44 @@ class WorstCase:
         key, response = low.tobytes() + high.tobytes(), self.response
         if key not in self._legs:
             cell = (low + high) / 2, (high - low) / 2
-            legs: tuple[Leg, ...] = (
-                (VaryingMotion(response.propagator, response.initial_state),)
-                if response.grid.varying
-                else lift_legs(response.system, response.grid, response.initial_state, *cell)
-            )
+            legs: tuple[Leg, ...]
+            if self._truncation is not None:
+                spread, motion = self._truncation.spread, self._truncation.motion
+                legs = (SpreadMotion(motion, spread, self._truncation, low, high),)
+            elif response.grid.varying:
+                legs = (VaryingMotion(response.propagator, response.initial_state),)
+            else:
+                legs = lift_legs(response.system, response.grid, response.initial_state, *cell)
             remember(self._legs, key, legs, LEGS_KEPT)
         return self._legs[key]
+
+    @cached_property
+    def _truncation(self) -> Truncation | None:
+        """What an expansion in the parameters leaves out, where there is one."""
+        if self.response.propagator.spread is None:
+            return None
+        spread, every = self.response.propagator.spread
+        begun = np.append(self.response.initial_state, np.zeros(spread.states - spread.d))
+        return Truncation(VaryingMotion(every, begun), spread)
+
+    def beyond(self, far: Array) -> Array:
+        """What an expansion in the parameters leaves out of any state, ``(d,)``, of a control that goes as ``far (m,)``
+        as it may; nothing where there is none."""
+        if self._truncation is None:
+            return np.zeros(self.response.initial_state.size)
+        axes, model, begun = (
+            np.eye(self.response.initial_state.size),
+            self.disturbance,
+            np.abs(self.response.initial_state),
+        )
+        if self.initial is not None:
+            begun = begun + self.initial.reach(axes)
+        pushed = np.zeros(self.response.system.disturbances)
+        if model is not None:
+            pushed = model.bound.reach(np.eye(model.channels))
+        known = np.abs(self.known).max(axis=1)
+        acting = np.concatenate([np.maximum(far, known[: far.size]), known[far.size :]])
+        return self._truncation.at_most(begun, np.concatenate([acting, pushed]))
 
     @cached_property
     def _frozen(self) -> dict[bytes, LiftedSystem]:

@@ -331,6 +331,10 @@ class LiftedSystem:
         return np.asarray(np.minimum(exact, product(norms, by_mode.T).T))
 
     @property
+    def recentred(self) -> None:
+        """The coefficients of its states are those on the cell."""
+
+    @property
     def influence(self) -> Array:
         """`Motion.influence`: the parameters' first-order part in the system."""
         if not self.space.degree:

@@ -17,10 +17,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.flows import FEW_STATES, Exponentials, Leaps
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transitions
 from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
+from sparserob_core.control.response.varying.spread import expanded
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -335,9 +337,21 @@ class Propagator:
             modes[self.which] = self.grid.mode
         return modes
 
+    @cached_property
+    def spread(self) -> tuple[Spread, Propagator] | None:
+        """Of a system that changes with time and whose state is no affine function of its parameters, how it is
+        expanded in them, and what all coefficients do."""
+        if not isinstance(self.system, VaryingSystem) or self.system.powers is None:
+            return None
+        how, every = expanded(self.system)
+        return how, Propagator(every, self.grid)
+
     @shaped
     def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
-        """Matrices and whole-piece transitions at parameters ``(v, nu)``; remembered for the last few calls."""
+        """Matrices and whole-piece transitions at parameters ``(v, nu)``, of all coefficients where there is a
+        `spread`; remembered for the last few calls."""
+        if self.spread is not None:
+            return self.spread[1].steps(np.zeros((1, 0)))
         # no parameters: any number of rows has the same bytes
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
         if key not in self._steps and self.expansion is not None:
@@ -421,7 +435,10 @@ class Propagator:
 
     @cached_property
     def expansion(self) -> Expansion | None:
-        """The system as polynomials in time, where it changes with time."""
+        """The system as polynomials in time, where it changes with time; that of all coefficients where there is a
+        `spread`."""
+        if self.spread is not None:
+            return self.spread[1].expansion
         return Expansion.of(self.system) if isinstance(self.system, VaryingSystem) else None
 
     def _varying_steps(self, expansion: Expansion) -> Steps:
@@ -463,8 +480,12 @@ class Propagator:
 
         ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)`` give ``free (k, d) = e^{A't} c``,
         ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, J m)``,
-        ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`).
+        ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`). Where there is a
+        `spread` they are on all coefficients.
         """
+        if self.spread is not None:
+            how, every = self.spread
+            return every.adjoint(times, how.directions(directions, parameters), np.zeros((times.size, 0)))
         if self.expansion is not None:
             return self._varying_adjoint(self.expansion, times, directions)
         if self.aged(parameters.shape[1]):
@@ -480,6 +501,10 @@ class Propagator:
     ) -> Weights:
         """The functional ``c'x(t)`` of each index as weights on what is given and on inputs: `adjoint` and
         `TimeGrid.through`, without ``(k, L, d)`` numbers."""
+        if self.spread is not None:
+            how, every = self.spread
+            found = every.weights(times, how.directions(directions, parameters), np.zeros((times.size, 0)))
+            return found._replace(free=found.free[:, : how.d])  # at the beginning nothing depends on parameters
         if self.expansion is not None:
             return self._varying_weights(self.expansion, times, directions)
         if self.aged(parameters.shape[1]):
@@ -696,6 +721,7 @@ class Outputs:
     H: Array
     times: Array
     points: Array
+    _axes: list[Outputs] = field(default_factory=list, repr=False)
 
     @cached_property
     def within(self) -> tuple[np.ndarray, Array, np.ndarray]:
@@ -742,6 +768,8 @@ class Outputs:
     def at(self, response: Response, control: Array) -> Array:
         """``(v, r, T)`` from the initial state of a response, under a control ``(m, K)`` on its own pieces."""
         steps, grid = self.propagator.steps(self.points), self.propagator.grid
+        if self.propagator.spread is not None:
+            return self._spread(response, control)
         if self.propagator.aged(self.points.shape[1]) and self.propagator.block(steps) > 1:
             return self._in_blocks(response.initial_state, grid.inputs(control))[None]
         if self._over_pieces is not None:
@@ -758,6 +786,18 @@ class Outputs:
             "vtri,vti->vrt", driven, drive[:, pieces]
         )
         return np.asarray(found)
+
+    def _spread(self, response: Response, control: Array) -> Array:
+        """`at` of a system whose state is a polynomial in its parameters: of all coefficients, which are seen then."""
+        assert self.propagator.spread is not None
+        how, every = self.propagator.spread
+        axes, none = np.eye(how.states), np.zeros((1, 0))
+        if not self._axes:
+            self._axes.append(Outputs(every, axes, self.times, none))
+        begun = np.append(response.initial_state, np.zeros(how.states - how.d))
+        states = self._axes[0].at(Response(every.system, every.grid, begun, shared=every), control)[0].T
+        at = how.seen(np.broadcast_to(states, (len(self.points), *states.shape)), self.points)
+        return np.asarray(np.einsum("ri,vti->vrt", self.H, at))
 
     def _in_blocks(self, initial_state: Array, inputs: Array) -> Array:
         """``(r, T)`` from inputs ``(m, L)``."""
@@ -866,6 +906,8 @@ class Response:
     def numbers(self, parameters: int) -> int:
         """How many numbers `weights` of one index make at once, with so many ``parameters``."""
         system, grid = self.system, self.grid
+        if self.propagator.spread is not None:
+            return int(grid.pieces * self.propagator.spread[0].states)
         width = system.states if parameters else system.controls + system.disturbances
         return int(grid.pieces * width)
 
@@ -911,6 +953,8 @@ class Response:
         disturbances), ``disturbance (v, mw, M)`` on the disturbance's pieces or ``None``, ``deviations (v, d)`` of the
         initial state.
         """
+        if self.propagator.spread is not None:
+            return self._spread_states(control, parameters, disturbance, deviations)
         steps = self.steps(parameters)
         count = max(part.shape[0] for part in (parameters, disturbance, deviations) if part is not None)
         drive = self.grid.driven(steps.B, self.grid.inputs(control))
@@ -939,6 +983,20 @@ class Response:
         for piece, length in enumerate(lengths):
             path[:, piece + 1] += moved(steps.Phi[:, length], path[:, piece])
         return path
+
+    def _spread_states(
+        self, control: Array, parameters: Array, disturbance: Array | None, deviations: Array | None
+    ) -> Array:
+        """`states` of a system whose state is a polynomial in its parameters."""
+        assert self.propagator.spread is not None
+        how, every = self.propagator.spread
+        more = np.zeros(how.states - how.d)
+        begun = Response(every.system, every.grid, np.append(self.initial_state, more), shared=every)
+        off = None if deviations is None else np.hstack([deviations, np.zeros((len(deviations), more.size))])
+        found = begun.states(control, np.zeros((1, 0)), disturbance, off)
+        count = max(len(found), len(parameters))
+        each = np.broadcast_to(parameters, (count, parameters.shape[1]))
+        return how.seen(np.broadcast_to(found, (count, *found.shape[1:])), each)
 
     def nodes(self, control: Array, parameters: Array) -> Array:
         """`states` without a disturbance, remembered for the last control, since all constraints ask for them."""

@@ -5,18 +5,26 @@ for a remainder. There ``y'' = Q y + R v`` with ``Q = A' + A^2`` and ``R = F' + 
 block of an uncertainty makes of it, under inputs ``v`` through ``F = [B E]``; and what ``y''`` moves by within a cell
 is bounded entry by entry by its own derivative. What is computed may be off by what every step was off by, carried on:
 the products of transitions that carry it are at most what is computed of them, and a little.
+
+Of a system with parameters that its state is no affine function of, it is the motion of all coefficients of an
+expansion in them. With ``x = sum_a delta^a x_a + R`` (`Spread`), what is beyond the degree ``D`` obeys ``R' = A(t, p)
+R`` plus the products of coefficients of ``A`` and of the state whose degrees add up to more than ``D``. So it is at
+most the transitions' norm times the integral of ``sum_j n_j sum_(b > D - j) a_b``, with ``a_b`` and ``n_j`` the norms
+of all coefficients of ``A`` and of the state of a degree; and the transitions themselves are such an expansion, whose
+norm is bounded by what it is of its own coefficients.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import product
+from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
@@ -30,6 +38,8 @@ GROWN = 8  # terms of an exponential of bounds, whose tail is added; half of the
 OUTWARD = 1.0 + 1e-12  # for sums of some thousand numbers that are not negative
 AT_ONCE = 4_000_000  # numbers of weights that are made at once
 TINY = float(np.finfo(float).tiny)
+TERMS = 40  # of the exponential of norms on a piece, which are at most a few: 4^40 / 40! is 1e-24
+REST = 1e-20  # of the norms, more than what is beyond these terms
 PATHS_KEPT = 4  # controls whose states are remembered
 
 
@@ -75,6 +85,10 @@ class VaryingMotion:
     def starts(self) -> np.ndarray:
         """Every state is a block."""
         return np.arange(self.states)
+
+    @property
+    def recentred(self) -> None:
+        """There are no cells."""
 
     @property
     def influence(self) -> Array:
@@ -194,14 +208,24 @@ class VaryingMotion:
         here = (self.flow.error + rounded * (ahead + self.flow.error))[:, None] * (begun + pushed)
         none = np.full((1, units.size), TINY)  # not 0, which times no bound is no number
         before = np.concatenate([none, np.cumsum(here, axis=0)[:-1]])
-        carried = units * self._carries[:-1] * before
+        carried = units * self.carries[:-1] * before
         return np.asarray((self.grown(self.every, self.grid.lengths, carried) + units * here) * OUTWARD)
 
-    @cached_property
-    def _carries(self) -> Array:
+    @property
+    def carries(self) -> Array:
         """The largest row sums ``(K + 1, d)`` of the transitions from any mark to each one, in own units: of the
         computed ones, and with ``P`` the largest of them and ``e`` the sum of what all steps are off by, ``P^2 e / (1
         - P e)`` more."""
+        return self._products[0]
+
+    @property
+    def carried_off(self) -> float:
+        """What the products of transitions that are computed are off by, in the norm of largest row sums in own
+        units."""
+        return self._products[1]
+
+    @cached_property
+    def _products(self) -> tuple[Array, float]:
         units = self.expansion.units
         steps = self.flow.state / units[:, None] * units
         found, every = np.ones((steps.shape[0] + 1, units.size)), np.empty((steps.shape[0] + 1, *steps.shape[1:]))
@@ -213,7 +237,8 @@ class VaryingMotion:
         largest, ahead = float(found.max()), np.abs(steps).sum(axis=2).max(axis=1)
         off = float((self.flow.error + rounding(units.size) * (ahead + self.flow.error)).sum())
         share = largest * off
-        return found + (largest * share / (1.0 - share) if share < 0.5 else np.inf)
+        more = largest * share / (1.0 - share) if share < 0.5 else np.inf
+        return found + more, more
 
     def grown(self, pieces: np.ndarray, width: Array, sizes: Array) -> Array:
         """What states of at most ``sizes (k, d)`` may become within a ``width (k,)`` of a piece, ``(k, d)``: by the
@@ -239,6 +264,11 @@ class VaryingMotion:
 
     def law(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         """``[A F]`` and its derivative at times on pieces, ``(k, d, d + m + mw)`` each."""
+        size = max(1, AT_ONCE // self.expansion.coefficients[0].size)
+        if times.size > size:
+            every = [slice(begin, begin + size) for begin in range(0, times.size, size)]
+            parts = [self.law(times[part], pieces[part]) for part in every]
+            return np.concatenate([one for one, _ in parts]), np.concatenate([one for _, one in parts])
         segments = self._segments[pieces]
         begin, end = self.expansion.ends[segments], self.expansion.ends[segments + 1]
         every = self.expansion.coefficients[segments]
@@ -369,7 +399,7 @@ class VaryingSupport:
         motion, d = self.motion, self.motion.states
         pieces = np.minimum(motion.place(start), motion.origin.size - 1)
         at = motion.bends(start, pieces)
-        bent = self._weights(start, self.rows @ at[:, :, :d])
+        bent = self.weights(start, self.rows @ at[:, :, :d])
         third = motion.third[pieces]
         turned = np.einsum("kij,kj->ki", third[:, :, :d], self.reached[pieces])
         if self.lasts:
@@ -387,7 +417,7 @@ class VaryingSupport:
     @cached_property
     def neglected(self) -> Array:
         """What is off in the transitions, and rounded in the sums over the blocks, on every piece: ``(r, K)``."""
-        motion, sums = self.motion, self._sizes
+        motion, sums = self.motion, self.sizes
         pushed = np.zeros((sums.shape[0] - 1, 1, 1))
         if self.lasts:
             pushed = motion.flow.sizes[..., -self.far.size :] * self.far
@@ -397,14 +427,14 @@ class VaryingSupport:
     @cached_property
     def reached(self) -> Array:
         """What any of it can have made of every state on every piece, ``(K, d)``."""
-        motion, begun = self.motion, self._sizes[:-1]
+        motion, begun = self.motion, self.sizes[:-1]
         lengths = motion.grid.lengths
         if self.lasts:
             begun = begun + lengths[:, None] * (motion.most[:, :, -self.far.size :] @ self.far)
         return motion.grown(motion.every, lengths, begun)
 
     @cached_property
-    def _sizes(self) -> Array:
+    def sizes(self) -> Array:
         """The same at the marks, ``(K + 1, d)``."""
         return np.asarray(np.einsum("kdpw,w->kd", np.abs(self.effect), self.far) * OUTWARD)
 
@@ -415,10 +445,10 @@ class VaryingSupport:
     def _seen(self, times: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block."""
         rows = np.broadcast_to(self.rows, (times.size, *self.rows.shape))
-        found = self.blocks(self._weights(times, rows))[:, :, None]
+        found = self.blocks(self.weights(times, rows))[:, :, None]
         return found if self.combination is None else self.combination.apply(found)
 
-    def _weights(self, times: Array, rows: Array) -> Array:
+    def weights(self, times: Array, rows: Array) -> Array:
         """What rows ``(k, r, d)`` at times ``(k,)`` give to every part, ``(k, r, P, w)``."""
         motion, place = self.motion, self.motion.place(times)
         parts = self.effect.shape[2:]
@@ -434,3 +464,283 @@ class VaryingSupport:
             pieces = motion.origin[np.minimum(place, motion.origin.size - 1)]
             found[np.arange(times.size), :, pieces] += rows @ flow.disturbance
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class Truncation:
+    """What an expansion leaves out of states that a ``motion`` of all coefficients tells of; in the norm of the units
+    of the first block of these."""
+
+    motion: VaryingMotion
+    spread: Spread
+
+    @cached_property
+    def units(self) -> Array:
+        """Units of the states, ``(d,)``."""
+        return self.motion.expansion.units[: self.spread.d]
+
+    def norms(self, sizes: Array) -> Array:
+        """The summed norms of the coefficients of every degree, ``(..., D + 1)``, of states that are at most ``sizes
+        (..., states)``."""
+        space = self.spread.space
+        apart = (sizes.reshape(*sizes.shape[:-1], space.size, self.spread.d) / self.units).max(axis=-1)
+        return np.stack([apart[..., space.degrees == j].sum(axis=-1) for j in range(space.degree + 1)], axis=-1)
+
+    def driven(self, inputs: Array) -> Array:
+        """The rates at which inputs that are at most ``inputs (K, m + mw)`` drive the coefficients of every degree,
+        ``(K, D + 1)``."""
+        d = self.motion.states
+        rates = np.einsum("kin,kn->ki", self.motion.most[:, :, d:], inputs)
+        return self.norms(rates)
+
+    @cached_property
+    def _sizes(self) -> Array:
+        """The norms of the coefficients of ``A`` of every degree on every piece, ``(K, D + 1)``."""
+        d, space = self.spread.d, self.spread.space
+        first = self.motion.most[:, :, :d].reshape(-1, space.size, d, d) / self.units[:, None] * self.units
+        norms = first.sum(axis=3).max(axis=2)
+        return np.stack([norms[:, space.degrees == j].sum(axis=1) for j in range(space.degree + 1)], axis=1)
+
+    @cached_property
+    def _within(self) -> Array:
+        """What a piece makes of norms at most, anywhere on it, ``(K, D + 1, D + 1)``."""
+        size, count = self.spread.space.degree + 1, self._sizes.shape[0]
+        rate = np.zeros((count, size, size))
+        for j in range(size):
+            for i in range(j + 1):
+                rate[:, j, i] = self._sizes[:, j - i]
+        rate = rate * self.motion.grid.lengths[:, None, None]
+        total, term = np.tile(np.eye(size), (count, 1, 1)), np.tile(np.eye(size), (count, 1, 1))
+        for n in range(1, TERMS):
+            term = term @ rate / n
+            total = total + term
+        return (total + REST) * OUTWARD
+
+    @cached_property
+    def _beyond(self) -> Array:
+        """What coefficients of every degree are multiplied by in the products beyond, ``(K, D + 1)``."""
+        found = np.cumsum(self._sizes[:, ::-1], axis=1)  # of the degrees D, D and D - 1, ...: for j = 0, 1, ...
+        return np.concatenate([np.zeros((found.shape[0], 1)), found[:, :-1]], axis=1) * OUTWARD
+
+    def _added(self, begun: Array, driven: Array) -> Array:
+        """The integral over every piece of what is beyond the degree, ``(K,)``, of states whose norms are ``begun (K, D
+        + 1)`` at its beginning and that are driven so fast, ``(K, D + 1)``."""
+        lengths = self.motion.grid.lengths[:, None]
+        most = np.einsum("kij,kj->ki", self._within, begun + lengths * driven)
+        return np.asarray((most * self._beyond).sum(axis=1) * lengths[:, 0] * OUTWARD)
+
+    @cached_property
+    def _carried(self) -> Array:
+        """The norms of the coefficients of every degree of the transitions from any mark to each one, ``(K + 1, D +
+        1)``: what the constant coefficient there makes of all of them, as computed, and what steps are off by, carried
+        on as in `VaryingMotion.carries`."""
+        steps, d, marks = self.motion.flow.state, self.spread.d, self.motion.grid.pieces + 1
+        every, found = np.empty((marks, self.motion.states, d)), np.empty((marks, self.spread.space.degree + 1))
+        first = np.eye(self.motion.states, d)
+        for k in range(marks):
+            if k:
+                every[:k] = steps[k - 1] @ every[:k]
+            every[k] = first
+            found[k] = self.norms((np.abs(every[: k + 1]) * self.units).sum(axis=2)).max(axis=0)
+        return np.asarray((found + self.norms(self.motion.carried_off * self.motion.expansion.units)) * OUTWARD)
+
+    @cached_property
+    def growth(self) -> float:
+        """The norm of the transitions from any time to any later one, at any parameter."""
+        ends = float(np.exp((self._sizes.sum(axis=1) * self.motion.grid.lengths).max()) * OUTWARD)
+        marks = self._carried[:-1]
+        share = ends * float(self._added(marks, np.zeros(marks.shape)).sum())
+        largest = float(self._carried.sum(axis=1).max())
+        return ends * ends * largest / (1.0 - share) * OUTWARD if share < 0.5 else np.inf
+
+    def lost(self, sizes: Array, inputs: Array) -> Array:
+        """What is beyond the degree of states that are at most ``sizes (K, states)`` at the beginning of every piece
+        and are driven by at most ``inputs (K, m + mw)``: state by state, ``(K, d)``."""
+        added = np.cumsum(self._added(self.norms(sizes), self.driven(inputs)))
+        return np.asarray(self.growth * added[:, None] * self.units * OUTWARD)
+
+    def at_most(self, begun: Array, inputs: Array) -> Array:
+        """The same at the end of the horizon of whatever begins at no more than ``begun (d,)`` and is driven so all the
+        time, ``inputs (m + mw,)``: ``(d,)``."""
+        pieces, size = self.motion.grid.pieces, self.spread.space.degree + 1
+        driven = self.driven(np.tile(inputs, (pieces, 1)))
+        pushed = (np.einsum("kij,kj->ki", self._within, driven) * self.motion.grid.lengths[:, None]).sum(axis=0)
+        pushed[0] += (begun / self.units).max(initial=0.0)
+        most = self._carried.max(axis=0)
+        norms = np.array([sum(most[j - i] * pushed[i] for i in range(j + 1)) for j in range(size)])
+        return self.growth * float(self._added(np.tile(norms, (pieces, 1)), driven).sum()) * self.units * OUTWARD
+
+
+@dataclass(frozen=True, eq=False)
+class SpreadMotion:
+    """The `Motion` over a cell ``[low, high]`` of parameters, ``(nu,)`` each, by the ``motion`` of all coefficients;
+    they stay those in ``delta``, of which `recentred` makes those on the cell."""
+
+    motion: VaryingMotion
+    spread: Spread
+    truncation: Truncation
+    low: Array
+    high: Array
+
+    @property
+    def grid(self) -> TimeGrid:
+        """The pieces between all marks."""
+        return self.motion.grid
+
+    @property
+    def space(self) -> TaylorSpace:
+        """The polynomials in the parameters."""
+        return self.spread.space
+
+    @property
+    def states(self) -> int:
+        """``d``."""
+        return self.spread.d
+
+    @cached_property
+    def transform(self) -> Array:
+        """The identity."""
+        return np.eye(self.states)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Every state is a block."""
+        return np.arange(self.states)
+
+    @property
+    def influence(self) -> Array:
+        """What is left out does not depend on the cell."""
+        return np.zeros(self.space.nu)
+
+    @property
+    def norm(self) -> float:
+        """That of all coefficients."""
+        return self.motion.norm
+
+    @cached_property
+    def recentred(self) -> Array:
+        """`Motion.recentred`."""
+        return self.spread.recentred(self.low, self.high)
+
+    @cached_property
+    def _most(self) -> Array:
+        """What every coefficient may add up to on the cell, ``(M,)``."""
+        return np.asarray(np.abs(self.recentred).sum(axis=0) * OUTWARD)
+
+    def nodes(self, control: Array) -> Array:
+        """`Motion.nodes`."""
+        return self._apart(self.motion.nodes(control)[:, 0])
+
+    def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
+        """`Motion.moved`."""
+        return self._apart(self.motion.moved(within, pieces, begun.reshape(len(begun), 1, -1), inputs)[:, 0])
+
+    def deviation(
+        self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
+    ) -> Array:
+        """`Motion.deviation`, of every coefficient on the cell."""
+        found = self.motion.deviation(
+            self.along_cell(rows), start, width, pieces, states.reshape(len(states), 1, -1), inputs
+        )
+        return np.asarray(found.reshape(start.size, len(rows), -1).sum(axis=2) * OUTWARD)
+
+    def along(self, control: Array, rows: Array, others: Array) -> Array:
+        """`Motion.along`; what coefficients are multiplied by and added up is rounded too."""
+        path = np.abs(self.motion.nodes(control)[:-1, 0])
+        inputs = np.abs(self.motion.grid.inputs(control)).T
+        unpushed = np.zeros((len(inputs), self.motion.most.shape[2] - self.motion.states - inputs.shape[1]))
+        off = self.motion.left_out(path, self.motion.flow.sizes[:, :, : inputs.shape[1]] * inputs[:, None])
+        lost = self.truncation.lost(path + off, np.hstack([inputs, unpushed]))
+        found = self.motion.along(control, self.sizes(rows), (1.0 + self.space.size) * self.sizes(others))
+        return np.asarray(found + rows @ lost.T * OUTWARD)
+
+    def along_cell(self, rows: Array) -> Array:
+        """Rows ``(r, d)`` as those of every coefficient on the cell, on all coefficients, ``(r M, states)``."""
+        found = self.recentred[None, :, :, None] * rows[:, None, None, :]
+        return np.asarray(found.reshape(len(rows) * self.space.size, -1))
+
+    def sizes(self, rows: Array) -> Array:
+        """Rows ``(r, d)`` on sizes of states as such on sizes of all coefficients, ``(r, states)``."""
+        return np.asarray((self._most[None, :, None] * rows[:, None, :]).reshape(len(rows), -1))
+
+    def folded(self, sizes: Array) -> Array:
+        """What sizes ``(K, states)`` of all coefficients add up to, ``(K, d)``."""
+        return np.asarray(np.einsum("a,kad->kd", self._most, sizes.reshape(len(sizes), self.space.size, -1)))
+
+    def _apart(self, states: Array) -> Array:
+        return states.reshape(len(states), self.space.size, self.states)
+
+
+@dataclass(frozen=True, eq=False)
+class SpreadSupport:
+    """A part of the uncertainty on functionals ``rows (r, d)`` over a cell of parameters, by that of all coefficients
+    on the cell, `VaryingSupport`."""
+
+    motion: SpreadMotion
+    every: VaryingSupport
+    rows: Array
+    combination: Combination | None = None
+
+    @staticmethod
+    def of_disturbance(
+        motion: SpreadMotion, model: DisturbanceModel, rows: Array, combination: Combination | None
+    ) -> SpreadSupport:
+        """That of the worst disturbance."""
+        every = VaryingSupport.of_disturbance(motion.motion, model, motion.along_cell(rows), None)
+        return SpreadSupport(motion, every, rows, combination)
+
+    @staticmethod
+    def of_initial(
+        motion: SpreadMotion, bound: ConvexSet, rows: Array, combination: Combination | None
+    ) -> SpreadSupport:
+        """That of the worst deviation of the initial state, which is one of the constant coefficient alone."""
+        every = VaryingSupport.of_initial(motion.motion, bound, motion.along_cell(rows), None)
+        every = replace(every, effect=every.effect[..., : motion.states])
+        return SpreadSupport(motion, every, rows, combination)
+
+    def steepness(self, times: Array) -> Array:
+        """`Support.steepness`."""
+        sizes = self.every.set.reach(self._seen(times)).sum(axis=3)
+        return np.asarray(sizes @ self._space.exponents)
+
+    def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
+        """`Support.at`."""
+        return over_faces(
+            self._space, ends, lambda here, face: summed(self.every.set, self._seen(times[here]), face).sum(axis=2)
+        )
+
+    def deviation(self, start: Array, widths: Array) -> Array:
+        """`Support.deviation`, of every coefficient on the cell."""
+        found = self.every.deviation(start, widths)
+        return np.asarray(found.reshape(start.size, len(self.rows), -1).sum(axis=2) * OUTWARD)
+
+    @cached_property
+    def neglected(self) -> Array:
+        """`Support.neglected`, with what is beyond the degree."""
+        motion, begun = self.motion, self.every.sizes[:-1]
+        inputs, pushed = (
+            np.zeros((len(begun), motion.motion.most.shape[2] - motion.motion.states)),
+            np.zeros((len(begun), 1, 1)),
+        )
+        if self.every.lasts:
+            inputs[:, -self.every.far.size :] = self.every.far
+            pushed = motion.motion.flow.sizes[..., -self.every.far.size :] * self.every.far
+        lost = motion.truncation.lost(begun + motion.motion.left_out(begun, pushed), inputs)
+        found = self.every.neglected.reshape(len(self.rows), self.motion.space.size, -1).sum(axis=1)
+        return np.asarray((found + np.abs(self.rows) @ lost.T) * OUTWARD)
+
+    @cached_property
+    def reached(self) -> Array:
+        """`Support.reached`, with what rounding there is more of them."""
+        return (1.0 + self.motion.space.size) * self.motion.folded(self.every.reached)
+
+    @property
+    def _space(self) -> TaylorSpace:
+        return self.motion.space if self.combination is None else self.combination.space
+
+    def _seen(self, times: Array) -> Array:
+        """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block."""
+        rows = np.broadcast_to(self.every.rows, (times.size, *self.every.rows.shape))
+        found = self.every.blocks(self.every.weights(times, rows))
+        found = found.reshape(times.size, len(self.rows), self.motion.space.size, *found.shape[2:])
+        return found if self.combination is None else self.combination.apply(found)

@@ -202,6 +202,7 @@ class ParametersInTime:
         every, system = at_corners(problem), in_time(problem).system
         if every is None or not isinstance(system, VaryingSystem) or system.parameters is None:
             return None
+        assert system.dependence is not None
         return ParametersInTime(system.parameters, system.dependence, every)
 
     def draw(self, law: LawName, count: int, directions: Array | None, rng: np.random.Generator) -> Array:

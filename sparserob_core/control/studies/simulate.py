@@ -93,6 +93,8 @@ def walk(
 def _motion(response: Response, parameters: Array) -> Motion:
     """The way to follow a system that takes the least: ``parameters (n, nu)`` are those of the trajectories."""
     grid, system = response.grid, response.system
+    if response.propagator.spread is not None:
+        return _InParameters(response, parameters)
     if grid.varying:
         return _InTime(response)
     many = grid.distinct(grid.lengths)[0].size * 4 * system.states**2 > HELD
@@ -172,6 +174,26 @@ class _InTime:
     def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
         drive = self.B[piece] @ control + self.E[piece] @ disturbance
         return np.asarray(self.steps.Phi[0, piece] @ state + self.steps.Gamma[0, piece] @ drive)
+
+
+class _InParameters:
+    """A system that changes with time and whose state is a polynomial in its parameters: all coefficients."""
+
+    def __init__(self, response: Response, parameters: Array) -> None:
+        assert response.propagator.spread is not None
+        self.spread, every = response.propagator.spread
+        self.parameters, begun = parameters, np.zeros(self.spread.states)
+        self.motion = _InTime(Response(every.system, every.grid, begun, shared=every))
+
+    def enter(self, states: Array) -> Array:
+        more = np.zeros((self.spread.states - self.spread.d, len(states)))
+        return np.vstack([states.T, more])
+
+    def leave(self, state: Array) -> Array:
+        return self.spread.seen(state.T, self.parameters).T
+
+    def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
+        return self.motion.step(piece, state, control, disturbance)
 
 
 def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:

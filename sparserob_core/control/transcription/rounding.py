@@ -29,13 +29,13 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
     disturbance bring to ``c'x(t)``. The absolute values of these, at their largest, times the multipliers of the rows
     and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). What a multiplier
     of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their own
-    (`_moving`).
+    (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`).
     """
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
     share = SHARE + _moving(model)
     lost = share * (_added(model, result) + _quadratic(model, result) + result.lower_bound)
-    lost += _neglected(model, result)
+    lost += _neglected(model, result) + _beyond(model, result)
     lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
@@ -75,6 +75,15 @@ def _added(model: Transcription, result: Result) -> float:
         return 0.0
     multipliers, times, directions, parameters = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
     return float(multipliers @ added_up(model, times, directions, parameters.reshape(len(rows), -1))) + besides
+
+
+def _beyond(model: Transcription, result: Result) -> float:
+    """What an expansion in the parameters leaves out of all rows with a multiplier, at most."""
+    off, lost = model.functionals.beyond(_far(model.problem.control)), 0.0
+    if off.any():
+        for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
+            lost += 0.0 if said is None else abs(cut.multiplier) * float(np.abs(said.direction[: off.size]) @ off)
+    return lost
 
 
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sparserob_core.arguments import whole
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.studies.initial_states import InitialPlane, check_states
@@ -72,10 +73,16 @@ def initial_states(
             expected="false, since a plan that repeats ends among its initial states, and not from elsewhere",
             got="true",
         )
-    if model.problem.system.varies:
+    system = model.problem.system
+    if isinstance(system, VaryingSystem):
         refused = {
             "policy.name": ("open_loop", model.feedback is not None, "a policy that answers"),
             "problem.terminal": ("a set with an interior", bool(model.problem.terminal_equalities), "fixed values"),
+            "problem.system.parameters": (
+                "such that the state depends on affinely",
+                system.powers is not None,
+                "others",
+            ),
         }
         for path, (expected, given, got) in refused.items():
             if given:

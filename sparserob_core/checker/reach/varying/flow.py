@@ -71,6 +71,10 @@ class VaryingFlow:
     _weights: dict[tuple[float, ...], Weights] = field(default_factory=dict)
     _most: dict[float, tuple[Array, Array]] = field(default_factory=dict)
 
+    def at(self, parameter: Sequence[float]) -> VaryingFlow:
+        """The flow at one parameter, of which there is none."""
+        return self
+
     @cached_property
     def segments(self) -> list[Segment]:
         """The system on parts of the horizon, one after another; raises `Unchecked` where it is not finite."""

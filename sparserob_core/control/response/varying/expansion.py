@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
+from sparserob_core.control.enclosures.dependence import Spread, Superposed
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.system import LinearSystem, SystemInUnits, VaryingSystem
@@ -85,7 +86,7 @@ class Expansion:
     in powers of the time from -1 to 1 over each segment, and what they may be off by, ``remainder (s, d, d + m + mw)``.
 
     ``units (d,)``: of states, in which no entry of ``A`` is much larger than the others. ``turns``: the numbers of the
-    ends at which another law takes over.
+    ends at which another law takes over. ``spread``: of which polynomials the states are the coefficients.
     """
 
     ends: Array
@@ -94,6 +95,7 @@ class Expansion:
     units: Array
     channels: tuple[int, int]
     turns: tuple[int, ...] = ()
+    spread: Spread | None = None
 
     @staticmethod
     def of(system: VaryingSystem) -> Expansion:
@@ -134,7 +136,10 @@ class Expansion:
     def _made(system: VaryingSystem) -> Expansion:
         space, horizon = TaylorSpace(1, DEGREE), system.horizon
         A = np.max([np.abs(np.asarray(mode.A, dtype=float)) for mode in system.modes], axis=0)
+        spread = _spread_of(system)
         units = balanced(A, horizon)
+        if spread is not None:  # the same for every coefficient, so that norms are those of a ring
+            units = np.tile(balanced(A[: spread.d, : spread.d], horizon), spread.space.size)
         scale = 1.0 / units[:, None]
         size = float((np.abs(A) * scale * units).sum(axis=1).max())
         todo = [
@@ -167,7 +172,7 @@ class Expansion:
                 todo += [(centre, stop, off, law), (start, centre, off, law)]
         turns = tuple(ends.index(begin) for begin, _ in system.later)
         channels = system.controls, system.disturbances
-        return Expansion(np.array(ends), np.array(found), np.array(left), units, channels, turns)
+        return Expansion(np.array(ends), np.array(found), np.array(left), units, channels, turns, spread)
 
     @shaped
     def flow(self, starts: Float[Array, " k"], stops: Float[Array, " k"]) -> Flow:
@@ -256,9 +261,57 @@ class Expansion:
         for n in range(DEGREE + 1):
             for k in range(n, DEGREE + 1):
                 moved[:, n, k] = comb(k, n) * powers[:, k - n] * share**n
-        every = self.coefficients[segments].reshape(times.size, DEGREE + 1, -1)
-        shape, factor = (times.size, *self.coefficients.shape[1:]), length[:, None, None, None]
+        given = self._first
+        every = given[segments].reshape(times.size, DEGREE + 1, -1)
+        shape, factor = (times.size, *given.shape[1:]), length[:, None, None, None]
         return (moved @ every).reshape(shape) * factor, (np.abs(moved) @ np.abs(every)).reshape(shape) * factor
+
+    @property
+    def own(self) -> int:
+        """How many states make all the others: of coefficients of polynomials the constant ones."""
+        return self.units.size if self.spread is None else self.spread.d
+
+    @cached_property
+    def _first(self) -> Array:
+        """The ``coefficients`` without the columns that follow from those before them."""
+        if self.spread is None:
+            return self.coefficients
+        return np.concatenate([self.coefficients[..., : self.own], self.coefficients[..., self.units.size :]], axis=3)
+
+    def _norm(self, columns: Array) -> Array:
+        """At most the norm of largest row sums, in own units, of matrices of which the first columns are these, ``(...,
+        d, own)``."""
+        sums = (np.abs(columns) * self.units[: self.own] / self.units[:, None]).sum(axis=-1)
+        if self.spread is None:
+            return np.asarray(sums.max(axis=-1))
+        return np.asarray(sums.reshape(*sums.shape[:-1], -1, self.own).max(axis=-1).sum(axis=-1))
+
+    def _of_ring(self, A: Array, driven: Array, terms: int, degree: int) -> Array:
+        """The sum of the series in `_within` where the states are coefficients of polynomials: what is multiplied are
+        polynomials whose coefficients are ``(own, own)``."""
+        assert self.spread is not None
+        count, d, size, wide = len(A), self.own, self.spread.space.size, self.own + driven.shape[3]
+        left, right, target = self.spread.space.products
+        law = A.reshape(count, DEGREE + 1, size, d, d)
+        every = np.zeros((count, size, terms + 1, d, wide))
+        every[:, 0, 0, :, :d] = np.eye(d)
+        pushes = driven.reshape(count, DEGREE + 1, size, d, -1)
+        there = [b for b in range(size) if law[:, : degree + 1, b].any()]
+        for n in range(terms):
+            last = min(n, degree) + 1
+            nexts = np.zeros((count, size, d, wide))
+            for b in there:
+                mine = left == b
+                over = law[:, :last, b].swapaxes(1, 2).reshape(count, 1, d, last * d)
+                earlier = every[:, right[mine], n - last + 1 : n + 1][:, :, ::-1]
+                nexts[:, target[mine]] += over @ earlier.reshape(count, -1, last * d, wide)
+            if n <= degree:
+                nexts[..., d:] += pushes[:, n]
+            every[:, :, n + 1] = nexts / (n + 1)
+        total = np.zeros((count, size, d, wide))
+        for n in range(terms, -1, -1):
+            total += every[:, :, n]
+        return total.reshape(count, size * d, wide)
 
     def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
         """`flow` of intervals within one segment each, with control and disturbance side by side, and by what factor
@@ -268,7 +321,11 @@ class Expansion:
         law, bulk = self._recentred(segments, starts, length, length)
         shape = law.shape
         majorant = self._majorant(segments, law, bulk, length)
-        A, driven = law[..., :d], law[..., d:]
+        A, driven, own = law[..., : self.own], law[..., self.own :], self.own
+        if self.spread is not None:
+            total = self._of_ring(A, driven, majorant.terms, majorant.degree)
+            flown = self.spread.filled(total[..., :own])
+            return flown, total[..., own:], majorant.error, majorant.sizes, majorant.growth
         total, terms = np.zeros((starts.size, *shape[2:])), []
         first = np.zeros((starts.size, *shape[2:]))
         first[:, :, :d] = np.eye(d)
@@ -293,17 +350,16 @@ class Expansion:
         variation of constants ``r e^(a + r)``; and rounding, of the coefficients ``bulk`` before anything cancels in
         them, of every term, and of the sum, whose first term is exact.
         """
-        d = self.units.size
-        scale = self.units / self.units[:, None]
-        sizes = (np.abs(law[..., :d]) * scale).sum(axis=3).max(axis=2)
+        d, own = self.units.size, self.own
+        sizes = self._norm(law[..., :own])
         rest = self.remainder[segments] * length[:, None, None]
-        pushes, lost = self._driven(law[..., d:]), self._driven(rest[..., d:])
+        pushes, lost = self._driven(law[..., own:]), self._driven(rest[..., d:])
         inputs, most = _totals(pushes, lost)
         shares = (pushes / most[:, None]).max(axis=(2, 3), initial=0.0)
         seen = (np.maximum(sizes, shares) > IDLE * np.maximum(sizes.sum(axis=1), 1e-300)[:, None]).any(axis=0)
         degree = int(np.flatnonzero(seen).max(initial=0))
         a = sizes.sum(axis=1)
-        r = (rest[..., :d] * scale).sum(axis=2).max(axis=1) + sizes[:, degree + 1 :].sum(axis=1)
+        r = self._norm(rest[..., :own]) + sizes[:, degree + 1 :].sum(axis=1)
         share = (lost / most).max(axis=(1, 2), initial=0.0) + shares[:, degree + 1 :].sum(axis=1)
         orders = np.arange(1.0, DEGREE + 2)
         terms, tail = TERMS, np.zeros(length.size)
@@ -316,8 +372,8 @@ class Expansion:
                     tail = np.fmin(tail, y * forced * R ** -float(terms) / (R - 1.0))
             if (tail <= IDLE).all():
                 break
-        fuller = (bulk[..., :d] * scale).sum(axis=(1, 3)).max(axis=1)
-        fuller += (self._driven(bulk[..., d:]).sum(axis=1) / most).max(axis=(1, 2), initial=0.0)
+        fuller = self._norm(bulk[..., :own].sum(axis=1))
+        fuller += (self._driven(bulk[..., own:]).sum(axis=1) / most).max(axis=(1, 2), initial=0.0)
         growth = np.exp(a + r)
         rounded = rounding((degree + 1) * d + terms) * np.minimum(a, 1.0) + rounding(DEGREE) * fuller
         error = tail + (r + share) * growth + (rounded * (1.0 + a) + EPSILON) * growth
@@ -347,6 +403,13 @@ class Expansion:
         """The errors of the flows over all segments, one after another: how much of what is added up to a state at the
         end of the horizon is not resolved."""
         return float(self.flow(self.ends[:-1], self.ends[1:]).error.sum())
+
+
+def _spread_of(system: VaryingSystem) -> Spread | None:
+    """The polynomials of which the states of a system are the coefficients, where they are."""
+    entry = system.law.entry("A")
+    depends = entry.dependence if isinstance(entry, Superposed) else None
+    return depends if isinstance(depends, Spread) else None
 
 
 def _coupled(A: Array) -> list[np.ndarray]:

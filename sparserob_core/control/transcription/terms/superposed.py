@@ -8,16 +8,16 @@ from itertools import product as every_choice
 
 import numpy as np
 
-from sparserob_core.control.enclosures.dependence import PARTS, Dependence, Superposed
+from sparserob_core.control.enclosures.dependence import Dependence
 from sparserob_core.control.problem.names import Corners, Names
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import TIME, LinearSystem, VaryingSystem
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.windows import everywhere
 from sparserob_core.control.sets.sets import Equality, cylinder
 from sparserob_core.control.transcription.terms.in_time import in_time
 from sparserob_core.control.transcription.terms.larger import larger
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.convex_set import Array
 
 CORNERS = 64  # of a box of parameters: rows are as many times more, with ten times as many it would take minutes
 
@@ -33,11 +33,12 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return problem
     depends, rows = system.dependence, at_corners(problem)
-    assert rows is not None
+    if depends is None or rows is None:  # whose parameters stay in the index
+        return problem
     return larger(
         problem,
         depends.states - system.states,
-        system=_known(system, depends),
+        system=system.superposed(depends),
         path=[
             one
             for entry, name in zip(problem.windows, problem.called("path"), strict=True)
@@ -55,9 +56,10 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
     """The stated states at every corner of the box of parameters beside the time, as rows ``(d, size)`` on those of one
-    in the middle and on what the parameters add; ``None`` where there are no such parameters."""
+    in the middle and on what the parameters add; ``None`` where there are none that the state is an affine function
+    of."""
     system = in_time(problem).system
-    if not isinstance(system, VaryingSystem) or system.parameters is None:
+    if not isinstance(system, VaryingSystem) or system.parameters is None or system.dependence is None:
         return None
     return [system.dependence.rows(corner) for corner in _corners(system.dependence)]
 
@@ -67,6 +69,7 @@ def corners_of(problem: OptimalControlProblem) -> Corners:
     system, rows = in_time(problem).system, at_corners(problem)
     if rows is None or not isinstance(system, VaryingSystem) or system.parameters is None:
         return Corners()
+    assert system.dependence is not None
     box, reached = system.parameters, system.dependence.reached
     ends = [
         sorted({low, high}) if any(one) else [low]
@@ -84,17 +87,6 @@ def _corners(depends: Dependence) -> list[Array]:
         expected = f"a box with at most {CORNERS} corners beside the time t"
         raise InputError(path="system.parameters", expected=expected, got=f"{count}")
     return [np.array(one) for one in every_choice(*((-1.0, 1.0) if one else (0.0,) for one in moves.tolist()))]
-
-
-def _known(system: VaryingSystem, depends: Dependence) -> VaryingSystem:
-    """The system of all states."""
-    laws = []
-    for begin, until, law in system.laws:
-        parts = {name: law.entry(name) for name in PARTS}
-        made = {name: Superposed(name, part, depends) for name, part in parts.items() if part is not None}
-        times = Box([begin], [until])
-        laws.append((begin, LinearSystem(made["A"], made["B"], made["E"], times, (TIME,), made.get("c"))))
-    return VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:]))
 
 
 def _names(names: Names, system: VaryingSystem, depends: Dependence) -> Names:

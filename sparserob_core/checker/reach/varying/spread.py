@@ -1,0 +1,664 @@
+"""A system that changes with time and whose state is no affine function of its parameters, in balls: at one parameter
+as the known system that it is there, and over a box of them as a polynomial in their shares, by power series of its
+own.
+
+With ``s`` the shares of the parameters and ``A = sum_b A_b s^b``, the coefficients of ``x = sum_a x_a s^a + R`` up to a
+degree ``D`` obey ``x_a' = sum_b A_b x_(a-b) + B_a u + E_a w``: matrices of such polynomials are a ring, in which power
+series in time solve as they do for numbers. What is beyond is ``R' = A R`` plus the products whose degrees add up to
+more than ``D``: at most what transitions make of them, whose own norm is bounded by what it is of their coefficients.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from math import ceil, comb, factorial
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.jets import Monomials
+from sparserob_core.checker.arithmetic.series import Series, upper
+from sparserob_core.checker.arithmetic.timed import Timed
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.disturbance_support import Scene, bounded
+from sparserob_core.checker.reach.flow import balanced, stacked
+from sparserob_core.checker.reach.superposition import FREE, Parts
+from sparserob_core.checker.reach.tube import Known, Polynomial
+from sparserob_core.checker.reach.varying.flow import (
+    FIRST,
+    LONG,
+    ORDER,
+    SHARP,
+    SHORTEST,
+    TERMS,
+    VaryingFlow,
+    _largest,
+    _Tails,
+    _wider,
+)
+from sparserob_core.checker.reach.varying.tube import ORDER as IN_TIME
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.sets.sets import Box
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat, arb_poly
+
+    from sparserob_core.checker.sets.parameters import Corners
+
+LEFT = ((1e-13, 64), (1e-11, 160))
+"""Of the state, what is to be beyond the degree, and with how many coefficients times states at most: the first that is
+reached. With 1e-9 it would show; twice as many numbers take four times as long."""
+MOST_DEGREE = 24  # of the expansion
+LOOKS = 17  # times at which the numbers of the system are looked at, by which nothing is proven
+EXPONENTIAL = 40  # terms of the exponential of norms on an interval, which are a few: 4^40 / 40! is 1e-24
+REST = 1e-20  # of the norms, more than what is beyond these terms
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Fixed:
+    """An entry of a system at one ``parameter (nu,)``, as a function of the time."""
+
+    entry: Any
+    parameter: tuple[float, ...]
+
+    def __call__(self, p: Any) -> object:
+        whole, nothing = np.empty(1 + len(self.parameter), dtype=object), 0.0 * p[0]
+        whole[0] = p[0]
+        for j, value in enumerate(self.parameter):
+            whole[1 + j] = nothing + value
+        return self.entry(whole)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """``[A B E]`` from ``start`` to ``stop``, part by part of the shares' monomials: polynomials in the time since
+    ``centre``, and balls ``left`` that hold what stands before the next power of it."""
+
+    start: float
+    stop: float
+    centre: float
+    law: list[list[list[arb_poly]]]
+    left: list[list[list[arb]]]
+
+
+@final
+@dataclass(eq=False)
+class SpreadFlow:
+    """The system ``x' = A(t, p) x + B(t, p) u + E(t, p) w`` from 0 to ``until``; a drift is one more column of
+    ``B``."""
+
+    system: VaryingSystem
+    until: float
+    _at: dict[tuple[float, ...], VaryingFlow] = field(default_factory=dict)
+    _known: dict[tuple[float, float], tuple[Series, Series, Series]] = field(default_factory=dict)
+
+    def at(self, parameter: Sequence[float]) -> VaryingFlow:
+        """The flow at one parameter."""
+        point = tuple(map(float, parameter))
+        if point not in self._at:
+            self._at[point] = VaryingFlow(self._fixed(point), self.until)
+        return self._at[point]
+
+    def _fixed(self, point: tuple[float, ...]) -> VaryingSystem:
+        laws = []
+        for begin, until, law in self.system.laws:
+            A, B, E, c = (Fixed(e, point) if callable(e) else e for e in map(law.entry, ("A", "B", "E", "c")))
+            laws.append((begin, LinearSystem(A, B, E, Box([begin], [until]), ("t",), c)))  # type: ignore[arg-type]
+        return VaryingSystem(laws[0][1], self.system.horizon, self.system.delay, tuple(laws[1:]))
+
+    @cached_property
+    def parts(self) -> Parts:
+        """The parameters as shares of the most that they deviate from the middle."""
+        assert self.system.parameters is not None
+        return Parts(self.system, tuple(self.system.parameters.interior_point().tolist()))
+
+    @cached_property
+    def _looks(self) -> tuple[Array, int, float, Array]:
+        """About how large the entries of ``A`` are in the middle of the box, ``(d, d)``; the largest degree of an
+        entry; the integral of the norms of what the parameters add to ``A``; and how large inputs are, ``(m +
+        mw,)``."""
+        d = self.system.states
+        every, drives, degree = np.zeros((d, d)), np.zeros(1), 0
+        tables = []
+        for begin, until, law in self.system.laws:
+            for time in np.linspace(begin, until, LOOKS).tolist():
+                found = self._coefficients(law, time)
+                sizes = {key: np.abs(table.astype(float)) for key, table in found.items()}
+                every = np.maximum(every, sizes[FREE][:, :d])
+                drives = np.maximum(drives, sum(sizes.values())[:, d:].max(axis=0))
+                degree = max(degree, *(len(key) for key in sizes))
+                tables.append(((until - begin) / LOOKS, sizes))
+        u = np.array(balanced(every, self.system.horizon, np.ones(d) / self.system.horizon))
+        pace = sum(
+            width * float((table[:, :d] * u / u[:, None]).sum(axis=1).max())
+            for width, sizes in tables
+            for key, table in sizes.items()
+            if key
+        )
+        return u, degree, pace, drives
+
+    @property
+    def units(self) -> Array:
+        """Units of the states, powers of two; any would be right."""
+        return self._looks[0]
+
+    @cached_property
+    def monomials(self) -> Monomials:
+        """Those of the shares; raises `Unchecked` where too many were needed."""
+        nu, (_, powers, pace, _) = len(self.parts.middle), self._looks
+        for left, most in LEFT:
+            for degree in range(powers, MOST_DEGREE + 1):
+                small = pace ** (degree + 1) / factorial(degree + 1) <= left
+                if small and self.system.states * comb(nu + degree, nu) <= most:
+                    return Monomials(nu, degree)
+        raise Unchecked("the parameters beside the time move the state further than an expansion reaches")
+
+    def _coefficients(self, law: LinearSystem, time: object) -> dict[tuple[int, ...], np.ndarray]:
+        """``[A B E]`` at a time, by the numbers of the shares."""
+        entries = [law.A, law.B, *([] if law.c is None else [law.c]), law.E]
+        every = [self.parts.coefficients(one, time) for one in entries]
+        keys = dict.fromkeys(key for one in every for key in one)
+        return {
+            key: np.hstack([one.get(key, np.zeros(one[FREE].shape, dtype=object)) for one in every]) for key in keys
+        }
+
+    def _table(self, law: LinearSystem, centre: arb, length: int) -> list[list[list[list[arb]]]]:
+        """The first coefficients in time of every entry of ``[A B E]``, part by part, at all times of a ball."""
+        from flint import arb, ctx
+
+        before, ctx.cap = ctx.cap, length
+        try:
+            found = self._coefficients(law, Timed.time(centre, length))
+            none = [arb(0)] * length
+            rows, columns = found[FREE].shape
+            parts = [[[none] * columns for _ in range(rows)] for _ in range(self.monomials.size)]
+            for key, table in found.items():
+                exponents = tuple(key.count(j) for j in range(self.monomials.count))
+                for (i, j), one in np.ndenumerate(table):
+                    if isinstance(one, Timed):
+                        parts[self.monomials.number[exponents]][i][j] = one.coefficients(length)
+                    elif float(one) != 0.0:
+                        parts[self.monomials.number[exponents]][i][j] = [arb(float(one)), *none[1:]]
+            return parts
+        finally:
+            ctx.cap = before
+
+    @cached_property
+    def segments(self) -> list[Segment]:
+        """The system on parts of the horizon, one after another; raises `Unchecked` where it is not finite."""
+        horizon, found = self.until, []
+        cuts = [*(begin for begin, _, _ in self.system.laws), horizon]
+        todo = [
+            (start, stop, law)
+            for (begin, until), (_, _, law) in zip(pairwise(cuts), self.system.laws, strict=True)
+            for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
+        ][::-1]
+        while todo:
+            start, stop, law = todo.pop()
+            made = self._segment(start, stop, law)
+            if made is not None:
+                found.append(made)
+                continue
+            if stop - start <= SHORTEST * horizon:
+                raise Unchecked(f"near t = {start:.9g} the system is not enclosed")
+            middle = (start + stop) / 2
+            todo += [(middle, stop, law), (start, middle, law)]
+        return found
+
+    def _segment(self, start: float, stop: float, law: LinearSystem) -> Segment | None:
+        """The system from ``start`` to ``stop``; ``None`` where that is too long."""
+        from flint import arb, arb_poly
+
+        centre = (start + stop) / 2
+        half = upper(abs(arb(stop) - arb(centre)).max(abs(arb(start) - arb(centre))))
+        try:
+            exact = self._table(law, arb(centre), ORDER + 1)
+            wide = self._table(law, arb(start).union(arb(stop)), ORDER + 2)
+        except Unchecked:
+            return None
+        d, u, drives = self.system.states, self.units.tolist(), self._looks[3]
+        size, lost = arb(0), arb(0)
+        for i in range(d):
+            sums, over = arb(0), arb(0)
+            for part, rest in zip(exact, wide, strict=True):
+                for j, entry in enumerate(part[i]):
+                    left = upper(abs(rest[i][j][ORDER + 1])) * half ** (ORDER + 1)
+                    if j >= d:
+                        if not left <= arb(SHARP) * arb(float(drives[j - d]) or 1.0):
+                            return None
+                        continue
+                    far = sum((upper(abs(one)) * half**k for k, one in enumerate(entry)), arb(0))
+                    sums, over = sums + far * u[j] / u[i], over + left * u[j] / u[i]
+            size, lost = size.max(sums), lost.max(over)
+        most = size.max(arb(1.0 / self.system.horizon))
+        if not (size * (arb(stop) - arb(start)) <= LONG and lost <= arb(SHARP) * most):
+            return None
+        return Segment(
+            start,
+            stop,
+            centre,
+            [[[arb_poly(entry) for entry in row] for row in part] for part in exact],
+            [[[entry[ORDER + 1] for entry in row] for row in part] for part in wide],
+        )
+
+    @cached_property
+    def ends(self) -> list[float]:
+        """Where the segments end."""
+        return [one.stop for one in self.segments]
+
+    @cached_property
+    def _begins(self) -> list[float]:
+        return [one.start for one in self.segments]
+
+    def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
+        """What an interval makes of a state, of a control that stays the same, and of such a disturbance."""
+        if not 0.0 <= start <= stop <= self.until:
+            raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
+        if (start, stop) not in self._known:
+            d, m = self.system.states, self.system.controls + (self.system.c is not None)
+            first = max(0, bisect_right(self._begins, start) - 1)
+            last = max(first, bisect_right(self._begins, np.nextafter(stop, -np.inf)) - 1)
+            times = [start, *self._begins[first + 1 : last + 1], stop]
+            whole: tuple[Series, Series] | None = None
+            for number, (one, other) in enumerate(pairwise(times), first):
+                terms, rest = self._series(self.segments[number], one, other)
+                total = rest
+                for term in reversed(terms):
+                    total = total + term
+                part = _columns(total, 0, d), _columns(total, d, None)
+                whole = part if whole is None else (part[0] * whole[0], part[0] * whole[1] + part[1])
+            assert whole is not None
+            self._known[start, stop] = whole[0], _columns(whole[1], 0, m), _columns(whole[1], m, None)
+        return self._known[start, stop]
+
+    def within(self, start: float, stop: float, order: int) -> tuple[list[Series], Series]:
+        """What an interval within one segment makes of states and of inputs that stay the same: coefficients of powers
+        of the share of the interval, up to ``order``, and balls that hold the rest."""
+        segment = self.segments[max(0, bisect_right(self._begins, start) - 1)]
+        if not 0.0 <= start <= stop <= segment.stop:
+            raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
+        terms, rest = self._series(segment, start, stop)
+        for term in terms[order + 1 :]:
+            rest = rest + Series(self.monomials, [_around(part) for part in term.parts])
+        return terms[: order + 1], rest
+
+    def _series(self, segment: Segment, start: float, stop: float) -> tuple[list[Series], Series]:
+        """The terms of the solution of ``Y' = h A Y + [0, h B, h E]``, ``Y(0) = [I, 0, 0]``, in powers of the share of
+        the interval, and balls around 0 that hold the rest: its tail by Cauchy's bound, for the norms of coefficients
+        are at most those of ``y' = a(s) y + b(s)``, and what the segment leaves out, by variation of constants."""
+        from flint import arb, arb_poly
+
+        d, h, u = self.system.states, arb(stop) - arb(start), [arb(one) for one in self.units.tolist()]
+        shifted, none = arb_poly([arb(start) - arb(segment.centre), h]), arb(0)
+        table = [[[(entry(shifted) * h).coeffs() for entry in row] for row in part] for part in segment.law]
+        order = max(1, *(len(entry) for part in table for row in part for entry in row))
+        columns = len(table[0][0])
+        A, driven, a_sizes, b_sizes = [], [], [], []
+        for k in range(order):
+            rows = [[[entry[k] if k < len(entry) else none for entry in row] for row in part] for part in table]
+            A.append(Series(self.monomials, [stacked([row[:d] for row in part]) for part in rows]))
+            driven.append(Series(self.monomials, [stacked([[none] * d + row[d:] for row in part]) for part in rows]))
+            a_sizes.append(upper(sum((self._norm(part, d, u) for part in rows), none)))
+            b_sizes.append([
+                upper(sum((_largest([upper(abs(row[j])) / u[i] for i, row in enumerate(part)]) for part in rows), none))
+                for j in range(d, columns)
+            ])  # fmt: skip
+        first = stacked([[arb(int(i == j)) for j in range(columns)] for i in range(d)])
+        terms, tails = [Series.constant(self.monomials, first)], _Tails(a_sizes)
+        count = next((one for one in TERMS if tails.of(one, None) <= arb(SHARP)), TERMS[-1])
+        for n in range(count):
+            nexts = A[0] * terms[n]
+            for k in range(1, min(n + 1, order)):
+                if any(A[k].there):
+                    nexts = nexts + A[k] * terms[n - k]
+            if n < order:
+                nexts = nexts + driven[n]
+            terms.append(nexts.scaled(1 / arb(n + 1)))
+        far = upper(abs(arb(segment.stop) - arb(segment.centre)).max(abs(arb(segment.start) - arb(segment.centre))))
+        rest = [
+            [[upper(abs(one)) * far ** (ORDER + 1) * upper(abs(h)) for one in row] for row in part]
+            for part in segment.left
+        ]
+        r, a = upper(sum((self._norm(part, d, u) for part in rest), none)), upper(sum(a_sizes, none))
+        spread = (a + r).exp() * a.exp()
+        state = tails.of(count, None) + r * spread
+        errors = [[state * u[i] / u[j] for j in range(d)] for i in range(d)]
+        for j in range(d, columns):
+            forced = [one[j - d] for one in b_sizes]
+            missing = sum((_largest([row[j] / u[i] for i, row in enumerate(part)]) for part in rest), none)
+            error = tails.of(count, forced) + spread * (r * sum(forced, none) + missing)
+            for i in range(d):
+                errors[i].append(error * u[i])
+        around = stacked([[_wider(none, one) for one in row] for row in errors])
+        return terms, Series(self.monomials, [around] * self.monomials.size)
+
+    @staticmethod
+    def _norm(part: Sequence[Sequence[arb]], d: int, u: Sequence[arb]) -> arb:
+        """The norm of largest row sums, in own units, of the first ``d`` columns."""
+        return _largest(
+            [sum((upper(abs(row[j])) * u[j] / u[i] for j in range(d)), u[0] * 0) for i, row in enumerate(part)]
+        )
+
+    @cached_property
+    def marks(self) -> list[float]:
+        """Where segments begin and end."""
+        return [0.0, *self.ends]
+
+    def _degrees(self, sizes: Array) -> Array:
+        """The norms ``(..., M)`` of all parts summed by their degree, ``(..., D + 1)``."""
+        degrees = np.array([sum(e) for e in self.monomials.exponents])
+        found = [sizes[..., degrees == j].sum(axis=-1) for j in range(self.monomials.degree + 1)]
+        return np.stack(found, axis=-1) * OUTWARD
+
+    @cached_property
+    def _most(self) -> tuple[Array, Array]:
+        """The norms of ``A`` on every segment by degree, ``(K, D + 1)``, and those of the columns of ``[B E]``, ``(K, m
+        + mw, D + 1)``, all in own units."""
+        d, u, states, inputs = self.system.states, self.units, [], []
+        for one in self.segments:
+            far = upper(abs(_ball(one.stop) - _ball(one.centre)).max(abs(_ball(one.start) - _ball(one.centre))))
+            table = np.array([
+                [
+                    [
+                        float((sum((upper(abs(c)) * far**k for k, c in enumerate(entry.coeffs())), far * 0)
+                               + upper(abs(left)) * far ** (ORDER + 1)).upper())
+                        for entry, left in zip(*rows, strict=True)
+                    ]
+                    for rows in zip(*part, strict=True)
+                ]
+                for part in zip(one.law, one.left, strict=True)
+            ])  # fmt: skip
+            states.append((table[:, :, :d] * u / u[:, None]).sum(axis=2).max(axis=1) * OUTWARD)
+            inputs.append((table[:, :, d:] / u[:, None]).max(axis=1).T * OUTWARD)
+        return self._degrees(np.array(states)), self._degrees(np.array(inputs))
+
+    @cached_property
+    def _lengths(self) -> Array:
+        return np.diff(self.marks) * (1.0 + rounding(2))
+
+    @cached_property
+    def _within_norms(self) -> Array:
+        """What a segment makes of norms by degree, anywhere on it, ``(K, D + 1, D + 1)``."""
+        sizes, n = self._most[0], self.monomials.degree + 1
+        rate = np.zeros((len(sizes), n, n))
+        for j in range(n):
+            for i in range(j + 1):
+                rate[:, j, i] = sizes[:, j - i]
+        rate = rate * self._lengths[:, None, None]
+        total, term = np.tile(np.eye(n), (len(sizes), 1, 1)), np.tile(np.eye(n), (len(sizes), 1, 1))
+        for order in range(1, EXPONENTIAL):
+            term = term @ rate / order
+            total = total + term
+        return (total + REST) * OUTWARD
+
+    def _beyond(self, norms: Array) -> float:
+        """The integral over the horizon of what is beyond the degree where the state's norms by degree are at most
+        ``norms (K, D + 1)`` on every segment."""
+        sizes = np.cumsum(self._most[0][:, ::-1], axis=1)
+        factors = np.concatenate([np.zeros((len(sizes), 1)), sizes[:, :-1]], axis=1)
+        return float(((norms * factors).sum(axis=1) * self._lengths).sum() * OUTWARD)
+
+    @cached_property
+    def _carried(self) -> Array:
+        """The largest norms by degree of the transitions from the beginning of any segment to that of any later one,
+        ``(D + 1,)``; of the computed products, and of what these are off by: with ``P`` the largest of their summed
+        norms and ``e`` the sum of what all steps are off by, ``P^2 e / (1 - P e)``."""
+        d, u, M, first = self.system.states, self.units, self.monomials.size, np.array(self.monomials.products)
+        steps = [self.over(*ends)[0] for ends in pairwise(self.marks)]
+        tables = Enclosed.all([part for one in steps for part in one.parts], (len(steps), M, d, d))
+        mid, rad = (one * u / u[:, None] for one in (tables.mid, tables.rad))
+        every = np.zeros((0, M, d, d))
+        unit = np.zeros((1, M, d, d))
+        unit[0, 0] = np.eye(d)
+        found, largest = self._degrees(_row_sums(unit))[0], 1.0
+        for step in mid:
+            every, moved = np.concatenate([every, unit]), np.zeros((len(every) + 1, M, d, d))
+            for i, j, k in first.tolist():
+                moved[:, k] += step[i] @ every[:, j]
+            every = moved
+            norms = _row_sums(every)
+            found, largest = (
+                np.maximum(found, self._degrees(norms).max(axis=0)),
+                max(largest, float(norms.sum(axis=1).max())),
+            )
+        sizes = _row_sums(mid).sum(axis=1)
+        off = float((_row_sums(rad).sum(axis=1) + rounding(d * M) * sizes).sum()) * OUTWARD
+        share = largest * off * OUTWARD
+        if not share < 0.5:
+            raise Unchecked("the transitions are not known closely enough")
+        return np.asarray((found + largest * share / (1.0 - share)) * OUTWARD)
+
+    def lost(self, begun: Array, inputs: Array) -> Array:
+        """What is beyond the degree of any state, ``(d,)``, that begins at no more than ``begun (d,)`` and is driven by
+        at most ``inputs (m + mw,)``."""
+        sizes, lengths, u, n = self._most, self._lengths, self.units, self.monomials.degree + 1
+        driven = np.einsum("kcj,c->kj", sizes[1], inputs)
+        ends = float(np.exp((sizes[0].sum(axis=1) * lengths).max())) * OUTWARD
+        carried, within = self._carried, self._within_norms
+        share = ends * self._beyond(np.einsum("kij,j->ki", within, carried))
+        if not share < 0.5:
+            raise Unchecked("what the expansion in the parameters leaves out is not bounded")
+        growth = ends * ends * float(carried.sum()) / (1.0 - share) * OUTWARD
+        pushed = (np.einsum("kij,kj->ki", within, driven) * lengths[:, None]).sum(axis=0)
+        pushed[0] += float((begun / u).max(initial=0.0))
+        at_marks = np.array([sum(carried[j - i] * pushed[i] for i in range(j + 1)) for j in range(n)])
+        norms = np.einsum("kij,kj->ki", within, at_marks + lengths[:, None] * driven)
+        return growth * self._beyond(norms) * u * OUTWARD
+
+
+@final
+@dataclass(eq=False)
+class SpreadTube:
+    """The reachable states over a ``box`` of parameters, seen along combinations of the rows of ``basis (b, d)``."""
+
+    every: SpreadStates
+    basis: Array
+    box: Corners
+
+    @cached_property
+    def flow(self) -> Known:
+        """The monomials on the box, its middle and half its widths."""
+        low, high = np.array(self.box[0]), np.array(self.box[1])
+        centre = (low + high) / 2
+        radius = np.nextafter(np.maximum(high - centre, centre - low), np.inf)
+        monomials = self.every.law.monomials
+        return Known(monomials, tuple(centre.tolist()), tuple(radius.tolist()), np.ones(monomials.size))
+
+    @cached_property
+    def _recentred(self) -> Enclosed:
+        """What makes of coefficients in the shares those on the box, ``(M, M)``."""
+        from flint import arb
+
+        parts, monomials = self.every.law.parts, self.every.law.monomials
+        moves = []
+        for centre, radius, middle, scale in zip(
+            self.flow.centre, self.flow.radius, parts.middle, parts.scales, strict=True
+        ):
+            unit = arb(scale) if scale else arb(1)
+            moves.append(((arb(centre) - arb(middle)) / unit, arb(radius) / unit))
+        table = []
+        for e in monomials.exponents:  # of the box
+            row = []
+            for f in monomials.exponents:
+                entry = arb(1)
+                for k, n, (c, r) in zip(e, f, moves, strict=True):
+                    entry = entry * comb(n, k) * c ** (n - k) * r**k if n >= k else arb(0)
+                row.append(entry)
+            table.append(row)
+        return Enclosed.of(stacked(table))
+
+    def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
+        """As `Tube.cells`, on a part of a piece within one segment of the system."""
+        scene = self.every.scene
+        state, parts = self.every.over(piece, start, stop)
+        seen = self._seen(state)  # (1, J + 1, M, 1, b)
+        mid = np.einsum("jkb,ib->ijk", seen.mid[0, :, :, 0], z)
+        lost = seen.rad[0, :, :, 0] + rounding(z.shape[1]) * np.abs(seen.mid[0, :, :, 0])
+        rad, kinks, turning = np.abs(z) @ lost.sum(axis=(0, 1)), np.zeros(len(z)), np.zeros(len(z))
+        for convex, part in parts:
+            here = self._seen(part)
+            if convex is scene.disturbance and scene.lasting is not None:
+                here = Enclosed(*scene.lasting.gathered(here.mid, here.rad))
+            moved, off, switching, of_box = bounded(known(convex), self.flow.monomials, here.mid, here.rad, z, sharp)
+            rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
+            mid, kinks, turning = mid + moved, kinks + switching, turning + of_box
+        rad += np.abs(z) @ (np.abs(self.basis) @ self.every.lost) * (1.0 + rounding(sum(self.basis.shape)))
+        assert scene.switches == ()
+        return [
+            Polynomial(mid[i], float(rad[i]) * OUTWARD, 0.0, float(kinks[i]), float(turning[i])) for i in range(len(z))
+        ]
+
+    def _seen(self, states: Enclosed) -> Enclosed:
+        """``basis`` times states ``(l, J + 1, M, d, w)``, on the box, ``(l, J + 1, M, w, b)``."""
+        basis, moves = self.basis, self._recentred
+        mid = np.einsum("bi,ef,ljfiw->ljewb", basis, moves.mid, states.mid, optimize=True)
+        size = np.abs(moves.mid) + moves.rad
+        rough = states.rad + rounding(2 * (basis.shape[1] + moves.mid.shape[0])) * np.abs(states.mid)
+        rad = np.einsum("bi,ef,ljfiw->ljewb", np.abs(basis), size, rough, optimize=True)
+        rad = rad + np.einsum("bi,ef,ljfiw->ljewb", np.abs(basis), moves.rad, np.abs(states.mid), optimize=True)
+        return Enclosed(mid, rad * OUTWARD)
+
+
+@final
+@dataclass(eq=False)
+class SpreadStates:
+    """All coefficients of the reachable states of a system, of which ``law`` is the flow, whatever the box."""
+
+    law: SpreadFlow
+    scene: Scene
+    _over: dict[tuple[int, float, float], tuple[Enclosed, list[Any]]] = field(default_factory=dict)
+
+    @cached_property
+    def _pieces(self) -> list[tuple[Series, Series, Series]]:
+        return [self.law.over(*ends) for ends in pairwise(self.scene.grid)]
+
+    @cached_property
+    def nodes(self) -> list[Series]:
+        """The undisturbed state at the breakpoints of the grid."""
+        x = Series.constant(self.law.monomials, stacked([[_ball(v)] for v in self.scene.initial_state]))
+        found = [x]
+        for (Phi, Gamma, _), u in zip(self._pieces, self.scene.control, strict=True):
+            x = Phi * x + Gamma.applied(u)
+            found.append(x)
+        return found
+
+    @cached_property
+    def _effects(self) -> list[tuple[Enclosed, Enclosed]]:
+        """At every breakpoint what a deviation at 0, ``(M, d, d)``, and the disturbance on every piece before, ``(node,
+        M, d, mw)``, made of the state."""
+        d, mw, M = self.law.system.states, self.law.system.disturbances, self.law.monomials.size
+        after = Series.constant(self.law.monomials, stacked([[_ball(i == j) for j in range(d)] for i in range(d)]))
+        past, found = list[Series](), []
+        for k in range(len(self._pieces) + 1):
+            if k:
+                Phi, _, Delta = self._pieces[k - 1]
+                after, past = Phi * after, [*(Phi * one for one in past), Delta]
+                past = past if self.scene.disturbance is not None else []
+            pushed = Enclosed.all([part for one in past for part in one.parts], (len(past), M, d, mw))
+            found.append((Enclosed.all(after.parts, (M, d, d)), pushed))
+        return found
+
+    def over(self, piece: int, start: float, stop: float) -> tuple[Enclosed, list[Any]]:
+        """On ``[start, stop]``, in powers of the share of it: the undisturbed state, ``(1, J + 1, M, d, 1)``, and the
+        sets of what is uncertain with what each of their members makes of the state, ``(blocks, J + 1, M, d, w)``."""
+        key = piece, start, stop
+        if key in self._over:
+            return self._over[key]
+        law, scene = self.law, self.scene
+        d, M = law.system.states, law.monomials.size
+        m = law.system.controls + (law.system.c is not None)
+        terms, rest = law.within(start, stop, 0 if start == stop else IN_TIME - 1)
+        Phi, Gamma, Delta = law.over(scene.grid[piece], start)
+        u = scene.control[min(piece, len(scene.control) - 1)]
+        x = Phi * self.nodes[piece] + Gamma.applied(u)
+        states = [_columns(one, 0, d) for one in (*terms, rest)]
+        every = [
+            one * x + _columns(whole, d, d + m).applied(u) for one, whole in zip(states, (*terms, rest), strict=True)
+        ]
+        state = _with_rest(every, (M, d, 1))
+        found = []
+        if scene.disturbance is not None and stop > 0.0:
+            carried = _with_rest([one * Phi for one in states], (M, d, d))
+            past = _ring(law.monomials, carried, self._effects[piece][1])
+            now = _with_rest(
+                [one * Delta + _columns(whole, d + m, None) for one, whole in zip(states, (*terms, rest), strict=True)],
+                (M, d, law.system.disturbances),
+            )
+            mid, rad = (np.concatenate([a, b[None]]) for a, b in ((past.mid, now.mid), (past.rad, now.rad)))
+            block = np.searchsorted(np.array(scene.changes), np.array(scene.grid[: len(mid)]), side="right")
+            firsts = np.flatnonzero(np.diff(block, prepend=-1))
+            rad = (rad + rounding(len(mid)) * np.abs(mid)) * OUTWARD
+            mid, rad = (np.add.reduceat(part, firsts, axis=0) for part in (mid, rad))
+            found.append((scene.disturbance, Enclosed(mid, rad)))
+        if scene.initial_set is not None:
+            carried = _with_rest([one * Phi for one in states], (M, d, d))
+            begun = self._effects[piece][0]
+            found.append((
+                scene.initial_set, _ring(law.monomials, carried, Enclosed(begun.mid[None], begun.rad[None]))
+            ))  # fmt: skip
+        self._over[key] = Enclosed(state.mid[None], state.rad[None]), found
+        return self._over[key]
+
+    @cached_property
+    def lost(self) -> Array:
+        """What is beyond the degree, ``(d,)``."""
+        scene = self.scene
+        begun = np.abs(np.array(scene.initial_state))
+        if scene.initial_set is not None:
+            begun = (begun + np.array(known(scene.initial_set).radius)) * OUTWARD
+        control = np.max([[float(upper(abs(v)).upper()) for v in u.entries()] for u in scene.control], axis=0)
+        pushed = np.zeros(self.law.system.disturbances)
+        if scene.disturbance is not None:
+            pushed = np.array(known(scene.disturbance).radius) * OUTWARD
+        return self.law.lost(begun, np.concatenate([control * OUTWARD, pushed]))
+
+
+def _ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
+    """Products of polynomials in time and shares ``(J + 1, M, d, d)`` with such in shares ``(l, M, d, w)``: ``(l, J +
+    1, M, d, w)``."""
+    shape = (len(right.mid), *left.mid.shape[:3], right.mid.shape[3])
+    mid, rad = np.zeros(shape), np.zeros(shape)
+    size, there = np.abs(left.mid), np.abs(right.mid)
+    wide = right.rad + rounding(left.mid.shape[3] * monomials.size) * there
+    for i, j, k in monomials.products:
+        mid[:, :, k] += left.mid[None, :, i] @ right.mid[:, None, j]
+        rad[:, :, k] += size[None, :, i] @ wide[:, None, j] + left.rad[None, :, i] @ (there + right.rad)[:, None, j]
+    return Enclosed(mid, rad * OUTWARD)
+
+
+def _with_rest(parts: Sequence[Series], shape: tuple[int, ...]) -> Enclosed:
+    """Coefficients ``(J + 1, ...)``, the last of ``parts`` being what all of them together leave out."""
+    every = [Enclosed.all(one.parts, shape) for one in parts]
+    mid, rad = (np.array([getattr(one, name) for one in every]) for name in ("mid", "rad"))
+    rad[0] += (np.abs(mid[-1]) + rad[-1]) * OUTWARD
+    return Enclosed(mid[:-1], rad[:-1])
+
+
+def _columns(series: Series, first: int, last: int | None) -> Series:
+    parts = [stacked([row[first:last] for row in part.tolist()]) for part in series.parts]
+    return Series(series.monomials, parts)
+
+
+def _around(matrix: arb_mat) -> arb_mat:
+    """Balls around 0 that hold the entries."""
+    return stacked([[_wider(x * 0, abs(x)) for x in row] for row in matrix.tolist()])
+
+
+def _row_sums(tables: Array) -> Array:
+    """The norms of largest row sums of ``(..., d, d)``."""
+    return np.asarray(np.abs(tables).sum(axis=-1).max(axis=-1))
+
+
+def _ball(value: float) -> arb:
+    from flint import arb
+
+    return arb(float(value))

@@ -1,0 +1,61 @@
+"""Guards the checker's expansion of a state in parameters beside the time, in balls: closed forms are in it, and what
+is beyond its degree is bounded by what is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.checker.arithmetic.jets import Monomials
+from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates, SpreadTube
+from tests.control.response.test_spread_motion import SYSTEM, decay
+
+flint = pytest.importorskip("flint")
+
+
+def flow(degree: int) -> SpreadFlow:
+    made = SpreadFlow(SYSTEM, 3.0)
+    made.__dict__["monomials"] = Monomials(1, degree)
+    return made
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [2, 5])
+def test_what_is_beyond_a_degree_is_bounded(degree: int) -> None:
+    law = flow(degree)
+    (scale,), (middle,) = law.parts.scales, law.parts.middle
+    lost, points, off = float(law.lost(np.ones(1), np.zeros(2))[0]), np.linspace(-0.3, 0.6, 31), 0.0
+    for time in (0.7, 1.5, 3.0):
+        parts = [float(part[0, 0].mid()) for part in law.over(0.0, time)[0].parts]
+        polynomial = np.polynomial.Polynomial(parts)((points - middle) / scale)
+        off = max(off, float(np.abs(polynomial - decay(np.array(time), points)).max()))
+    assert off <= lost <= 1e3 * off
+
+
+def test_a_known_parameter_has_the_flow_of_its_own_system() -> None:
+    found = SpreadFlow(SYSTEM, 3.0).at([0.4]).over(0.5, 2.0)[0][0, 0]
+    exact = (-(flint.arb(1.5) / 2) - flint.arb(0.4) * (flint.arb(1).cos() - flint.arb(4).cos()) / 2).exp()
+    assert abs(found - exact) < 1e-12
+
+
+@pytest.mark.slow
+def test_polynomials_on_boxes_hold_what_the_closed_form_gives_there() -> None:
+    law = SpreadFlow(SYSTEM, 3.0)
+    grid, none = [0.0, 1.5, 3.0], stacked([[flint.arb(0)]])
+    scene = Scene(grid, [none, none], [1.0], None, [], sr.Box([-0.1], [0.2]), ())
+    states, rng = SpreadStates(law, scene), np.random.default_rng(30)
+    cuts = sorted({*grid, *law.ends})
+    for low, high in ((-0.3, 0.6), (0.1, 0.2), (-0.3, -0.3)):
+        tube = SpreadTube(states, np.ones((1, 1)), ((low,), (high,)))
+        for start, stop in ((cuts[2], cuts[3]), (cuts[-2], (cuts[-2] + 2 * cuts[-1]) / 3)):
+            (found,) = tube.cells(int(start >= 1.5), start, stop, np.ones((1, 1)))
+            s, e = rng.uniform(0.0, 1.0, 50), rng.uniform(-1.0, 1.0, 50)
+            truth = 1.2 * decay(start + s * (stop - start), (low + high) / 2 + e * (high - low) / 2)
+            orders = [s**j for j in range(len(found.coefficients))]
+            powers = [e ** sum(one) for one in law.monomials.exponents]
+            told = np.einsum("jm,jk,mk->k", found.coefficients, orders, powers)
+            assert (truth <= told + found.error).all()
+            assert (told - found.error - found.kinks * 2 <= truth + 1e-9).all()

@@ -1,0 +1,247 @@
+"""Guards parameters beside the time that the state does not depend on affinely: costs by closed forms and by systems
+that do not change with time, trajectories of an integrator, each checked."""
+
+from __future__ import annotations
+
+import copy
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import linprog
+
+import sparserob_core as sr
+from sparserob_core.experiment.assemble import assemble
+from sparserob_core.experiment.check.check import check
+from sparserob_core.experiment.config.load import load_config
+from tests.support import tampering
+
+Config = dict[str, Any]
+
+DECAY: Config = {
+    "problem": {
+        "name": "linear",
+        "system": {
+            "A": [["-0.5 - p*sin(2*t)"]],
+            "B": [["1 + p^2"]],
+            "E": [[1]],
+            "parameters": {"p": [-0.3, 0.6]},
+        },
+        "horizon": 3.0,
+        "initial_state": [1.0],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0.02]},
+        "path": [{"box": [0.45], "from": 1.2}],
+        "terminal": [{"box": [0.1]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 6}},
+    "observers": [],
+}
+
+
+def solved(config: Config, directory: Path) -> sr.Outcome:
+    outcome = sr.run(config, out=directory, quiet=True, figures=False)
+    assert check(directory).status == "verified"
+    return outcome
+
+
+def in_units(config: Config, time: float, length: float, unit: float) -> Config:
+    """The same problem of one state with its time, its state and its parameter in other units."""
+    made = copy.deepcopy(config)
+    problem = made["problem"]
+    t, p = f"(t / {time!r})", f"(p / {unit!r})"
+    system = problem["system"]
+    system["A"] = [[f"(-0.5 - {p}*sin(2*{t})) / {time!r}"]]
+    system["B"], system["E"] = [[f"(1 + {p}^2) * {length / time!r}"]], [[f"{length / time!r}"]]
+    system["parameters"] = {"p": [-0.3 * unit, 0.6 * unit]}
+    problem.update(horizon=3.0 * time, initial_state=[length])
+    problem["path"], problem["terminal"] = [{"box": [0.45 * length], "from": 1.2 * time}], [{"box": [0.1 * length]}]
+    return made
+
+
+def least() -> float:
+    """The least cost of `DECAY`: ``x(t) = int exp(a(t) - a(s)) (...) ds`` with ``a(t) = -t / 2 - p (1 - cos 2t) / 2``,
+    at many parameters and times: a bound from below that misses little."""
+    N, fine = 6, 400
+    marks = np.linspace(0.0, 3.0, N * fine + 1)
+    middles, width = (marks[:-1] + marks[1:]) / 2, 3.0 / (N * fine)
+    rows, limits = [], []
+    for p in np.linspace(-0.3, 0.6, 61).tolist():
+        a, inside = (-one / 2 - p * (1 - np.cos(2 * one)) / 2 for one in (marks, middles))
+        for k, t in enumerate(marks.tolist()):
+            if t < 1.2 - 1e-9 or (k % 10 and k < marks.size - 1):
+                continue
+            gains = (np.exp(a[k] - inside) * (middles < t) * width).reshape(N, -1).sum(axis=1)
+            limit, begun = (0.1 if k == marks.size - 1 else 0.45), float(np.exp(a[k]))
+            for sign in (1.0, -1.0):
+                rows.append(sign * (1 + p * p) * gains)
+                limits.append(limit - 0.02 * gains.sum() - sign * begun)
+    G = np.array(rows)
+    found = linprog(np.full(2 * N, 3.0 / N), np.hstack([G, -G]), limits, bounds=(0, 1.0))
+    assert found.success
+    return float(found.fun)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("units", [None, (3600.0, 1e-3, 50.0)])
+def test_a_decay_at_an_uncertain_rate_costs_what_its_closed_form_says(
+    units: tuple[float, float, float] | None, tmp_path: Path
+) -> None:
+    config, time = (DECAY, 1.0) if units is None else (in_units(DECAY, *units), units[0])
+    outcome = solved(config, tmp_path / "run")
+    assert outcome.result.status == "certified"
+    assert outcome.result.cost / time == pytest.approx(least(), rel=2e-5)  # by the rule of midpoints, and between rows
+
+
+SPRING: Config = {
+    "problem": {
+        "name": "linear",
+        "system": {
+            "A": [[0, 1], ["-1 + p", -0.4]],
+            "B": [[0.2, 0], [0, "1 + p"]],
+            "E": [[1, 0], [0, "1 + p/2"]],
+            "c": [0, "0.05 + p - p^2"],
+            "parameters": {"p": [-0.05, 0.08]},
+        },
+        "horizon": 3.0,
+        "initial_state": [-0.5, 0.5],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0.03, 0.03]},
+        "path": [{"box": [0.6, None], "from": 0.2}],
+        "terminal": [{"box": [0.25, 0.25]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 6}},
+    "observers": [],
+}
+ADDED: dict[str, Config] = {
+    "initial set and integral": {
+        "initial_state": {"centre": [-0.5, 0.5], "box": [0.02, 0.02]},
+        "integral": [{"H": [[1, 0]], "G": [[0, 0.1]], "from": 0, "to": 2.5, "lower": [-0.3], "upper": [0.5]}],
+    },
+    "curved, moving and mixed": {
+        "path": [
+            {"ellipsoid": {"centre": [0, 0], "shape": [[0.5, 0], [0, 0.6]]}, "from": 0.5},
+            {"box": [0.8, None], "from": 0.3, "relative_to": [[0, -0.2, 0], [3, 0.1, 0]]},
+            {"mixed": {"H": [[0, 1]], "G": [[0.2, 0.5]], "h": [0.9]}, "from": 0.5},
+        ]
+    },
+    "quadratic cost and a list": {
+        "cost": {"l1": 1.0, "control": {"R": [[0.1, 0], [0, 0.1]]}, "state": {"Q": [[0.1, 0], [0, 0]]}},
+        "disturbance": [{"set": {"box": 0.03}, "E": [[1], [0]]}, {"set": {"box": 0.02}, "E": [[0], [1]], "pieces": 3}],
+    },
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("added", ADDED)
+def test_entries_that_do_not_change_cost_what_the_system_without_the_time_does(added: str, tmp_path: Path) -> None:
+    config = copy.deepcopy(SPRING)
+    config["problem"].update(copy.deepcopy(ADDED[added]))
+    plain = sr.run(config, out=tmp_path / "plain", quiet=True, figures=False)
+    dressed = copy.deepcopy(config)
+    dressed["problem"]["system"]["A"][1][1] = "-0.4 + 0*t"
+    ours = solved(dressed, tmp_path / "dressed")
+    assert ours.result.status == plain.result.status == "certified"
+    assert ours.result.cost == pytest.approx(plain.result.cost, rel=1e-6)
+
+
+MATHIEU: Config = {
+    "problem": {
+        "name": "linear",
+        "system": {
+            "A": [[0, 1], ["-(1 + p) - (0.4 + p^2)*cos(2*t)", "-0.1 - 0.2*p"]],
+            "B": [[0], ["1 / (1 - t/20)"]],
+            "E": [[0], [1]],
+            "parameters": {"p": [-0.1, 0.15]},
+            "delay": 0.3,
+        },
+        "horizon": 5.0,
+        "initial_state": {"centre": [-0.4, 0.5], "box": [0.02, 0.02]},
+        "control": {"box": 1.5},
+        "disturbance": {"box": [0.02]},
+        "path": [{"box": [0.7, None], "from": 0.2}],
+        "terminal": [{"box": [0.25, 0.3]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 10}},
+    "observers": [],
+}
+
+
+@pytest.fixture(scope="module")
+def mathieu(tmp_path_factory: pytest.TempPathFactory) -> tuple[sr.Outcome, Path]:
+    out = tmp_path_factory.mktemp("mathieu") / "run"
+    outcome = solved(MATHIEU, out)
+    assert outcome.result.status == "certified"
+    return outcome, out
+
+
+@pytest.mark.slow
+def test_mathieus_equation_with_an_uncertain_stiffness_stays_inside(mathieu: tuple[sr.Outcome, Path]) -> None:
+    values, rng, closest = mathieu[0].result.control.values[0], np.random.default_rng(30), np.inf
+    for _ in range(12):
+        p, noise = rng.choice([-0.1, 0.15, rng.uniform(-0.1, 0.15)]), rng.choice([-0.02, 0.02], 10)
+        state = np.array([-0.4, 0.5]) + 0.02 * rng.choice([-1.0, 1.0], 2)
+        marks = sorted({*np.linspace(0.0, 5.0, 11).tolist(), *(np.linspace(0.0, 4.5, 10) + 0.3).tolist()})
+        for begin, until in pairwise(marks):
+            middle = (begin + until) / 2
+            given = 0.0 if middle < 0.3 else values[int((middle - 0.3) * 2)]
+
+            def rate(t: float, x: np.ndarray, p=p, u=given, w=noise[int(2 * middle)]) -> list[float]:
+                spring = -(1 + p) - (0.4 + p**2) * np.cos(2 * t)
+                return [x[1], spring * x[0] - (0.1 + 0.2 * p) * x[1] + u / (1 - t / 20) + w]
+
+            times = np.linspace(begin, until, 9)
+            path = solve_ivp(rate, (begin, until), state, t_eval=times, rtol=1e-10, atol=1e-12).y
+            state = path[:, -1]
+            inside = np.abs(path[0, times >= 0.2])
+            assert inside.max(initial=0.0) <= 0.7 + 1e-8
+        assert abs(state[0]) <= 0.25 + 1e-8
+        assert abs(state[1]) <= 0.3 + 1e-8
+        closest = min(closest, 0.25 - abs(state[0]), 0.3 - abs(state[1]))
+    assert closest < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change",
+    [
+        tampering.system(parameters={"p": [-0.101, 0.15]}),
+        tampering.system(parameters={"p": [-0.1, 0.151]}),
+        tampering.system(A=[[0, 1], ["-(1 + p) - (0.401 + p^2)*cos(2*t)", "-0.1 - 0.2*p"]]),
+        tampering.system(A=[[0, 1], ["-(1 + 1.02*p) - (0.4 + p^2)*cos(2*t)", "-0.1 - 0.2*p"]]),
+        tampering.system(A=[[0, 1], ["-(1 + p) - (0.4 + 2*p^2)*cos(2*t)", "-0.1 - 0.2*p"]]),
+    ],
+    ids=["a lower end", "an upper end", "an entry", "a slope", "a square"],
+)
+def test_parameters_that_are_changed_afterwards_are_found(
+    change: tampering.Change, mathieu: tuple[sr.Outcome, Path], tmp_path: Path
+) -> None:
+    assert check(tampering.forged(mathieu[1], tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
+def changed(**problem: Any) -> Config:
+    made = copy.deepcopy(DECAY)
+    made["problem"].update(problem)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("problem", "said"),
+    [
+        ({"terminal": [{"equals": [0.0]}]}, "fixed final values"),
+        ({"disturbance_class": "measurable"}, "measurable disturbances"),
+        ({"execution": [0.01]}, "errors of execution"),
+    ],
+)
+def test_what_is_not_built_beside_them_is_refused_by_name(problem: Config, said: str) -> None:
+    with pytest.raises(sr.InputError, match=rf"system\.parameters: .*{said}"):
+        assemble(load_config(changed(**problem)))
+
+
+def test_a_box_over_which_no_expansion_reaches_is_refused() -> None:
+    system = {"A": [["-0.5 - p*sin(2*t) + q"]], "B": [[1]], "parameters": {"p": [-30, 60], "q": [-1, 1]}}
+    with pytest.raises(sr.InputError, match=r"system\.parameters: .*expansion"):
+        assemble(load_config(changed(system=system, disturbance=None)))
