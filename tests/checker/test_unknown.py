@@ -20,6 +20,7 @@ from sparserob_core.checker.reach import effort
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.turns import in_turns
 from sparserob_core.checker.sets import flat
 from sparserob_core.control.policies import policy
 from sparserob_core.control.policies.affine import AffinePolicy
@@ -66,6 +67,9 @@ def forced(case: Case, **fields: Any) -> Case:
     return made
 
 
+UNSURE = LinearSystem([[0.0]], [[1.0]], parameters=NormBall(2.0, 0.1, dimension=2), names=("p", "q"))
+
+
 def returning(case: Case) -> object:
     return replace(case, given=None)
 
@@ -103,7 +107,12 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "errors of execution of a policy": (
         lambda: replace(kind("alone").case(execution=np.array([0.1, 0.2])), policy=AffinePolicy()).execution,
         Unchecked,
-        "undelayed and without feedback",
+        "of known systems, without feedback",
+    ),
+    "parameters in no box beside errors of execution": (
+        lambda: in_turns(forced(test_lists.case_of("of two classes"), execution=[0.1], system=UNSURE).problem),
+        Unchecked,
+        "boxes of parameters",
     ),
     "fixed states under two classes": (
         lambda: constraints.missed(test_lists.case_of("of two classes", terminal=[Equality([0.0, None])])),

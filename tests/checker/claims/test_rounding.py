@@ -126,7 +126,8 @@ def test_a_bound_of_a_time_rounds_down(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(activity, "_vectors", lambda case: np.array([0.25, 0.75]))
     monkeypatch.setattr(activity, "_lengths", lambda case: [])
     low = arb(1) + arb(2) ** -52 - arb(2) ** -80
-    case: Any = SimpleNamespace(duality=SimpleNamespace(summed=lambda rows, pieces: (low, [])))
+    duality = SimpleNamespace(summed=lambda rows, pieces: (low, []), charged=lambda rows, costs: costs)
+    case: Any = SimpleNamespace(duality=duality, problem=SimpleNamespace(system=SimpleNamespace(controls=1)))
     for found in (activity._whole(case, low), activity._leaf(case, True, {}, [])):
         assert arb(found) <= low
         assert found > 1.0 - 1e-12

@@ -684,18 +684,24 @@ def test_a_vector_that_is_offered_for_a_norm_closes_the_bound_in_a_corner_and_ne
         decision=((0.0, 0.0), (0.0, 0.0)), control=Polytope(normals, (normals * corners).sum(axis=1)),
         cost=sr.Cost(group="all"), **plane,
     )  # fmt: skip
-    shares = np.linspace(0.0, 1.0, 401)[:, None]
+    shares = np.linspace(0.0, 1.0, 1601)[:, None]
     ends = np.roll(corners, -1, axis=0)
     edges = np.concatenate([(1.0 - shares) * a + shares * b for a, b in zip(corners, ends, strict=True)])
-    for _ in range(20):
+    for number in range(30):
         slope, weight = rng.normal(size=2) * 3.0, rng.uniform(0.2, 1.5)
-        values = weight * np.linalg.norm(edges, axis=1) + edges @ slope
+        sizes = rng.uniform(0.1, 0.8, size=2) * (number >= 20)  # that absolute values cost beside the norm
+        values = weight * np.linalg.norm(edges, axis=1) + np.abs(edges) @ sizes + edges @ slope
         least, best = min(0.0, float(values.min())), edges[values.argmin()]
-        told = [arb(float(v)) for v in slope]
-        given = ([arb(weight)] * 2, told, [[0, 1]], [arb(0.3), arb(0.1)])
+        told, beside = ([arb(float(v)) for v in part] for part in (slope, sizes))
+        given = ([arb(weight)] * 2, beside, told, [[0, 1]], [arb(0.3), arb(0.1)])
         bounds = [
             float(case.duality._least_of_groups(*given, None if one is None else [arb(float(v)) for v in one]).mid())
-            for one in (None, weight * best / np.linalg.norm(best), 9.0 * rng.normal(size=2), -slope)
+            for one in (
+                None,
+                weight * best / np.linalg.norm(best) + sizes * np.sign(best),
+                9.0 * rng.normal(size=2),
+                -slope,
+            )
         ]
         assert all(bound <= least + 1e-12 for bound in bounds)
         assert bounds[1] == max(bounds) and (least == 0.0 or bounds[1] >= least - 1e-3 * weight)
