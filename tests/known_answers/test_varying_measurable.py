@@ -216,9 +216,8 @@ def test_a_constant_plant_costs_the_same_as_a_function_of_time(more: str, tmp_pa
         ({"problem": {"disturbance": {"ellipsoid": {"centre": [0, 0], "shape": [[0.1, 0], [0, 0.1]]}}}},
          r"problem\.disturbance: expected a box"),
         ({"policy": {"name": "affine"}}, "a system that stays the same with time under measurable disturbances"),
-        ({"problem": {"execution": 0.1}}, r"problem\.execution.*measurable disturbances"),
     ],
-    ids=["diamond", "ellipsoid", "feedback", "execution"],
+    ids=["diamond", "ellipsoid", "feedback"],
 )  # fmt: skip
 def test_what_is_not_proven_beside_them_is_refused_by_name(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
     config = {"dictionaries": {"control": pieces(4)}, "observers": [], **changes}
