@@ -102,7 +102,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "measurable in a ball, in time": (
         lambda: forced(test_lists.case_of("in time, measurable"), disturbance=NormBall(2.0, 0.1, dimension=2)).strayed,
         Unchecked,
-        "measurable disturbances in boxes only",
+        "measurable disturbances in boxes and polytopes only",
     ),
     "errors of execution of a policy": (
         lambda: replace(kind("alone").case(execution=np.array([0.1, 0.2])), policy=AffinePolicy()).execution,

@@ -114,12 +114,20 @@ def test_a_system_that_is_changed_afterwards_is_found(change: tampering.Change, 
     ("changes", "said"),
     [
         (
-            {"disturbance": {"norm": {"p": 2, "radius": 0.1}}, "disturbance_class": "measurable"},
-            "disturbance: expected a box where the system changes with time and disturbances are measurable",
+            {
+                "system": {"A": [["-1/(1 + t)"]], "B": [[1]], "E": [[1, "t"]]},
+                "disturbance": {"norm": {"p": 2, "radius": 0.1}},
+                "disturbance_class": "measurable",
+            },
+            "disturbance: expected a box or a polytope where the system changes with time",
+        ),
+        (
+            {"system": {"A": [["exp(p*t)"]], "B": [[1]], "parameters": {"p": [0, 1]}}},
+            r"system\.A\.0\.0: expected polynomials in the parameters",
         ),
         (
             {"system": {"A": [["t + p"]], "B": [[1]], "parameters": {"p": [0, 1]}}},
-            r"system\.A\.0\.0: expected parameters that the state depends on affinely",
+            r"system\.parameters: expected none beside fixed final values",
         ),
         ({"system": {"A": [["a"]], "B": [[1]], "define": {"a": "b*t", "b": "a"}}}, r"system\.define\.a: .*circle"),
         ({"system": {"A": [["a"]], "B": [[1]], "define": {"a": "q*t"}}}, r"system\.define\.a: .*unknown name 'q'"),

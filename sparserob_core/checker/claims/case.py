@@ -18,11 +18,12 @@ from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.cost.price import Price
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion
+from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.integrals import integrating, spelt
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
-from sparserob_core.checker.reach.measurable import Execution
+from sparserob_core.checker.reach.measurable import Execution, Side
 from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
@@ -366,7 +367,7 @@ class Case:
     @cached_property
     def held(self) -> ConvexSet | None:
         """The set of the disturbances of which every one stays the same between `changes`: of a system that changes
-        with time, measurable ones are in the middle of their box, and `strayed` says how far they may be from that."""
+        with time, measurable ones are in the middle of their set, and `strayed` says how far they may be from that."""
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
         if self.looped or not self.measurable or bound is None:
             return bound
@@ -386,25 +387,28 @@ class Case:
     @cached_property
     def strayed(self) -> VaryingExecution | None:
         """What measurable disturbances of a system that changes with time do beside the middle of their box: a command
-        of 1 through the columns of ``E`` that is missed by half the widths. ``None`` where there are none."""
+        of 1 through the columns of ``E`` that is missed by half the widths; of a polytope all of it at once, counted
+        from its middle. ``None`` where there are none."""
         bound = self.problem.measurable
         if bound is None or self.looped or self.changing is None:
             return None
-        if not bound.is_box:
-            raise Unchecked(
-                "of a system that changes with time, the checker knows measurable disturbances in boxes only"
-            )
-        box, middle, system = bound.bounding_box(), _middle(bound), self.problem.system
-        sides, single = np.stack([box.upper - middle, middle - box.lower]), box.upper == box.lower
-        most = np.where(single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
-        least = np.where(single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
-        half, ends = least + (most - least) / 2.0, np.array([0.0, self.grid[-1]])
-        off = np.nextafter(np.maximum(most - half, half - least), np.inf)
-        first = system.controls + (system.c is not None)
         if not isinstance(self.changing, VaryingFlow):
             raise Unchecked(
                 "the checker knows no measurable disturbances beside parameters that states are expanded in"
             )
+        ends, system = np.array([0.0, self.grid[-1]]), self.problem.system
+        first = system.controls + (system.c is not None)
+        if not bound.is_box:
+            side, *more = Side.of(bound)
+            if more:
+                raise Unchecked("of a system that changes with time, the checker knows sets of corners only")
+            return VaryingExecution(self.changing, np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
+        box, about = bound.bounding_box(), _middle(bound)
+        sides, single = np.stack([box.upper - about, about - box.lower]), box.upper == box.lower
+        most = np.where(single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
+        least = np.where(single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
+        half = least + (most - least) / 2.0
+        off = np.nextafter(np.maximum(most - half, half - least), np.inf)
         return VaryingExecution(
             self.changing, half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off
         )
@@ -514,6 +518,8 @@ class Case:
 
 
 def _middle(bound: ConvexSet) -> Array:
+    if not bound.is_box:
+        return middle(bound)
     box = bound.bounding_box()
     return np.asarray((box.lower + box.upper) / 2)
 

@@ -39,6 +39,7 @@ ORDER = 13  # of the polynomials
 PARTS, MOST_PARTS = 4, 2048  # of a piece, at least and at most
 SETTLED = 2.0**-49  # of the heights: what another corner may add on a cell
 ROUNDS = 60  # in which cells are cut
+CROSSING = 8  # of them always where two corners are equally good, which is beside an end where they touch there
 SECANTS = 12  # steps to where two corners are equally good
 APART = 2.0**-45  # how far the place of a time among the parts may be off
 
@@ -193,7 +194,9 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
             break
         rest = rows[~settled]
         a, b = left[rest].argmax(axis=1), right[rest].argmax(axis=1)
-        cut = _equal(Q[rest, :, a] - Q[rest, :, b], start[rest], stop[rest])
+        cut = (start[rest] + stop[rest]) / 2.0
+        if turn < CROSSING or turn % 2:
+            cut = _equal(Q[rest, :, a] - Q[rest, :, b], start[rest], stop[rest])
         here = np.tile(here[rest], 2)
         start, stop = np.concatenate([start[rest], cut]), np.concatenate([cut, stop[rest]])
     return value, more * OUTWARD, less * OUTWARD

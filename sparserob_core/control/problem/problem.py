@@ -167,11 +167,12 @@ class OptimalControlProblem(Term):
             step = checked_set("control_step", self.control_step, self.system.controls, "controls")
             self._set("control_step", None if restricts_nothing(step) else step)
         self._check_disturbance()
-        if self.system.varies and self.measurable is not None and not self.measurable.is_box:
+        bound = self.measurable
+        if self.system.varies and bound is not None and bound.halfspaces() is None:
             raise InputError(
                 path="disturbance",
-                expected="a box where the system changes with time and disturbances are measurable",
-                got=self.measurable.kind,
+                expected="a box or a polytope where the system changes with time and disturbances are measurable",
+                got=bound.kind,
             )
         self._set("measurements", self._measured())
         self._check_names()

@@ -36,6 +36,7 @@ from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.response.varying_motion import OUTWARD, VaryingMotion, VaryingSupport
+from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
@@ -779,10 +780,14 @@ class ExecutionCellSupport(KnownCellSupport):
 class VaryingExecution(Execution):
     """`Execution` of a system that changes with time; ``disturbing``: what is commanded enters through ``E``, all of
     it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do. ``before (m,)``: the
-    size of what acts until the first command does, where these act late."""
+    size of what acts until the first command does, where these act late. ``bound``: a flat set of what enters by the
+    columns ``through (m,)`` of ``E`` at once, in the place of channels of their own; there is one share of 1 then, and
+    integrals are those of its support function."""
 
     disturbing: bool = False
     before: Array | None = None
+    bound: ConvexSet | None = None
+    through: np.ndarray | None = None
     _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
     _ways: dict[bytes, tuple[Array, Kernel]] = field(default_factory=dict, repr=False)
 
@@ -804,7 +809,15 @@ class VaryingExecution(Execution):
     def columns(self) -> np.ndarray:
         """The columns of ``[B E]`` through which errors enter."""
         first = self.motion.expansion.channels[0] if self.disturbing else 0
-        return np.arange(first, first + self.shares.size)
+        return first + (np.arange(self.far.size) if self.through is None else self.through)
+
+    @cached_property
+    def far(self) -> Array:
+        """How far from 0 at most what enters by each column is, ``(m,)``, where the command is 1."""
+        if self.bound is None:
+            return self.shares
+        box = self.bound.bounding_box()
+        return np.asarray(np.maximum(np.abs(box.lower), np.abs(box.upper)) * OUTWARD)
 
     @cached_property
     def acting(self) -> np.ndarray:
@@ -944,6 +957,8 @@ class VaryingExecution(Execution):
         """Bounds ``(q, m, 2)`` of what intervals ``which (q,)`` of a kernel make of ``rows (q, d)`` on their ends, of
         channels that are ``asked (m, q)``."""
         m, units, columns = self.shares.size, self.motion.expansion.units, self.columns
+        if self.bound is not None:
+            return self._together(self.bound, kernel, which, rows)
         sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which])
         lost = np.einsum("qd,qdm->qm", np.abs(rows) * units, kernel.sizes[which][..., columns])
         lost = lost * kernel.error[which, None]
@@ -958,6 +973,18 @@ class VaryingExecution(Execution):
             found = found + lost[mine, j, None] * [-1.0, 1.0]
             bounds[mine, j] = share * np.maximum(found, 0.0) * [1.0 / OUTWARD, OUTWARD]
         return bounds
+
+    def _together(self, bound: ConvexSet, kernel: Kernel, which: np.ndarray, rows: Array) -> Array:
+        """`_along` of a set of what enters by all columns, ``(q, 1, 2)``."""
+        columns, far = self.columns, self.far
+        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which]) @ far
+        units = np.abs(rows) * self.motion.expansion.units
+        lost = np.einsum("qd,qdm->qm", units, kernel.sizes[which][..., columns]) @ far * kernel.error[which]
+        lost = lost + rounding(rows.shape[1] + 2 * kernel.terms.shape[1] + HALVINGS + 2 * far.size) * sizes
+        terms = np.einsum("qd,qpdm->qpm", rows, kernel.terms[which][..., columns])
+        accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes, TINY)
+        found = integrated(bound, terms, np.ones(which.size), accuracy)
+        return np.asarray(found + OUTWARD * lost[:, None] * [-1.0, 1.0])[:, None]
 
 
 @final
@@ -1022,7 +1049,7 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     @cached_property
     def _sizing(self) -> Array:
         """How large errors may be on every piece between marks, ``(K, m)``."""
-        size = self.execution.shares[:, None] * self.execution.acts(self.control)
+        size = self.execution.far[:, None] * self.execution.acts(self.control)
         return np.asarray(size[:, self.execution.acting].T * OUTWARD)
 
     @cached_property
@@ -1032,15 +1059,22 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     def _sizes(self, times: Array) -> Array:
         """What errors can have made of every state, ``(k, d)``, at most."""
         d = self.motion.states
-        every = np.repeat(times, d), np.tile(np.eye(d), (times.size, 1))
-        return np.asarray(self.execution.enclosed(self.control, *every)[:, 1].reshape(-1, d) * OUTWARD)
+        ways = [np.eye(d)] if self.execution.bound is None else [np.eye(d), -np.eye(d)]
+        every = (self.execution.enclosed(self.control, *self._each(times, way))[:, 1] for way in ways)
+        return np.asarray(np.max([np.maximum(one, 0.0) for one in every], axis=0).reshape(-1, d) * OUTWARD)
+
+    @staticmethod
+    def _each(times: Array, rows: Array) -> tuple[Array, Array]:
+        """Every time with every row."""
+        return np.repeat(times, len(rows)), np.tile(rows, (times.size, 1))
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingMeasurable:
-    """`MeasurableSupport` of a system that changes with time, for a box: what stays in the middle of the box, and the
-    errors, through the columns of ``E``, of a command that is 1 and may be missed by half the widths."""
+    """`MeasurableSupport` of a system that changes with time, for a flat set. Of a box: what stays in the middle of the
+    box, and the errors, through the columns of ``E``, of a command that is 1 and may be missed by half the widths. Of
+    another one what all of it does at once takes the place of such errors, and the middle is 0."""
 
     response: Response
     bound: ConvexSet
@@ -1067,23 +1101,29 @@ class VaryingMeasurable:
 
     @cached_property
     def middle(self) -> Array:
-        """That of the box, ``(mw,)``."""
+        """That of the box, ``(mw,)``; 0 of another set."""
+        if not self.bound.is_box:
+            return np.zeros(self.bound.dimension)
         box = self.bound.bounding_box()
         return np.asarray((box.lower + box.upper) / 2)
 
     @cached_property
     def errors(self) -> VaryingExecution:
         """How far disturbances may be from the middle: rounded outwards where that is not 0."""
+        ends, felt = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
+        if not self.bound.is_box:
+            bound, through = _moving(self.bound)
+            one = np.ones(1)
+            return VaryingExecution(self.response, ends, one, felt, disturbing=True, bound=bound, through=through)
         box = self.bound.bounding_box()
         far = np.maximum(box.upper - self.middle, self.middle - box.lower)
         far = np.where(self.middle == 0.0, far, np.where(box.upper > box.lower, np.nextafter(far, np.inf), 0.0))
-        ends = self.response.grid.breakpoints[[0, -1]]
-        return VaryingExecution(self.response, ends, far, np.ones(self.response.system.states), disturbing=True)
+        return VaryingExecution(self.response, ends, far, felt, disturbing=True)
 
     @property
     def command(self) -> Array:
-        """The 1 that is missed, ``(mw, 1)``."""
-        return np.ones((self.middle.size, 1))
+        """The 1 that is missed, ``(mw, 1)``, of sets of all channels at once ``(1, 1)``."""
+        return np.ones((self.errors.shares.size, 1))
 
     @cached_property
     def resting(self) -> DisturbanceModel | None:
@@ -1103,7 +1143,26 @@ class VaryingMeasurable:
 
     def integrated_sizes(self, times: Array, directions: Array) -> Array:
         """`MeasurableSupport.integrated_sizes`: integrals of absolute values."""
-        return np.asarray(self.errors.lengths(times, directions).sum(axis=1))
+        return np.asarray(self._apart.lengths(times, directions).sum(axis=1))
+
+    @cached_property
+    def _apart(self) -> VaryingExecution:
+        """The errors of the box around the set."""
+        of = self.errors
+        if of.bound is None:
+            return of
+        return VaryingExecution(of.response, of.breakpoints, of.far, of.felt, disturbing=True, through=of.through)
+
+
+def _moving(bound: ConvexSet) -> tuple[ConvexSet, np.ndarray]:
+    """A flat set without the entries that are 0 in all of it, as those of another class are, and which the others
+    are."""
+    box, flat = bound.bounding_box(), bound.halfspaces()
+    moving = np.flatnonzero((box.lower != 0.0) | (box.upper != 0.0))
+    if moving.size in (0, bound.dimension) or flat is None:
+        return bound, np.arange(bound.dimension)
+    rows = flat[0][:, moving].any(axis=1)
+    return Polytope(flat[0][rows][:, moving], flat[1][rows]), moving
 
 
 def measurable_support(response: Response, bound: ConvexSet) -> MeasurableSupport | VaryingMeasurable:

@@ -17,7 +17,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.measurable import signed, swept
+from sparserob_core.checker.reach.measurable import Side, signed, swept
 from sparserob_core.checker.reach.varying.flow import VaryingFlow, products
 from sparserob_core.checker.reach.varying.loop import ORDER
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
@@ -35,7 +35,9 @@ TIMES_KEPT = 4096  # times at which what errors make of the states is remembered
 class VaryingExecution:
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for. It enters through the columns of ``[B E]`` from the ``first`` one on; the
-    errors are known but for ``off (m,)``, and do not reach the ``numb`` states, which add up what is commanded."""
+    errors are known but for ``off (m,)``, and do not reach the ``numb`` states, which add up what is commanded.
+    ``side``: what enters by all columns at once, in the place of channels of their own; there is one share of 1 then,
+    and integrals are those of its support function, which is not negative."""
 
     law: VaryingFlow
     shares: Array
@@ -44,6 +46,7 @@ class VaryingExecution:
     first: int = 0
     off: Array | None = None
     numb: Sequence[int] = ()
+    side: Side | None = None
     _kernels: dict[tuple[float, float], Enclosed] = field(default_factory=dict, repr=False)
     _onward: dict[int, Enclosed] = field(default_factory=dict, repr=False)
     _added: dict[tuple[float, bytes], tuple[Array, Array]] = field(default_factory=dict, repr=False)
@@ -67,6 +70,18 @@ class VaryingExecution:
         lost = off * (np.abs(control.mid) + control.rad)
         return Enclosed(size, (self.shares * control.rad + lost + rounding(2) * size) * OUTWARD)
 
+    @property
+    def columns(self) -> int:
+        """How many columns of ``[B E]`` it enters through."""
+        return int(self.shares.size if self.side is None else self.side.corners.shape[1])
+
+    @cached_property
+    def _far(self) -> Array:
+        """How far from 0 at most what enters by each column is, ``(m,)``, as a multiple of its size."""
+        if self.side is None:
+            return np.ones(self.shares.size)
+        return np.asarray((np.abs(self.side.corners) + self.side.rad).max(axis=0) * OUTWARD)
+
     def least(self, c: Array, time: float) -> Array:
         """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
         found = np.zeros((self.breakpoints.size - 1, self.shares.size))
@@ -86,8 +101,10 @@ class VaryingExecution:
         is from its own: its terms ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What begins within the
         cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
         """
-        d, m, width = c.size, self.shares.size, (stop - start) * (1.0 + rounding(2))
+        d, m, width = c.size, self.columns, (stop - start) * (1.0 + rounding(2))
         begun = self._summed(np.eye(d), start)[1]
+        if self.side is not None:
+            begun = np.maximum(begun, self._summed(-np.eye(d), start)[1])
         terms, rest = self.law.within(start, stop, ORDER)
         line, total = stacked([balls(c)]), 0.0
         for n, term in enumerate([*terms[2:], rest], 2):
@@ -95,7 +112,7 @@ class VaryingExecution:
             factor = 2.0 if n == len(terms) else (n - 1) * n ** (-n / (n - 1))
             total += factor * float((np.abs(found.mid) + found.rad)[0] @ begun)
         place = min(max(0, int(np.searchsorted(self.breakpoints, start, side="right")) - 1), len(self.pieces) - 1)
-        size = self.sizes.mid[place] + self.sizes.rad[place]
+        size = (self.sizes.mid[place] + self.sizes.rad[place]) * self._far
         if size.any():
             (most, slope), units = self.law.most(start, stop), np.array(self.law.units)
             entering = slice(d + self.first, d + self.first + m)
@@ -125,11 +142,11 @@ class VaryingExecution:
     def _integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
         """``int |c'Phi(t, s) B_j(s)| ds`` for ``rows (n, d)`` over those of the ``pieces`` between marks that begin
         before the time: between ``(q, n, m)`` and ``(q, n, m)``; and which pieces these are, ``(q,)``."""
-        m, begins = self.shares.size, np.array(self.marks[:-1])
+        m, begins = self.columns, np.array(self.marks[:-1])
         rows = np.where(np.isin(np.arange(rows.shape[1]), list(self.numb)), 0.0, rows)
         which = pieces[begins[pieces] < time]
         if not which.size:
-            none = np.zeros((0, len(rows), m))
+            none = np.zeros((0, len(rows), self.shares.size))
             return none, none, which
         last = int(np.searchsorted(begins, time, side="left")) - 1
         kernels, lines = [], []
@@ -153,16 +170,30 @@ class VaryingExecution:
         off = np.einsum("qnd,qdm->qnm", np.abs(a), rounding(a.shape[2] + 1) * sizes + K.rad.sum(axis=1))
         off = (off + np.einsum("qnd,qdm->qnm", rad, sizes + K.rad.sum(axis=1))) * OUTWARD
         off = off + rounding(4 * order + 32) * np.abs(plain).sum(axis=2)  # as they are summed
+        if self.side is not None:
+            return *self._together(self.side, plain, off), which
         flat = signed(plain.reshape(-1, *plain.shape[2:]), off.reshape(-1, m))
         value, more, less = (one.reshape(off.shape) / 2.0 for one in swept(*flat, np.ones(off.size)))
         return (value - less) / OUTWARD, (value + more) * OUTWARD, which
+
+    @staticmethod
+    def _together(side: Side, plain: Array, off: Array) -> tuple[Array, Array]:
+        """Bounds ``(q, n, 1)`` of the integrals of the support function of a set at polynomials ``(q, n, p + 1, m)``
+        that are off by ``off (q, n, m)``."""
+        q, n, order, _ = plain.shape
+        far, sizes = np.abs(side.corners) + side.rad, np.abs(plain).sum(axis=2)
+        P = np.einsum("qnpm,vm->qnpv", plain, side.corners)
+        e = (off @ far.T + sizes @ side.rad.T + rounding(4 * order + 32 + far.shape[1]) * (sizes @ far.T)) * OUTWARD
+        found = swept(P.reshape(q * n, order, -1), e.reshape(q * n, -1), np.ones(q * n))
+        value, more, less = (one.reshape(q, n, 1) / 2.0 for one in found)
+        return np.minimum(value - less, (value - less) / OUTWARD), np.maximum(value + more, 0.0) * OUTWARD
 
     def _kernel(self, start: float, stop: float) -> Enclosed:
         """That of an interval, in powers of ``u`` from -1 to 1 across it, ``(p + 1, d, m)``."""
         if (start, stop) not in self._kernels:
             from flint import arb, arb_poly
 
-            m, terms = self.shares.size, self.law.kernel(start, stop)
+            m, terms = self.columns, self.law.kernel(start, stop)
             half = arb_poly([arb(1) / 2, arb(1) / 2])
             d = terms[0].nrows()
             columns = range(self.first, self.first + m)
