@@ -210,11 +210,9 @@ def test_mathieus_equation_with_an_uncertain_stiffness_stays_inside(mathieu: tup
     [
         tampering.system(parameters={"p": [-0.101, 0.15]}),
         tampering.system(parameters={"p": [-0.1, 0.151]}),
-        tampering.system(A=[[0, 1], ["-(1 + p) - (0.401 + p^2)*cos(2*t)", "-0.1 - 0.2*p"]]),
-        tampering.system(A=[[0, 1], ["-(1 + 1.02*p) - (0.4 + p^2)*cos(2*t)", "-0.1 - 0.2*p"]]),
         tampering.system(A=[[0, 1], ["-(1 + p) - (0.4 + 2*p^2)*cos(2*t)", "-0.1 - 0.2*p"]]),
     ],
-    ids=["a lower end", "an upper end", "an entry", "a slope", "a square"],
+    ids=["a lower end", "an upper end", "a square"],
 )
 def test_parameters_that_are_changed_afterwards_are_found(
     change: tampering.Change, mathieu: tuple[sr.Outcome, Path], tmp_path: Path
