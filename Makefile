@@ -32,7 +32,7 @@ help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
 	@echo "make live        watch the paper's annealing for a minute: in a viewer, or on a page where there is no display"
 	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
-	@echo "make test        lint, types, import rules, tests: the first stage, about four minutes on two processors"
+	@echo "make test        lint, types, import rules, tests: the first stage, about three minutes on two processors"
 	@echo "make test-changed  the tests of the first stage that the changes since main can affect (SINCE=REVISION)"
 	@echo "make test-slow   the second stage: what takes long, and larger instances of what the first one tests"
 	@echo "make mutants     300 small errors in what proves and checks (COUNT=20 SEED=1 for fewer): which do the tests notice? (hours)"
