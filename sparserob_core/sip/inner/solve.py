@@ -310,11 +310,13 @@ def _tried(case: _Case) -> FiniteSolution:
 
 def _sharper(case: _Case, claim: Claim | None, answer: Recovered | None) -> FiniteSolution | None:
     """The first answer that is believed and sharp: more digits of the ``claim``, and a vertex, which comes first where
-    the solver has an answer that lacks digits, and last where it has none."""
+    the solver has an answer that lacks digits, and last where it goes somewhere and does not arrive. One that raises,
+    or has nothing to say, is told of."""
     solved = claim is not None and claim.status == "solved" and answer is not None
     believed = _at_a_vertex(case) if solved else None
     believed = believed or _more_digits(case, claim)
-    return believed if solved or believed is not None else _at_a_vertex(case)
+    lost = claim is not None and claim.status == "failed" and np.isfinite(claim.x).all() and claim.x.any()
+    return _at_a_vertex(case) if believed is None and lost else believed
 
 
 def _at_a_vertex(case: _Case) -> FiniteSolution | None:
