@@ -9,6 +9,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.decoupling import pace
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON
+from sparserob_core.control.response.response import Weights
 from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription
@@ -27,14 +28,15 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
 
     A row ``c'x(t) <= b`` is a sum of what the initial state, every piece of the control and every piece of the
     disturbance bring to ``c'x(t)``. The absolute values of these, at their largest, times the multipliers of the rows
-    and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). What a multiplier
-    of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their own
-    (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`).
+    and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). A piece of the
+    control whose push is below its price by more than that is 0 in the bound, whatever is rounded (`_pushed`). What a
+    multiplier of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their
+    own (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`).
     """
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
     share = SHARE + _moving(model)
-    lost = share * (_added(model, result) + _quadratic(model, result) + result.lower_bound)
+    lost = share * (_added(model, result, share) + _quadratic(model, result) + result.lower_bound)
     lost += _neglected(model, result) + _beyond(model, result)
     lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
@@ -58,10 +60,11 @@ def _moving(model: Transcription) -> float:
     return EPSILON * fastest * model.problem.horizon
 
 
-def _added(model: Transcription, result: Result) -> float:
-    """The sum over all rows with a multiplier of multiplier times the numbers that are added up to the row."""
+def _added(model: Transcription, result: Result, share: float) -> float:
+    """The sum over all rows with a multiplier of multiplier times the numbers that are added up to the row, of which a
+    ``share`` may be lost."""
     middle = model.parameters.middle
-    rows, besides = [], 0.0
+    rows, besides, whole = [], 0.0, True
     for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         constraint = model.constraint(model.program.family(cut.family))
         if said is not None and constraint is not None and cut.multiplier > 0.0:
@@ -69,12 +72,39 @@ def _added(model: Transcription, result: Result) -> float:
             if said.gain is not None:
                 besides += cut.multiplier * float(np.abs(said.gain) @ _far(model.problem.control))
             besides += cut.multiplier * float(constraint.reference.reach(said.direction))
+            whole = whole and said.gain is None
+        elif cut.multiplier > 0.0:
+            whole = False
     for axis, price in zip(fixed(model.problem)[0], result.dual.mu, strict=False):
-        rows.append((abs(float(price)), model.problem.horizon, axis, middle))
+        rows.append((float(price), model.problem.horizon, axis, middle))
     if not rows:
         return 0.0
-    multipliers, times, directions, parameters = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
-    return float(multipliers @ added_up(model, times, directions, parameters.reshape(len(rows), -1))) + besides
+    multipliers, *indices = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
+    times, directions, parameters = indices[0], indices[1], indices[2].reshape(len(rows), -1)
+    weights = model.response.weights(times, directions, parameters)
+    sizes = np.abs(multipliers) @ _beside_control(model, weights, times, directions)
+    return float(sizes) + besides + _pushed(model, result, weights.control, multipliers, share if whole else None)
+
+
+def _pushed(model: Transcription, result: Result, weights: Array, multipliers: Array, share: float | None) -> float:
+    """The numbers that are added up to what rows with ``multipliers (k,)``, of ``weights (k, L, m)``, make of the
+    control, at its largest.
+
+    The bound is the least of ``sum_j (w_j |u_j| + r_j u_j)`` over the control's set, ``r`` the sum of the rows. In a
+    box that holds 0 it is attained at ``u_j = 0`` where ``|r_j| <= w_j``, and is the same for every such ``r_j``: so
+    only entries count whose ``|r_j|`` is less than a ``share`` of the largest numbers in it below ``w_j``. Sets and
+    costs of another form, and rows that are not all here (no ``share``), have all of them count.
+    """
+    functionals, finite, m = model.functionals, model.program.finite, model.problem.system.controls
+    far = _far(model.problem.control)
+    plain = finite.S is None and finite.P is None and finite.blocks is None and not finite.q.any()
+    if share is None or not plain or result.dual.z is not None or finite.n != m * model.control.pieces:
+        return float(np.abs(multipliers) @ (np.abs(functionals.decided(weights)) @ far).sum(axis=1))
+    push = multipliers @ functionals.on_decision(weights)
+    size = np.abs(multipliers) @ functionals.on_decision(np.abs(weights))
+    off = np.repeat(size.reshape(m, -1).max(axis=1, initial=0.0), model.control.pieces)
+    clear = (np.abs(push) + share * off < finite.weights) & (finite.lower <= 0.0) & (finite.upper >= 0.0)
+    return float(np.repeat(far, model.control.pieces) @ np.where(clear, 0.0, size))
 
 
 def _beyond(model: Transcription, result: Result) -> float:
@@ -88,18 +118,23 @@ def _beyond(model: Transcription, result: Result) -> float:
 
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:
     """The numbers ``(k,)`` that are added up to rows ``c'x(t)``, ``directions (k, d)``, at their largest."""
-    free, weights, on_noise = model.response.weights(times, directions, parameters)
-    sizes = np.abs(free) @ np.abs(model.response.initial_state)
+    weights = model.response.weights(times, directions, parameters)
+    sizes = _beside_control(model, weights, times, directions)
+    controlled = np.abs(model.functionals.decided(weights.control)) @ _far(model.problem.control)
+    return np.asarray(sizes + controlled.sum(axis=1))
+
+
+def _beside_control(model: Transcription, weights: Weights, times: Array, directions: Array) -> Array:
+    """Those ``(k,)`` beside what the control brings."""
+    functionals, free = model.functionals, np.abs(weights.free)
+    sizes = free @ np.abs(model.response.initial_state)
     if model.problem.initial_set is not None:
-        sizes += np.abs(free) @ _far(model.problem.initial_set)
-    functionals = model.functionals
-    sizes += np.einsum("klm,ml->k", np.abs(weights), np.abs(functionals.known))
-    sizes += (np.abs(functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1)
+        sizes += free @ _far(model.problem.initial_set)
+    sizes += np.einsum("klm,ml->k", np.abs(weights.control), np.abs(functionals.known))
     if functionals.execution is not None:
         lengths = functionals.execution.lengths(times, directions)
         sizes += lengths @ np.repeat(_far(model.problem.control), model.control.pieces)
-    sizes += _disturbing(model, on_noise, times, directions)
-    return np.asarray(sizes)
+    return np.asarray(sizes + _disturbing(model, weights.disturbance, times, directions))
 
 
 def _disturbing(model: Transcription, on_noise: Array, times: Array, directions: Array) -> Array:

@@ -94,7 +94,36 @@ def test_what_errors_of_execution_bring_to_a_row_is_added_up_too() -> None:
     model = prepare(problem, dictionary, dictionary)
     result = SimpleNamespace(dual=SimpleNamespace(cuts=[Cut("terminal", np.array([2.0]), 1, 1.0)], mu=np.zeros(0)))
     # the beginning, 1, and what a command of 3 and 5 % of it bring in 2 units of time
-    assert rounding._added(model, result) == pytest.approx(1.0 + 6.0 + 0.3)  # type: ignore[arg-type]
+    assert rounding._added(model, result, rounding.SHARE) == pytest.approx(1.0 + 6.0 + 0.3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("multiplier", "lower", "counted"),
+    [
+        (1.0, -3.0, 6.0),
+        (1.0 - 1e-15, -3.0, 6.0),
+        (1.0 - 1e-13, -3.0, 0.0),
+        (0.5, -3.0, 0.0),
+        (0.5, 1.0, 6.0),
+    ],
+    ids=["as large as its price", "but for rounding", "clear of it", "far below", "never off"],
+)
+def test_a_piece_whose_push_is_clear_of_its_price_adds_nothing(multiplier: float, lower: float, counted: float) -> None:
+    dictionary = sr.Dictionary.indicators([0.0, 1.0, 2.0])
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0.0]], [[1.0]]),
+        horizon=2.0,
+        initial_state=[-1.0],
+        control=sr.Box([lower], [3.0]),
+        terminal=[sr.Box([-0.1], [0.1])],
+    )
+    model = prepare(problem, dictionary, dictionary)
+    result = SimpleNamespace(
+        dual=SimpleNamespace(cuts=[Cut("terminal", np.array([2.0]), 1, multiplier)], mu=np.zeros(0), z=None)
+    )
+    # the beginning, 1, and what a command of 3 brings in 2 units of time, at a price of 1
+    found = rounding._added(model, result, rounding.SHARE)  # type: ignore[arg-type]
+    assert found == pytest.approx(multiplier * (1.0 + counted), rel=1e-12)
 
 
 def test_what_cancels_in_the_slope_of_a_quadratic_cost_is_added_up_too() -> None:
