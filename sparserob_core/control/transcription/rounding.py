@@ -22,7 +22,7 @@ SHARE = 64 * 2.0**-52  # of the numbers that are added up to a row: products of 
 SMALL_GAP = 1e-11  # by which the gap may be wider then than it was to be
 
 
-def rounded_down(model: Transcription, result: Result, tolerance: float | None) -> Result:
+def rounded_down(model: Transcription, result: Result, tolerance: float | None, prices: Array | None = None) -> Result:
     """The same result with a lower bound that rounding cannot have raised; no longer ``certified`` where that opens the
     gap beyond the relative ``tolerance``.
 
@@ -31,12 +31,13 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
     and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). A piece of the
     control whose push is below its price by more than that is 0 in the bound, whatever is rounded (`_pushed`). What a
     multiplier of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their
-    own (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`).
+    own (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`). ``prices (n,)`` are those of the
+    decision, where the bound is one of what its sizes cost at them.
     """
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
     share = SHARE + _moving(model)
-    lost = share * (_added(model, result, share) + _quadratic(model, result) + result.lower_bound)
+    lost = share * (_added(model, result, share, prices) + _quadratic(model, result) + result.lower_bound)
     lost += _neglected(model, result) + _beyond(model, result)
     lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
@@ -60,11 +61,11 @@ def _moving(model: Transcription) -> float:
     return EPSILON * fastest * model.problem.horizon
 
 
-def _added(model: Transcription, result: Result, share: float) -> float:
+def _added(model: Transcription, result: Result, share: float, prices: Array | None) -> float:
     """The sum over all rows with a multiplier of multiplier times the numbers that are added up to the row, of which a
-    ``share`` may be lost."""
+    ``share`` may be lost; ``prices`` as in `rounded_down`."""
     middle = model.parameters.middle
-    rows, besides, whole = [], 0.0, True
+    rows, besides, whole = [], 0.0, prices is not None
     for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         constraint = model.constraint(model.program.family(cut.family))
         if said is not None and constraint is not None and cut.multiplier > 0.0:
@@ -83,28 +84,33 @@ def _added(model: Transcription, result: Result, share: float) -> float:
     times, directions, parameters = indices[0], indices[1], indices[2].reshape(len(rows), -1)
     weights = model.response.weights(times, directions, parameters)
     sizes = np.abs(multipliers) @ _beside_control(model, weights, times, directions)
-    return float(sizes) + besides + _pushed(model, result, weights.control, multipliers, share if whole else None)
+    if prices is None or not whole or not _plain(model, result):
+        controlled = np.abs(model.functionals.decided(weights.control)) @ _far(model.problem.control)
+        return float(sizes) + besides + float(np.abs(multipliers) @ controlled.sum(axis=1))
+    return float(sizes) + besides + _pushed(model, prices, weights.control, multipliers, share)
 
 
-def _pushed(model: Transcription, result: Result, weights: Array, multipliers: Array, share: float | None) -> float:
+def _plain(model: Transcription, result: Result) -> bool:
+    """Whether nothing but rows, the box of every entry of the decision and its price makes the bound."""
+    finite, m = model.program.finite, model.problem.system.controls
+    whole = finite.S is None and finite.P is None and finite.blocks is None and not finite.q.any()
+    return whole and result.dual.z is None and finite.n == m * model.control.pieces
+
+
+def _pushed(model: Transcription, prices: Array, weights: Array, multipliers: Array, share: float) -> float:
     """The numbers that are added up to what rows with ``multipliers (k,)``, of ``weights (k, L, m)``, make of the
     control, at its largest.
 
-    The bound is the least of ``sum_j (w_j |u_j| + r_j u_j)`` over the control's set, ``r`` the sum of the rows. In a
-    box that holds 0 it is attained at ``u_j = 0`` where ``|r_j| <= w_j``, and is the same for every such ``r_j``: so
-    only entries count whose ``|r_j|`` is less than a ``share`` of the largest numbers in it below ``w_j``. Sets and
-    costs of another form, and rows that are not all here (no ``share``), have all of them count.
+    The bound is the least of ``sum_j (w_j |u_j| + r_j u_j)`` over a box, ``w`` the ``prices`` and ``r`` the sum of the
+    rows. Where it holds 0 it is attained at ``u_j = 0`` for every ``|r_j| <= w_j``: so only entries count whose
+    ``|r_j|`` is not below ``w_j`` by more than a ``share`` of the largest numbers of any in their channel.
     """
     functionals, finite, m = model.functionals, model.program.finite, model.problem.system.controls
-    far = _far(model.problem.control)
-    plain = finite.S is None and finite.P is None and finite.blocks is None and not finite.q.any()
-    if share is None or not plain or result.dual.z is not None or finite.n != m * model.control.pieces:
-        return float(np.abs(multipliers) @ (np.abs(functionals.decided(weights)) @ far).sum(axis=1))
     push = multipliers @ functionals.on_decision(weights)
     size = np.abs(multipliers) @ functionals.on_decision(np.abs(weights))
     off = np.repeat(size.reshape(m, -1).max(axis=1, initial=0.0), model.control.pieces)
-    clear = (np.abs(push) + share * off < finite.weights) & (finite.lower <= 0.0) & (finite.upper >= 0.0)
-    return float(np.repeat(far, model.control.pieces) @ np.where(clear, 0.0, size))
+    clear = (np.abs(push) + share * off < prices) & (finite.lower <= 0.0) & (finite.upper >= 0.0)
+    return float(np.repeat(_far(model.problem.control), model.control.pieces) @ np.where(clear, 0.0, size))
 
 
 def _beyond(model: Transcription, result: Result) -> float:

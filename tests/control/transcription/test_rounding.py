@@ -94,7 +94,7 @@ def test_what_errors_of_execution_bring_to_a_row_is_added_up_too() -> None:
     model = prepare(problem, dictionary, dictionary)
     result = SimpleNamespace(dual=SimpleNamespace(cuts=[Cut("terminal", np.array([2.0]), 1, 1.0)], mu=np.zeros(0)))
     # the beginning, 1, and what a command of 3 and 5 % of it bring in 2 units of time
-    assert rounding._added(model, result, rounding.SHARE) == pytest.approx(1.0 + 6.0 + 0.3)  # type: ignore[arg-type]
+    assert rounding._added(model, result, rounding.SHARE, None) == pytest.approx(1.0 + 6.0 + 0.3)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,8 @@ def test_a_piece_whose_push_is_clear_of_its_price_adds_nothing(multiplier: float
         dual=SimpleNamespace(cuts=[Cut("terminal", np.array([2.0]), 1, multiplier)], mu=np.zeros(0), z=None)
     )
     # the beginning, 1, and what a command of 3 brings in 2 units of time, at a price of 1
-    found = rounding._added(model, result, rounding.SHARE)  # type: ignore[arg-type]
+    prices = model.program.finite.weights
+    found = rounding._added(model, result, rounding.SHARE, prices)  # type: ignore[arg-type]
     assert found == pytest.approx(multiplier * (1.0 + counted), rel=1e-12)
 
 

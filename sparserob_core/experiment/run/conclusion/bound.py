@@ -8,7 +8,7 @@ import numpy as np
 
 from sparserob_core.control.transcription.provable import remark
 from sparserob_core.control.transcription.rounding import SMALL_GAP, rounded_down
-from sparserob_core.experiment.assemble import ControlExperiment
+from sparserob_core.experiment.assemble import ControlExperiment, counting
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import certificate
 from sparserob_core.sip.inner.solve import ADVICE
@@ -45,7 +45,8 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
     points of sets that are no boxes: what they are off by is in no running bound.
     """
     tolerance = experiment.gap_tolerance
-    safe = rounded_down(experiment.transcription, result, tolerance)
+    prices = None if any(counting(experiment.loaded)) else experiment.program.finite.weights
+    safe = rounded_down(experiment.transcription, result, tolerance, prices)
     if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
         return safe
     feedback = experiment.transcription.feedback
