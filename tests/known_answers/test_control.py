@@ -79,6 +79,7 @@ def start_of(system, horizon, signal, pieces):
     return state.tolist()
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(("first", "last"), [(5, 10), (12, 3), (1, 1), (20, 19)])
 def test_a_bang_off_bang_control_with_its_switches_on_the_grid_is_exact(run, first, last):
     """The switching function of the double integrator is affine, so -1, 0, +1 is optimal whatever its switches."""
@@ -100,6 +101,7 @@ def test_the_oscillator_approaches_its_closed_form_from_above(run, k, r, pieces,
     assert truth - 1e-6 <= outcome.result.cost <= truth + 2e-5
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("on", [2, 5, 10])
 @pytest.mark.parametrize("k", [1, 2])
 def test_an_oscillator_with_its_switches_on_the_grid_is_exact(run, k, on):
@@ -287,6 +289,7 @@ PAPER = {
 }
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "row", [pytest.param(row, marks=pytest.mark.slow if row.startswith("experiment") else ()) for row in PAPER]
 )
@@ -344,6 +347,7 @@ def test_experiment_1_as_printed_is_infeasible_even_without_its_path_constraint(
     assert outcome.result.status == "infeasible", outcome.result.message
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("bound", "feasible"), [(0.06838, True), (0.06844, False)])
 def test_the_largest_disturbance_that_experiment_1_survives(run, bound, feasible):
     outcome = run(EXPERIMENT_1, {"problem.disturbance": {"box": [bound, bound]}})

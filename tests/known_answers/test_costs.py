@@ -372,6 +372,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.first(7)
 @pytest.mark.parametrize(("cost", "said"), WRONG)
 def test_a_wrong_cost_is_refused_with_its_place(cost, said, tmp_path):
     with pytest.raises(sr.InputError, match=said):
@@ -387,6 +388,7 @@ def test_a_matrix_that_is_semidefinite_but_for_rounding_is_taken():
         sr.Cost(state={"Q": thin - 1e-9 * np.eye(3)}).checked(3, 1, np.ones(1))
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("time", [1.0, 2.0**-7])
 def test_other_units_give_the_same_bits(time, tmp_path):
     states, control, price = np.array([2.0**5, 2.0**-3]), 2.0**4, 2.0**6

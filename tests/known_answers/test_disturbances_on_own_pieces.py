@@ -83,6 +83,7 @@ def test_the_pieces_of_the_control_may_be_among_theirs():
     assert result.cost == pytest.approx(value(EVEN), abs=1e-7)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cut", [0.7, 1.9])
 def test_one_that_jumps_once_less_than_another_is_no_freer(cut):
     """Of two pieces of the one the other has one."""
@@ -159,6 +160,7 @@ def test_a_signal_that_jumps_within_a_piece_of_its_own_is_refused(bounded, tmp_p
     assert "the disturbance jumps within a piece" in str(checked.claims)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("kind", ["known", "entries in t"])
 def test_a_bound_that_a_disturbance_on_shorter_pieces_would_have_is_refuted(kind, tmp_path):
     """What is derived is what disturbances do that stay what they are; one that is a little larger does not follow."""

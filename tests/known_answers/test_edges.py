@@ -37,6 +37,7 @@ def in_units(unit, **more):
     )
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("unit", [1e-6, 1e-4, 1e-2, 1e2, 1e4])
 def test_the_cost_scales_with_the_units(unit):
     reference, result = solved(in_units(1.0), 50), solved(in_units(unit), 50)

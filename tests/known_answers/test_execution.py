@@ -186,6 +186,7 @@ def test_a_control_that_is_refuted_shows_by_how_much(tmp_path: Path) -> None:
     assert {one.name: one.verdict for one in check(tmp_path / "run").claims}["violation"] == "holds"
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -118,6 +118,7 @@ def test_references_that_saw_times_less_densely_are_lower_bounds(
     assert outcome.result.cost == pytest.approx(value, rel=within)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
 def test_more_disturbance_than_any_policy_withstands_is_infeasible_with_its_reason(cost: str, tmp_path: Path) -> None:
     outcome = run(springs(0.3, 0.3), 20, tmp_path / "run", cost)

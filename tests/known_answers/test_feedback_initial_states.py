@@ -184,6 +184,7 @@ def test_a_basis_from_which_the_solver_finds_no_way_is_given_up() -> None:
     assert len(found.inner) >= 3
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
 def test_a_plane_under_feedback_agrees_with_the_problem_transcribed_afresh(cost: str) -> None:
     def problem(x0: np.ndarray) -> sr.OptimalControlProblem:

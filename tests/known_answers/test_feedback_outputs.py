@@ -117,6 +117,7 @@ def stepped(directory: Path, problem: dict[str, Any], w: np.ndarray, v: np.ndarr
     return np.array(path), np.array(applied)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
 def test_a_loop_that_is_stepped_by_hand_keeps_every_wall_and_meets_its_worst_case(cost: str, tmp_path: Path) -> None:
     problem = {**SHORT, "measurements": {**POSITION, "latency": 0.5}}
@@ -217,6 +218,7 @@ def test_whatever_hides_is_proven_to_hide(noise, C, more, tmp_path: Path) -> Non
     assert plain.result.causal.lower < outcome.result.causal.lower <= outcome.result.cost * (1 + 1e-9)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("measured", [None, POSITION])
 def test_what_costs_nothing_costs_no_causal_policy_less(measured, tmp_path: Path) -> None:
     problem = {**SHORT, "initial_state": [0.0, 0.0], "disturbance": {"box": 0.001}}
@@ -262,6 +264,7 @@ def honest(tmp_path_factory) -> Path:
     return outcome.directory
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("name", FORGERIES)
 def test_a_forged_certificate_is_found(name: str, honest: Path, tmp_path: Path) -> None:
     shutil.copytree(honest, tmp_path / "run")

@@ -260,6 +260,7 @@ def test_the_margin_of_a_disturbance_beside_a_fixed_state_is_what_its_last_piece
     assert found.amounts[0] <= exact <= found.amounts[1]
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("pushed", [{"box": [0.1, 0.0]}, {"box": {"lower": [-0.1, 0.05], "upper": [0.1, 0.05]}}])
 def test_a_fixed_state_that_only_a_known_disturbance_reaches_is_met(pushed: dict[str, Any], tmp_path: Path) -> None:
     system = {**SIDE_BY_SIDE["system"], "E": [[1, 0], [0, 1]]}
@@ -337,6 +338,7 @@ def fixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return outcome.directory
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", FIXED)
 def test_a_forged_final_state_is_found(name: str, tmp_path: Path, fixed: Path) -> None:
     assert forged(fixed, tmp_path / "copy", FIXED[name]) == "refuted"

@@ -51,6 +51,7 @@ def test_fifty_pieces_need_seven_and_the_optimum_of_l1_acts_on_eight(tmp_path: P
     assert interval["lower"] >= outcome.result.lower_bound / 5.0 - 1e-9
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("start", "sides", "share"),
     [
@@ -93,6 +94,7 @@ def test_pieces_of_unequal_length_are_not_rounded_up(tmp_path: Path) -> None:
     assert interval["upper"] >= 0.475 - 1e-12  # 0.95 is the least sum of lengths that is at least 0.9
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["haar", "walsh"])
 def test_other_dictionaries_count_pieces_and_not_coefficients(name: str, tmp_path: Path) -> None:
     dictionary = {"control": {"name": name, "pieces": 16}}

@@ -184,6 +184,7 @@ def test_curved_steps_go_around_too(tmp_path) -> None:
     assert _verdicts(tmp_path / "run")["control_step"] == "holds"
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(("share", "feasible"), [(0.996, True), (1.006, False)])
 @pytest.mark.parametrize(
     ("period", "noise", "largest"),

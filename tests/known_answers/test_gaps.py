@@ -88,6 +88,7 @@ def test_a_wide_control_has_the_value_of_an_independent_linear_program(far):
     assert max(proven.values()) <= 0.7  # a wall is judged by itself, not by how far the control may go
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("far", [1.0, 1e12])
 @pytest.mark.parametrize("policy", [None, "nominal", "peak", "worst"])
 def test_what_need_not_act_costs_exactly_nothing(far, policy):
@@ -96,6 +97,7 @@ def test_what_need_not_act_costs_exactly_nothing(far, policy):
     assert (found.status, found.lower_bound, found.upper_bound, found.gap) == ("certified", 0.0, 0.0, 0.0)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("pieces", ["piecewise_constant", "haar", "walsh", "a policy of innovations"])
 def test_a_run_in_which_nothing_need_be_done_writes_bounds_of_exactly_zero(pieces, tmp_path):
     """Where an exact bound of 0 is rounded downwards once more, the gap is 1."""

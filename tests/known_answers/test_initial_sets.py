@@ -174,6 +174,7 @@ def test_a_terminal_equality_is_refused_where_the_set_reaches_the_state_and_kept
         solved({**plain, "terminal": [{"equals": [None, 0]}]})
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("method", ["nominal", "scenario"])
 def test_a_baseline_is_refuted_by_an_initial_state_that_it_did_not_look_at(method: str, tmp_path: Path) -> None:
     entry = {"name": method, **({"scenarios": 20} if method == "scenario" else {})}

@@ -198,6 +198,7 @@ BOUND: dict[str, dict[str, object]] = {
 }
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("name", BOUND)
 def test_an_integral_that_binds_costs_what_an_independent_program_says(name: str) -> None:
     plan = spring(path=[], **BOUND[name])

@@ -71,6 +71,7 @@ def of_piece(number: int, **changes: Any) -> tampering.Change:
     return change
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "change",
     [of_piece(0, until=SWITCH - 1e-4), of_piece(0, A=[["-1.00001/(1 + t)"]]), of_piece(1, B=[["1.99999 - t"]]),

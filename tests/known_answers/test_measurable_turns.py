@@ -126,6 +126,7 @@ def integrator(**more: Any) -> sr.OptimalControlProblem:
 FOUR = {"name": "piecewise_constant", "pieces": 4}
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(("start", "stop"), [(0.5, 1.5), (0.25, 1.6), (1.9, None), (0.0, 0.3)])
 def test_in_a_window_a_measurable_disturbance_pushes_as_long_as_it_acts(
     start: float, stop: float | None, tmp_path: Path

@@ -84,6 +84,7 @@ def test_no_honest_claim_fails_and_every_cut_says_what_its_index_is(
     assert (multipliers is None) == (form == "sampled")
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("method", ["exchange", "scenario", "sparserob literal"])
 def test_no_honest_proof_of_infeasibility_fails(method: str, tmp_path: Path) -> None:
     changes = {"terminal": [{"box": [0.001, 0.001]}]}

@@ -189,6 +189,7 @@ def test_what_is_impossible_says_so(tmp_path):
         assert check(outcome.directory).status == "verified", check(outcome.directory).claims
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("method", ["nominal", "scenario"])
 def test_baselines_are_refuted_by_a_witness_that_is_checked(method, tmp_path):
     options = {"name": method, **({"scenarios": 100} if method == "scenario" else {})}
@@ -197,6 +198,7 @@ def test_baselines_are_refuted_by_a_witness_that_is_checked(method, tmp_path):
     assert not any(claim.verdict == "fails" for claim in check(outcome.directory).claims)
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize(
     ("entry", "said"),
     [

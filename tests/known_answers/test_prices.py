@@ -73,6 +73,7 @@ def test_the_sparsest_control_counts_time_and_tells_what_it_costs(tmp_path: Path
     assert u is not None and certificate["J"] == pytest.approx(np.abs(u) @ [1, 1, 2, 2], abs=1e-9)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("cost", "value"), [("nominal", 4.0), ("peak", 4.6), ("worst", 4.6)])
 def test_a_policy_pays_the_price_of_the_time_at_which_it_answers(cost: str, value: float, tmp_path: Path) -> None:
     """The last disturbance, 0.1, is never answered, so the nominal control brings 3 to 0: 2 at the price 1. The other

@@ -35,6 +35,7 @@ def numbers():
     ]
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("seed", numbers())
 def test_what_is_said_of_a_random_problem_in_any_units_is_true(seed, tmp_path):
     problem, units = instance(seed)

@@ -112,6 +112,7 @@ def test_the_quadratures_reproduce_the_listed_values(name, value):
     assert abs(weights @ f(nodes) - value) <= 1e-10
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("decay", [0.5, 4.0])
 def test_one_sided_approximation_of_an_exponential_of_any_rate(decay, solver):

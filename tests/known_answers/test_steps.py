@@ -89,6 +89,7 @@ def _cheapest(step: float, before: float | None, T: float = 2.0, K: int = 20) ->
     return float(found.fun) if found.status == 0 else np.inf
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(("step", "before"), [(0.5, None), (0.4, 0.0), (0.4, -0.7), (0.3, None), (0.3, 0.5)])
 def test_the_cost_is_that_of_an_independent_linear_program(step, before, tmp_path):
     problem = {

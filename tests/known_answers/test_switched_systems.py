@@ -207,6 +207,7 @@ def test_functionals_of_switched_systems_are_what_trajectories_do() -> None:
         assert found == pytest.approx(float(direction @ state), rel=1e-11)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("factors", [(2.0, 0.5, 4.0), (0.25, 8.0, 2.0)])
 def test_other_units_by_powers_of_two_give_the_same_bits(factors: tuple[float, float, float]) -> None:
     time, first, control = factors
@@ -271,6 +272,7 @@ def test_a_piece_that_is_changed_afterwards_is_found_by_what_it_does(
     assert check(tampering.forged(finished, tmp_path / "copy", change, consistent=True)).status == "refuted"
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize(
     ("system", "said"),
     [

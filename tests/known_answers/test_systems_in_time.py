@@ -24,6 +24,7 @@ DELAY = {
 }
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("problem", "J"), [(DRIFT, 0.819851), (DELAY, 0.538325)], ids=["drift", "delay"])
 def test_a_listed_value_is_found_and_verified(problem: dict[str, Any], J: float, tmp_path: Path) -> None:
     assert verified(tmp_path / "run", problem, pieces(50))["cost"] == pytest.approx(J, abs=6e-7)
@@ -128,6 +129,7 @@ def test_an_uncertain_drift_that_reaches_a_fixed_state_is_refused() -> None:
         sr.run({**config, "observers": []}, figures=False)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("factors", [(2.0, 0.5, 4.0), (0.25, 8.0, 2.0)])
 def test_other_units_by_powers_of_two_give_the_same_bits(factors: tuple[float, float, float]) -> None:
     time, first, control = factors
@@ -168,6 +170,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "change",
     [

@@ -96,6 +96,7 @@ def test_the_transfer_of_simbol_x_costs_what_is_listed(tmp_path: Path) -> None:
     assert verified(tmp_path / "run", config, pieces(250))["cost"] == pytest.approx(1.813578, rel=3e-7)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "change",
     [

@@ -134,6 +134,7 @@ def test_a_constant_that_the_values_refute_proves_nothing():
     assert undefined.upper_bound == np.inf
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("factor", [1e-200, 1e-9, 1e9, 1e200])
 def test_adalipo_does_not_depend_on_the_unit_of_the_value(factor):
     plain = sr.maximise(TWO, UNIT, "adalipo", budget=80, growth=1e-9, polish=0.0)

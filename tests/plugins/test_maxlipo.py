@@ -81,6 +81,7 @@ def test_slopes_follow_the_unit_of_the_values():
     np.testing.assert_allclose(bound(one, points + 0.01) * 1e9, bound(other, points + 0.01), rtol=1e-6)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("count", [10, 90, 400])
 def test_the_early_exit_finds_the_candidate_that_a_full_search_finds(count):
     rng = np.random.default_rng(1)

@@ -259,6 +259,7 @@ CASES = [
 ]
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(("name", "dimension", "budget"), CASES)
 def test_they_spend_every_budget_in_every_dimension_without_a_fallback(name, dimension, budget):
     box = sr.Box(np.full(dimension, -2.0), np.full(dimension, 3.0))

@@ -93,6 +93,7 @@ def of_boxes(tmp_path_factory) -> float:
     return cost(BOXES, tmp_path_factory.mktemp("boxes") / "run")
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("part", AS_ZONOTOPE)
 def test_a_box_written_as_a_zonotope_gives_the_same_answer(part, of_boxes, tmp_path):
     assert cost(changed(**{part: AS_ZONOTOPE[part]}), tmp_path / "run") == pytest.approx(of_boxes, rel=1e-6)
@@ -208,6 +209,7 @@ def disc(tmp_path) -> str:
     return str(tmp_path / "disc.py")
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("part", ["path", pytest.param("terminal", marks=pytest.mark.slow), "disturbance"])
 def test_a_set_of_a_file_with_three_members_works_as_the_norm_that_it_is(part, disc, tmp_path):
     radius = {"path": 1.3, "terminal": 0.4, "disturbance": 0.02}[part]

@@ -44,6 +44,7 @@ def test_a_walsh_dictionary_changes_nothing_in_the_linear_program():
     assert np.ptp(values) <= 1e-8
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
 def test_a_solver_with_no_iterations_to_spare_fails_and_says_so(solver):
     claim_limit = type(solver)(max_iterations=1)

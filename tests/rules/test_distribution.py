@@ -37,6 +37,7 @@ def run(command: list[str | Path], place: Path, **variables: str) -> str:
     return done.stdout
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("module", ["sparserob", "sparserob_core"])
 def test_the_command_is_a_module_of_either_name(module: str, tmp_path: Path) -> None:
     assert run([sys.executable, "-m", module, "--version"], tmp_path) == f"sparserob {version('sparserob')}\n"

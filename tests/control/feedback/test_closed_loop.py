@@ -57,6 +57,7 @@ def cells(case: Loop, widths=(1.0, 0.3, 0.01)):
     return np.array(found).T
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", EXACT)
 def test_the_state_and_every_response_are_those_of_a_loop_that_measures(name):
     case, loop, x = made(name)
@@ -108,6 +109,7 @@ def test_what_a_cell_adds_to_its_chord_is_an_eighth_of_its_square_times_the_curv
     assert (late[short] <= 1.1 * owed[short] + 1e-12).all()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["begun", "level"])
 def test_a_bound_is_reached_where_the_curvature_is_constant(name):
     """The double integrator between two breakpoints, in the direction in which both ends of a cell are level: a
@@ -149,6 +151,7 @@ def test_what_stands_beside_the_state_is_added_at_both_ends(name):
         assert (late == loop.bounded(x, lower, upper, H)[1]).all()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", MEASURABLE)
 def test_bounds_of_measurable_disturbances_are_above_those_that_jump_often_and_near_them(name):
     case, loop, x = made(name)
@@ -198,6 +201,7 @@ def test_a_loop_whose_deviations_are_larger_is_that_loop_with_larger_sets():
     )
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize("name", LOOPS)
 def test_uncertain_rows_are_violated_by_the_worst_case_of_the_state_and_of_the_control_beside_it(name):
     """Rows that look the same way or opposite ways share their answers."""
@@ -228,6 +232,7 @@ def test_uncertain_rows_are_violated_by_the_worst_case_of_the_state_and_of_the_c
         assert both == pytest.approx(loop.height(along) + within - h[: len(H)], abs=1e-9)
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize("name", LOOPS)
 def test_the_signal_of_the_worst_deviation_takes_the_state_there(name):
     """Stepped with the gains of the decision, from where the deviation begins, under the signal that has it."""

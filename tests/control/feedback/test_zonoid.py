@@ -49,6 +49,7 @@ def test_the_support_of_a_force_on_a_double_integrator_is_in_closed_form() -> No
         assert found.support(a @ found.outward) == pytest.approx(np.abs(parts).sum(), rel=1e-13)
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", CASES)
 def test_the_support_function_is_the_integral_of_that_of_the_disturbance(name: str) -> None:
     A, E, length, bound = CASES[name]
@@ -78,6 +79,7 @@ def test_the_signal_of_a_direction_attains_the_support_function_and_no_sampled_s
         assert a @ pushed <= float(found.support(a)) * (1 + 1e-12)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name == "four integrators" else ()) for name in CASES]
 )
@@ -114,6 +116,7 @@ def test_a_chord_less_a_parabola_is_the_whole_truth_of_convex_quadratics() -> No
     assert _apart(*straight, np.zeros(50), 0.0).all()
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", CASES)
 def test_the_support_function_is_that_of_the_checker_to_all_digits(name: str) -> None:
     """Whose enclosure is another algorithm, in balls: no quadrature is as good."""

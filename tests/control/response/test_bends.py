@@ -55,6 +55,7 @@ def sampled(sigma: DisturbanceSupport, start: float, width: float) -> Array:
     return np.asarray(each.sum(axis=(2, 3)).max(axis=0))
 
 
+@pytest.mark.first(16)
 @pytest.mark.parametrize("uncertain", [False, True])
 @pytest.mark.parametrize("bound", sorted(BOUNDS))
 @pytest.mark.parametrize("grid", sorted(GRIDS))

@@ -80,6 +80,7 @@ def program(name: str) -> Any:
     return prepare(made, *grids).program
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("name", KINDS)
 def test_no_cell_is_bounded_below_what_is_met_in_it_and_narrow_ones_hardly_above(name: str) -> None:
     rng, made = np.random.default_rng(5), program(name)

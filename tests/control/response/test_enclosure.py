@@ -170,6 +170,7 @@ def test_an_l1_ball_of_functions_larger_than_one_is_enclosed():
         check(constraint, rng.normal(size=constraint.functionals.variables), rng, *constraint.cells)
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize("rate", [-3.0, -20.0, -60.0, -400.0, -3000.0])
 @pytest.mark.parametrize("bound", ["none", "box"])
 def test_a_stiff_system_on_long_pieces_is_enclosed(rate, bound):
@@ -209,6 +210,7 @@ def test_a_stiff_bound_is_the_violation_at_a_single_time(rate, side):
     assert np.allclose(bounds, (G @ x - rhs)[:, 0], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("nu", "bound"),
     [
@@ -291,6 +293,7 @@ STIFF = {
 }
 
 
+@pytest.mark.first(7)
 @pytest.mark.parametrize("kind", ["piecewise_constant", "measurable", "none"])
 @pytest.mark.parametrize("name", sorted(STIFF))
 def test_stiff_long_and_unstable_systems_are_enclosed_on_pieces_of_any_length(name, kind):

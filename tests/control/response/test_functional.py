@@ -57,6 +57,7 @@ def indices(seed: int, count: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return np.append(rng.uniform(0.0, HORIZON, count - 1), HORIZON), rng.normal(size=(count, 2)), np.zeros((count, 0))
 
 
+@pytest.mark.first(5)
 @pytest.mark.parametrize(("name", "begun"), [("none", False), ("box", False), *((name, True) for name in MODELS)])
 def test_rows_values_parts_and_turning_directions_agree(name: str, begun: bool) -> None:
     one = functionals(name, begun)
@@ -85,6 +86,7 @@ def test_rows_values_parts_and_turning_directions_agree(name: str, begun: bool) 
     assert again.measurable is one.measurable
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", [name for name in MODELS if name not in ("none", "measurable", "of two classes")])
 def test_the_worst_disturbance_attains_what_is_said_and_no_other_exceeds_it(name: str) -> None:
     one, rng = functionals(name, begun=True), np.random.default_rng(4)

@@ -89,6 +89,7 @@ def test_rows_by_baby_and_giant_steps_are_those_of_the_plain_recursion(seed, pie
         )
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("kind", sorted(RATES))
 @pytest.mark.parametrize("pieces", [1000, 1531, 16384])
 def test_outputs_in_blocks_are_rows_times_the_inputs(kind, pieces):
@@ -164,6 +165,7 @@ def test_rows_of_many_instants_are_those_of_each_alone(together):
             np.testing.assert_allclose(one[i], other[0], rtol=1e-14, atol=1e-15)
 
 
+@pytest.mark.first(8)
 @pytest.mark.parametrize("kind", sorted(RATES))
 @pytest.mark.parametrize("pieces", [1000, 1023, 4999, 20_000])
 def test_states_in_blocks_are_the_closed_form(kind, pieces):

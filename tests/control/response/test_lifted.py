@@ -109,6 +109,7 @@ def deltas(rng, nu):
     return np.vstack([rng.uniform(-1, 1, (6, nu)), np.sign(rng.normal(size=(4, nu)))])
 
 
+@pytest.mark.first(27)
 @pytest.mark.parametrize("grid", sorted(GRIDS))
 @pytest.mark.parametrize("name", sorted(SYSTEMS))
 @pytest.mark.parametrize("scale", [1.0, 0.05])
@@ -150,6 +151,7 @@ def test_the_taylor_model_of_a_functional_encloses_it_over_the_cell(name):
             assert (block_norms(truth - polynomial, lifted.starts) <= allowed).all()
 
 
+@pytest.mark.first(13)
 @pytest.mark.parametrize("name", sorted(SYSTEMS))
 @pytest.mark.parametrize("grid", sorted(GRIDS))
 def test_the_push_is_enclosed_over_the_cell(name, grid):

@@ -57,6 +57,7 @@ def test_the_support_of_a_box_is_an_integral_of_moduli(seed, speed):
     assert abs(found[0] - truth) <= 1e-6 * max(1.0, truth)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["ellipsoid", "triangle", "1-norm"])
 def test_the_support_of_other_sets_is_an_integral_of_their_support(name):
     rng = np.random.default_rng(2)
@@ -155,6 +156,7 @@ def across_kinks(system, bound, direction, time):
     return total
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", FLAT)
 @pytest.mark.parametrize("short", [0.5, 4.0])
 def test_bounds_of_the_support_of_a_flat_set_hold_it_and_are_close(name, short):
@@ -175,6 +177,7 @@ def test_bounds_of_the_support_of_a_flat_set_hold_it_and_are_close(name, short):
             assert high - low > 1e-9 * abs(truth)
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", FLAT)
 @pytest.mark.parametrize("short", [0.5, 4.0])
 def test_bounds_over_turns_hold_what_both_systems_add_and_are_close(name, short):
@@ -219,6 +222,7 @@ def test_the_halves_of_a_polynomial_are_itself():
         np.testing.assert_allclose(at(halves[2:], u), at(points, 0.5 + u / 2), atol=1e-14)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", sorted(BOUNDS))
 def test_a_rough_support_is_near_the_support(name):
     """It says where to climb to; what is found there is measured anew."""

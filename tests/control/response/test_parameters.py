@@ -35,6 +35,7 @@ class Egg(ConvexSet):
         return points[..., 0] ** 2 + points[..., 1] ** 4 - 1
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("convex", [*sorted(SETS), "egg", "long diamond"])
 def test_the_map_of_a_box_onto_a_set_has_the_slopes_that_it_has(convex):
     rng = np.random.default_rng(12)

@@ -169,6 +169,7 @@ def test_the_profile_of_a_uniform_grid_equals_the_offsets(seed, pieces):
     assert np.allclose(fast.ravel(), slow, rtol=1e-10, atol=1e-11)
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("disturbance", ["uneven", "three walsh"])
 @pytest.mark.parametrize("bound", [Box([-0.1, -0.2], [0.3, 0.1]), Box([-0.3, -0.2], [0.3, 0.2])])
 @pytest.mark.parametrize("begun", [None, Box([-0.2, 0.0, -0.1], [0.1, 0.4, 0.1])])
@@ -224,6 +225,7 @@ def test_what_pieces_give_by_their_age_is_what_rows_give_from_piece_to_piece(sta
         assert np.allclose(one, other, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("pieces", [7, 999, 3001])
 def test_many_pieces_add_up_to_the_horizon(pieces):
     """An integrator driven by 1 ends at the horizon; the rounded length of a piece may not accumulate."""

@@ -137,6 +137,7 @@ def test_a_kernel_is_the_closed_form_but_for_its_error(
     assert off.max() > 1e-9 if name else (found.error < 1e-11).all()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["TERMS", "DEGREE", "kernel"])
 def test_bounds_hold_what_coarse_transitions_are_off_by(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     H = np.array([[1.0, 0.3], [-0.2, 1.0]])

@@ -116,6 +116,7 @@ def test_it_is_nowhere_above_its_chord_by_more_than_is_said_and_hardly_less(plan
     assert max(ratios) > 0.5  # an enclosure that is a little smaller would be wrong
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["TERMS", "DEGREE"])
 def test_bounds_hold_what_coarse_transitions_are_off_by(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     times = np.linspace(0.0, HORIZON, 31)

@@ -104,6 +104,7 @@ def test_a_curved_set_is_enclosed_over_cells_of_directions(seed, plant, bound):
     assert (bounds < 0.0).any() or truths.max() > 0.0
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", ["TERMS", "DEGREE"])
 @pytest.mark.parametrize("part", ["control", "disturbance", "initial"])
 def test_bounds_hold_what_coarse_transitions_are_off_by(name, part, monkeypatch):
@@ -139,6 +140,7 @@ def test_transitions_that_are_not_resolved_give_no_bound(monkeypatch):
     assert not np.isfinite(constraint.enclosure(np.zeros(6), lower, upper).bounds[-1])
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("plant", sorted(PLANTS))
 def test_derivatives_in_time_are_differences(plant):
     worst = functionals(plant, GRIDS["uneven"], None, "box", "ellipsoid")
@@ -152,6 +154,7 @@ def test_derivatives_in_time_are_differences(plant):
     np.testing.assert_allclose(found, (ahead - behind) / (2 * h), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(("start", "width"), [(1.0, 0.2), (2.0, 0.01)], ids=["third", "second"])
 @pytest.mark.parametrize("part", ["state", "disturbance", "initial"])
 def test_what_bends_within_a_cell_is_counted(part, start, width):

@@ -29,6 +29,7 @@ CURVED = [OBLONG, *(NormBall(p, 0.7, centre=np.array([0.2, -0.4])) for p in (1.5
 SEGMENTS = Zonotope(np.array([0.1, 0.2, -0.3]), np.array([[1.0, 0, 0], [0.5, 0.5, 0], [0, -1.0, 2.0], [0.3, 0.3, 0.3]]))
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("ball", CURVED)
 def test_a_curved_set_knows_its_rim_its_normals_and_its_gauge(ball):
     turns = np.linspace(0.0, 2.0 * np.pi, 37)[:-1] + 0.01
@@ -291,6 +292,7 @@ def test_a_cylinder_is_its_base_in_the_first_coordinates():
 LEANING = np.array([[1.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("base", CURVED)
 def test_an_oblique_cylinder_holds_what_is_seen_in_its_base(base):
     leaning, rng = oblique(base, LEANING), np.random.default_rng(8)

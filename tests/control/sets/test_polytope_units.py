@@ -11,6 +11,7 @@ H = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0]])
 h = np.array([1.0, 1.0, 1.0, 1.0, 0.5])
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("seed", range(8))
 def test_rows_and_coordinates_of_any_size_make_the_same_set(seed):
     rng = np.random.default_rng(seed)

@@ -165,6 +165,7 @@ def test_the_excess_of_a_smooth_set_that_is_known_by_its_support_function_is_of_
     assert wide < 4.0 * ball.linearisation_excess(centre, 0.1 * spread)  # twice the closed form of two steps, each
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_leading_axes_are_kept(d: int) -> None:
     rng = np.random.default_rng(d)
@@ -303,6 +304,7 @@ def test_an_ellipsoid_in_units_far_apart_still_tells_inside_from_outside() -> No
         assert (ellipsoid.violation(2.0 * rim.T) > 0.0).all()
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize("seed", range(8))
 def test_a_middle_on_the_boundary_is_drawn_inwards_whatever_rounding_says(seed):
     """Of a triangle with a right angle the middle of the bounding box is halfway along the third side."""

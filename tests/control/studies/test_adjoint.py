@@ -67,6 +67,7 @@ def test_values_are_those_of_transitions_and_quadrature(kind: str) -> None:
         assert high - low <= 1e-12
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("kind", ["none", "constant", "measurable"])
 @pytest.mark.parametrize("parts", [1, 3])
 def test_cells_bound_every_value_in_them_closely(kind: str, parts: int) -> None:

@@ -117,6 +117,7 @@ def by_all_signals(w: float, radius: float, x0: float, K: int, L: int, cost: str
     return float(found.fun) if found.status == 0 else np.inf
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("w", "radius", "x0", "K"), [(0.2, 0.4, 0.5, 3), (0.1, 0.3, -0.4, 2), (0.3, 0.5, 0.3, 3)])
 def test_the_tree_of_a_scalar_problem_proves_what_dynamic_programming_finds(
     w: float, radius: float, x0: float, K: int
@@ -163,6 +164,7 @@ def test_what_dynamic_programming_finds_impossible_no_causal_policy_can_do() -> 
         assert (bound.lower == np.inf) is not exists
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(("radius", "x0"), [(0.3, 0.2), (2.5, 1.7)])
 def test_the_largest_factor_of_a_tree_is_the_largest_that_dynamic_programming_allows(radius: float, x0: float) -> None:
     K, w = 3, 0.1

@@ -32,6 +32,7 @@ def test_a_run_prints_a_table_and_where_everything_is(config: Path, process: Com
     assert done.stderr == ""
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(
     ("status", "expected"),
     [("certified", 0), ("verified", 0), ("infeasible", 3), ("refuted", 4), ("undecided", 4), ("failed", 5)],

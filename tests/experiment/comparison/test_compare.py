@@ -301,6 +301,7 @@ def test_a_list_of_runs_is_expected(given: Any) -> None:
         compare(given)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("count", [1, 2, 10])
 def test_the_figure_has_both_panels_for_any_number_of_runs(runs: Runs, count: int) -> None:
     comparison = compare([runs.rounds("exact"), *(runs.search(f"run{k}", seed=k) for k in range(count - 1))])
@@ -344,6 +345,7 @@ def test_a_first_bound_far_below_does_not_flatten_the_others(runs: Runs) -> None
     assert draw_comparison(comparison).axes[0].get_ylim()[0] > -2 * EXACT
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
 def test_the_ending_decides_the_kind_of_the_picture(runs: Runs, tmp_path: Path, ending: str) -> None:
     file = tmp_path / "new" / f"picture.{ending}"

@@ -33,6 +33,7 @@ def edited(config: Path, old: str, new: str) -> Path:
     return config
 
 
+@pytest.mark.first(23)
 @pytest.mark.parametrize(
     ("old", "new", "place", "said"),
     [

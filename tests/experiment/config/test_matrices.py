@@ -136,6 +136,7 @@ BAD: dict[str, tuple[dict[str, np.ndarray], str]] = {
 }
 
 
+@pytest.mark.first(10)
 @pytest.mark.parametrize("name", BAD)
 def test_a_file_at_fault_is_refused_with_key_file_and_array(name: str, tmp_path: Path) -> None:
     arrays, array = BAD[name]

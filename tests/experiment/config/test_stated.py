@@ -123,6 +123,7 @@ def same(one: object, other: object) -> bool:
     return bool(one == other)
 
 
+@pytest.mark.first(6)
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_problem_is_read_back_from_its_config_as_it_was(name: str) -> None:
     given = PROBLEMS[name]()

@@ -89,6 +89,7 @@ COMMANDS = (
 )
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("arguments", COMMANDS, ids=[arguments[0] for arguments in COMMANDS])
 def test_no_command_that_reads_a_directory_executes_what_its_config_names(
     foreign: tuple[Path, Path, Path], command: Command, arguments: tuple[str, ...]

@@ -279,6 +279,7 @@ def test_letters_that_no_font_has_are_told_once_and_other_warnings_are_kept(tmp_
         warnings.warn("something else", UserWarning, stacklevel=1)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "entries",
     [

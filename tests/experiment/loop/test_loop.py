@@ -156,6 +156,7 @@ def test_what_is_no_run_is_refused(tmp_path, capsys) -> None:
     assert "expected the directory of a run" in capsys.readouterr().err
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ["theta", "control", "gains", "decision"])
 def test_another_control_than_the_proven_one_is_not_applied(name: str, outcome, tmp_path) -> None:
     """Whoever changes one array of solution.npz is found out by the others and by the certificate."""

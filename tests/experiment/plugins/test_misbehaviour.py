@@ -134,6 +134,7 @@ SOLVERS = [
 ]
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(("body", "words"), SOLVERS)
 def test_a_solver_that_misbehaves_is_named_in_the_answer(body, words, tmp_path) -> None:
     """A solver may fail on a program: another one answers, and the result names the first with what it did."""

@@ -118,6 +118,7 @@ def test_it_imports_nothing_but_public_names() -> None:
     assert modules == {"typing", "numpy", "sparserob_core"}
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("place", ["initial_set", "disturbance", "terminal", "path"])
 def test_a_sum_that_is_a_shipped_set_has_its_cost(place: str) -> None:
     factor = {"terminal": 8.0, "path": 60.0, "disturbance": 0.2}.get(place, 1.0)

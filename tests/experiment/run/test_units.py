@@ -148,6 +148,7 @@ class Heard(sr.Observer):
             self.rounds.append(event)
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("policy", ["open_loop", "affine"])
 def test_what_refutes_a_control_has_the_unit_of_its_row(tmp_path: Path, policy: str) -> None:
     moved = {"terminal": [{"box": 0.12}], "control_step": {"box": 0.9}}

@@ -143,6 +143,7 @@ def test_a_signal_that_is_not_admissible_is_told_from_one_that_is():
         assert admissibility(model.functionals.disturbance, 1.3 * drawn).max() > 1e-3
 
 
+@pytest.mark.first(8)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(
     "parameters",

@@ -136,6 +136,7 @@ def test_without_a_cost_there_is_nothing_to_draw() -> None:
         draw_study(study({"x": [1.0, 2.0]}, [{"x": 1.0, "cost": None, "status": "infeasible"}]))
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("count", [1, 30])
 def test_one_point_and_very_many_curves_can_be_drawn(tmp_path: Path, count: int) -> None:
     rows = [{"x": 1.0, "method": f"m{k}", "cost": float(k)} for k in range(count)]

@@ -47,6 +47,7 @@ def both(program: FiniteProgram) -> tuple[FiniteSolution, FiniteSolution]:
     return cones, solve_finite(program, REGISTRY.build("solver", "piqp"))
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("curved", [False, True])
 @pytest.mark.parametrize("image", [False, True])
 def test_cones_and_directions_have_one_value_that_is_proven(image: bool, curved: bool) -> None:

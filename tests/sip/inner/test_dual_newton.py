@@ -63,6 +63,7 @@ def separable(seed: int, rows: int, entries: int, curvature: float) -> FinitePro
     )
 
 
+@pytest.mark.first(8)
 @pytest.mark.parametrize("curvature", [0.0, 1e-6, 1e-2, 1.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_from_nothing_it_finds_the_optimum_to_round_off(seed: int, curvature: float) -> None:
@@ -163,6 +164,7 @@ def test_the_searching_method_counts_every_relaxed_program_too(monkeypatch: pyte
     assert sum(result.solved_by.values()) == result.counts["relaxed_programs"] > 0
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [

@@ -44,6 +44,7 @@ def slanted(seed: int, sides: int, q: np.ndarray | None = None) -> FiniteProgram
     return FiniteProgram(cost, weights, lower, np.ones(n + sides), none, np.zeros(0), none, np.zeros(0), S=S)
 
 
+@pytest.mark.first(24)
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("dust", [0.0, 1e-16, 1e-14, 1e-9])
 def test_a_multiplier_near_its_limit_is_held_there_and_the_others_make_up_for_it(seed, dust):

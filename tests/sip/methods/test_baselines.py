@@ -145,6 +145,7 @@ def test_fresh_draws_break_the_scenario_decision_no_more_often_than_the_bound(tm
     assert 0.0 < share < outcome.result.scenario_bound.after
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "method", [{"name": "nominal"}, {"name": "scenario", "scenarios": 5}], ids=lambda method: method["name"]
 )

@@ -25,6 +25,7 @@ def solved(solver="auto", **options):
     return sr.solve(problem, control=BREAKPOINTS, solver=solver, method={"name": "sparsest", **options})
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("options", [{}, {"alphabet": [-1.0, 0.0, 1.0]}, {"alphabet": [-0.3, 0.0]}])
 def test_a_solver_that_is_named_answers_every_part_of_the_tree(options):
     spied = Spied()

@@ -270,6 +270,7 @@ def test_a_corridor_of_an_integrator_is_certified_although_its_path_has_kinks(op
         assert result.counts["rounds"] <= 20
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize(("start", "sigma"), [([1.0], 0.0), ([1.0], 0.3), ([-1.0], 0.3)])
 @pytest.mark.parametrize("count", [5, 40])
 def test_an_initial_state_on_the_boundary_of_its_path_set_ends_with_an_answer(options, start, sigma, count):
@@ -324,6 +325,7 @@ def test_a_start_that_must_leave_at_once_is_infeasible(options):
     assert result.status == "infeasible"
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("width", [1e-3, 1e-6, 1e-8])
 def test_a_thin_terminal_set_is_reached_and_certified(options, width):
     """An almost-equality: the margin of the rows must shrink with the set."""

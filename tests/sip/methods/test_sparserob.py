@@ -48,6 +48,7 @@ def test_a_general_program_is_solved_to_the_accuracy_of_the_search():
     assert result.status == "undecided"
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize(
     "name",
     [

@@ -212,6 +212,7 @@ def test_what_idle_workers_evaluated_is_kept_in_the_state():
         assert (again.best_value, again.evaluations) == (5.0, 2)
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("name", ["random_search", "direct", "maxlipo", "simulated_annealing", "sequool"])
 def test_a_larger_budget_is_the_search_that_had_it_from_its_beginning(name):
     short = sr.ask_tell(BOX, name, budget=20, seed=2, polish=0)
@@ -251,6 +252,7 @@ MIXED = sr.Box([1.0, 1e-6, 2.0, 1.0], [4.0, 1e2, 2.0, 1000.0])
 RANGES = {"integer": [0, 2, 3], "logarithmic": [1, 3]}
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("name", NAMES)
 def test_whole_and_logarithmic_ranges_are_kept_and_filled(name):
     search = sr.ask_tell(MIXED, name, budget=200, seed=1, **RANGES, start=[[2.0, 1e-3, 2.0, 10.0]])

@@ -86,6 +86,7 @@ def test_an_ascent_that_is_given_its_start_evaluates_it_once():
         assert (seen[0] == first).all() and not (seen[1] == first).all()
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("polish", [0.0, 0.5])
 def test_a_polish_takes_the_ascent_for_every_maximiser_and_sees_only_what_can_move(polish):
     class Once(sr.Maximiser):
@@ -182,6 +183,7 @@ WALLS = {
 }
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("walls", WALLS)
 @pytest.mark.parametrize("disturbance", SETS)
 def test_the_steepest_index_is_the_one_at_which_no_disturbance_is_worse(disturbance, walls):

@@ -100,6 +100,7 @@ def test_a_remainder_of_what_drives_nothing_is_held_too() -> None:
     assert flow.error[0] <= 1e-9
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize(
     ("entry", "said"),
     [

@@ -82,6 +82,7 @@ def test_multipliers_leave_no_slope_in_what_answers_however_far_that_may_go() ->
     assert cost - 1e-7 <= lower <= cost + 1e-9  # 5e-4 where what rounding leaves stays
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("seed", range(4))
 def test_both_methods_meet_at_one_optimum_and_rows_that_come_later_move_it_alike(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -119,6 +119,7 @@ def solved(counterpart: Counterpart, blocks: list[UncertainRows], margin: float 
 CASES = [(seed, spread, kind) for seed in range(4) for spread in SPREADS for kind in ("several", "single", "none")]
 
 
+@pytest.mark.first(12)
 @pytest.mark.parametrize(("seed", "name", "kind"), CASES)
 def test_the_optimum_is_that_of_what_is_written_out_and_its_multipliers_prove_it(
     seed: int, name: str, kind: str
@@ -139,6 +140,7 @@ def test_the_optimum_is_that_of_what_is_written_out_and_its_multipliers_prove_it
         assert size >= abs(proven) - 1e-12
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_block_that_comes_late_and_another_margin_are_imposed_like_those_before(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -172,6 +174,7 @@ def test_what_comes_late_begins_with_its_equations_met(monkeypatch: pytest.Monke
     assert 2 * steps["met"] < steps["slack"]
 
 
+@pytest.mark.first(12)
 @pytest.mark.parametrize(("seed", "name", "kind"), CASES)
 def test_what_nothing_meets_is_relaxed_as_little_as_possible_and_its_multipliers_refute_it(
     seed: int, name: str, kind: str
