@@ -54,7 +54,8 @@ if TYPE_CHECKING:
 
 LEFT = ((1e-19, 160), (1e-16, 160), (1e-13, 160), (1e-11, 160))
 """Of the state, what is to be beyond the degree, and with how many coefficients times states at most: the first that is
-reached. Norms of transitions multiply it: with 1e-13 what rides a wall to 1e-9 was left open; twice as many numbers take four times as long."""
+reached. Norms of transitions multiply it: with 1e-13 what rides a wall to 1e-9 was left open. Twice as many numbers
+take four times as long."""
 MOST_DEGREE = 24  # of the expansion
 LOOKS = 17  # times at which the numbers of the system are looked at, by which nothing is proven
 EXPONENTIAL = 40  # terms of the exponential of norms on an interval, which are a few: 4^40 / 40! is 1e-24

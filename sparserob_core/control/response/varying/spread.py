@@ -15,7 +15,8 @@ from sparserob_core.errors import InputError
 
 LEFT = ((1e-14, 64), (1e-12, 100), (1e-10, 140))
 """Of the state, what is beyond the degree is about, and with how many coefficients times states at most: the first that
-is reached. A proof needs 1e-8, and norms are counted many times on the way; of twice as many numbers a run takes some five times as long."""
+is reached. A proof needs 1e-8, and norms are counted many times on the way; of twice as many numbers a run takes some
+five times as long."""
 MOST_ORDERS = 20  # the degree, at most: the coefficients are then as many for one parameter alone
 LOOKS = 17  # times at which the coefficients of A are looked at; of an estimate, with which nothing is proven
 _KNOWN: WeakKeyDictionary[VaryingSystem, tuple[Spread, VaryingSystem]] = WeakKeyDictionary()
