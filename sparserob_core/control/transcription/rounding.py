@@ -84,9 +84,7 @@ def _added(model: Transcription, result: Result, share: float, prices: Array | N
     times, directions, parameters = indices[0], indices[1], indices[2].reshape(len(rows), -1)
     weights = model.response.weights(times, directions, parameters)
     sizes = np.abs(multipliers) @ _beside_control(model, weights, times, directions)
-    if prices is None or not whole or not _plain(model, result):
-        controlled = np.abs(model.functionals.decided(weights.control)) @ _far(model.problem.control)
-        return float(sizes) + besides + float(np.abs(multipliers) @ controlled.sum(axis=1))
+    prices = prices if whole and _plain(model, result) else None
     return float(sizes) + besides + _pushed(model, prices, weights.control, multipliers, share)
 
 
@@ -97,15 +95,19 @@ def _plain(model: Transcription, result: Result) -> bool:
     return whole and result.dual.z is None and finite.n == m * model.control.pieces
 
 
-def _pushed(model: Transcription, prices: Array, weights: Array, multipliers: Array, share: float) -> float:
+def _pushed(model: Transcription, prices: Array | None, weights: Array, multipliers: Array, share: float) -> float:
     """The numbers that are added up to what rows with ``multipliers (k,)``, of ``weights (k, L, m)``, make of the
     control, at its largest.
 
     The bound is the least of ``sum_j (w_j |u_j| + r_j u_j)`` over a box, ``w`` the ``prices`` and ``r`` the sum of the
     rows. Where it holds 0 it is attained at ``u_j = 0`` for every ``|r_j| <= w_j``: so only entries count whose
-    ``|r_j|`` is not below ``w_j`` by more than a ``share`` of the largest numbers of any in their channel.
+    ``|r_j|`` is not below ``w_j`` by more than a ``share`` of the largest numbers of any in their channel. All of them
+    do where the bound is one of something else, and there are no prices.
     """
     functionals, finite, m = model.functionals, model.program.finite, model.problem.system.controls
+    if prices is None:
+        controlled = np.abs(functionals.decided(weights)) @ _far(model.problem.control)
+        return float(np.abs(multipliers) @ controlled.sum(axis=1))
     push = multipliers @ functionals.on_decision(weights)
     size = np.abs(multipliers) @ functionals.on_decision(np.abs(weights))
     off = np.repeat(size.reshape(m, -1).max(axis=1, initial=0.0), model.control.pieces)
