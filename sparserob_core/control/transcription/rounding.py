@@ -106,8 +106,7 @@ def _pushed(model: Transcription, prices: Array | None, weights: Array, multipli
     """
     functionals, finite, m = model.functionals, model.program.finite, model.problem.system.controls
     if prices is None:
-        controlled = np.abs(functionals.decided(weights)) @ _far(model.problem.control)
-        return float(np.abs(multipliers) @ controlled.sum(axis=1))
+        return float(np.abs(multipliers) @ _controlled(model, weights))
     push = multipliers @ functionals.on_decision(weights)
     size = np.abs(multipliers) @ functionals.on_decision(np.abs(weights))
     off = np.repeat(size.reshape(m, -1).max(axis=1, initial=0.0), model.control.pieces)
@@ -127,9 +126,12 @@ def _beyond(model: Transcription, result: Result) -> float:
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:
     """The numbers ``(k,)`` that are added up to rows ``c'x(t)``, ``directions (k, d)``, at their largest."""
     weights = model.response.weights(times, directions, parameters)
-    sizes = _beside_control(model, weights, times, directions)
-    controlled = np.abs(model.functionals.decided(weights.control)) @ _far(model.problem.control)
-    return np.asarray(sizes + controlled.sum(axis=1))
+    return _beside_control(model, weights, times, directions) + _controlled(model, weights.control)
+
+
+def _controlled(model: Transcription, weights: Array) -> Array:
+    """Those ``(k,)`` that the control brings, by ``weights (k, L, m)``."""
+    return np.asarray((np.abs(model.functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1))
 
 
 def _beside_control(model: Transcription, weights: Weights, times: Array, directions: Array) -> Array:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from math import ceil
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, TypeVar, final
 
 import numpy as np
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat, arb_poly
 
     from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+
+Part = TypeVar("Part")
 
 ORDER = 24  # of the system in time on a segment; with a tenth of it segments are a million times shorter
 TERMS = (16, 24, 32, 48, 64)  # of the solution over a part of a segment: the fewest that are sharp, else the last
@@ -59,6 +61,30 @@ class Weights:
     disturbance: list[arb_mat]
 
 
+def segmented(
+    system: VaryingSystem, horizon: float, made: Callable[[float, float, LinearSystem], Part | None]
+) -> list[Part]:
+    """What is ``made`` of a system between two times by their law, on parts of the horizon one after another, each
+    halved where it is too long; raises `Unchecked` where the system is not finite."""
+    found, cuts = list[Part](), [*(begin for begin, _, _ in system.laws), horizon]
+    todo = [
+        (start, stop, law)
+        for (begin, until), (_, _, law) in zip(pairwise(cuts), system.laws, strict=True)
+        for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
+    ][::-1]
+    while todo:
+        start, stop, law = todo.pop()
+        part = made(start, stop, law)
+        if part is not None:
+            found.append(part)
+            continue
+        if stop - start <= SHORTEST * horizon:
+            raise Unchecked(f"near t = {start:.9g} the system is not enclosed")
+        middle = (start + stop) / 2
+        todo += [(middle, stop, law), (start, middle, law)]
+    return found
+
+
 @final
 @dataclass(eq=False)
 class VaryingFlow:
@@ -78,24 +104,7 @@ class VaryingFlow:
     @cached_property
     def segments(self) -> list[Segment]:
         """The system on parts of the horizon, one after another; raises `Unchecked` where it is not finite."""
-        horizon, found = self.until, []
-        cuts = [*(begin for begin, _, _ in self.system.laws), horizon]
-        todo = [
-            (start, stop, law)
-            for (begin, until), (_, _, law) in zip(pairwise(cuts), self.system.laws, strict=True)
-            for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
-        ][::-1]
-        while todo:
-            start, stop, law = todo.pop()
-            made = self._segment(start, stop, law)
-            if made is not None:
-                found.append(made)
-                continue
-            if stop - start <= SHORTEST * horizon:
-                raise Unchecked(f"near t = {start:.9g} the system is not enclosed")
-            middle = (start + stop) / 2
-            todo += [(middle, stop, law), (start, middle, law)]
-        return found
+        return segmented(self.system, self.until, self._segment)
 
     def _segment(self, start: float, stop: float, system: LinearSystem) -> Segment | None:
         """The system from ``start`` to ``stop``; ``None`` where that is too long."""

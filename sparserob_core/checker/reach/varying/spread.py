@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from math import ceil, comb, factorial
+from math import comb, factorial
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -29,16 +29,15 @@ from sparserob_core.checker.reach.flow import balanced, stacked
 from sparserob_core.checker.reach.superposition import FREE, Parts
 from sparserob_core.checker.reach.tube import Known, Polynomial
 from sparserob_core.checker.reach.varying.flow import (
-    FIRST,
     LONG,
     ORDER,
     SHARP,
-    SHORTEST,
     TERMS,
     VaryingFlow,
     _largest,
     _Tails,
     _wider,
+    segmented,
 )
 from sparserob_core.checker.reach.varying.tube import ORDER as IN_TIME
 from sparserob_core.checker.sets.known import known
@@ -196,24 +195,7 @@ class SpreadFlow:
     @cached_property
     def segments(self) -> list[Segment]:
         """The system on parts of the horizon, one after another; raises `Unchecked` where it is not finite."""
-        horizon, found = self.until, []
-        cuts = [*(begin for begin, _, _ in self.system.laws), horizon]
-        todo = [
-            (start, stop, law)
-            for (begin, until), (_, _, law) in zip(pairwise(cuts), self.system.laws, strict=True)
-            for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
-        ][::-1]
-        while todo:
-            start, stop, law = todo.pop()
-            made = self._segment(start, stop, law)
-            if made is not None:
-                found.append(made)
-                continue
-            if stop - start <= SHORTEST * horizon:
-                raise Unchecked(f"near t = {start:.9g} the system is not enclosed")
-            middle = (start + stop) / 2
-            todo += [(middle, stop, law), (start, middle, law)]
-        return found
+        return segmented(self.system, self.until, self._segment)
 
     def _segment(self, start: float, stop: float, law: LinearSystem) -> Segment | None:
         """The system from ``start`` to ``stop``; ``None`` where that is too long."""
