@@ -104,14 +104,16 @@ def _pushed(model: Transcription, prices: Array | None, weights: Array, multipli
     ``|r_j|`` is not below ``w_j`` by more than a ``share`` of the largest numbers of any in their channel. All of them
     do where the bound is one of something else, and there are no prices.
     """
-    functionals, finite, m = model.functionals, model.program.finite, model.problem.system.controls
-    if prices is None:
-        return float(np.abs(multipliers) @ _controlled(model, weights))
-    push = multipliers @ functionals.on_decision(weights)
-    size = np.abs(multipliers) @ functionals.on_decision(np.abs(weights))
-    off = np.repeat(size.reshape(m, -1).max(axis=1, initial=0.0), model.control.pieces)
-    clear = (np.abs(push) + share * off < prices) & (finite.lower <= 0.0) & (finite.upper >= 0.0)
-    return float(np.repeat(_far(model.problem.control), model.control.pieces) @ np.where(clear, 0.0, size))
+    sizes = np.tensordot(np.abs(multipliers), _controlled(model, weights), 1)
+    if prices is not None:
+        grid, finite = model.response.grid, model.program.finite
+        functionals, m = model.functionals, model.problem.system.controls
+        push = multipliers @ functionals.on_decision(weights)
+        off = np.abs(multipliers) @ functionals.on_decision(np.abs(weights))
+        off = np.repeat(off.reshape(m, -1).max(axis=1, initial=0.0), model.control.pieces)
+        clear = (np.abs(push) + share * off < prices) & (finite.lower <= 0.0) & (finite.upper >= 0.0)
+        sizes[clear.reshape(m, -1)[:, grid.control_piece[grid.decided]].T] = 0.0
+    return float(sizes.sum())
 
 
 def _beyond(model: Transcription, result: Result) -> float:
@@ -126,12 +128,12 @@ def _beyond(model: Transcription, result: Result) -> float:
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:
     """The numbers ``(k,)`` that are added up to rows ``c'x(t)``, ``directions (k, d)``, at their largest."""
     weights = model.response.weights(times, directions, parameters)
-    return _beside_control(model, weights, times, directions) + _controlled(model, weights.control)
+    return _beside_control(model, weights, times, directions) + _controlled(model, weights.control).sum(axis=(1, 2))
 
 
 def _controlled(model: Transcription, weights: Array) -> Array:
-    """Those ``(k,)`` that the control brings, by ``weights (k, L, m)``."""
-    return np.asarray((np.abs(model.functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1))
+    """Those ``(k, J, m)`` that every piece of the control brings, by ``weights (k, L, m)``."""
+    return np.asarray(np.abs(model.functionals.decided(weights)) * _far(model.problem.control))
 
 
 def _beside_control(model: Transcription, weights: Weights, times: Array, directions: Array) -> Array:
