@@ -7,8 +7,6 @@ import copy
 from functools import partial
 from pathlib import Path
 
-import pytest
-
 import sparserob_core as sr
 from tests.support.entered import entered
 from tests.support.problems import spring
@@ -75,7 +73,6 @@ def beyond(functions: set[str], named: set[str]) -> list[str]:
     return sorted(one for one in functions if not one.startswith(tuple(named)))
 
 
-@pytest.mark.slow
 def test_a_run_with_feedback_and_one_without_go_one_way(tmp_path: Path) -> None:
     whole("open_loop", tmp_path / "first")  # whatever is done once in a process
     plain, answering = (
