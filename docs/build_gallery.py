@@ -23,6 +23,7 @@ STORIES: dict[str, tuple[str, ...]] = {
     "narrowing_corridor": ("states",),
     "two_modes": ("states",),
     "tracking_corridor": ("states",),
+    "ion_trap": ("states", "switching"),
     "motor_voltage": ("states",),
     "experiment1_feedback": ("states", "gains", "effort", "answers"),
     "output_feedback": ("outputs",),
