@@ -4,6 +4,7 @@ that do not change with time, trajectories of an integrator, each checked."""
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -62,25 +63,53 @@ def in_units(config: Config, time: float, length: float, unit: float) -> Config:
     return made
 
 
-def least() -> float:
-    """The least cost of `DECAY`: ``x(t) = int exp(a(t) - a(s)) (...) ds`` with ``a(t) = -t / 2 - p (1 - cos 2t) / 2``,
-    at many parameters and times: a bound from below that misses little."""
-    N, fine = 6, 400
-    marks = np.linspace(0.0, 3.0, N * fine + 1)
-    middles, width = (marks[:-1] + marks[1:]) / 2, 3.0 / (N * fine)
+INSIDE: Config = copy.deepcopy(DECAY)  # whose worst parameter lies inside the box
+INSIDE["problem"] = {
+    "name": "linear",
+    "system": {
+        "A": [["0.3 - 2*p^2 + 0.2*sin(t)"]],
+        "B": [["1 + p"]],
+        "E": [[1]],
+        "parameters": {"p": [-0.3, 0.4]},
+    },
+    "horizon": 2.0,
+    "initial_state": [0.5],
+    "control": {"box": 1.5},
+    "disturbance": {"box": [0.01]},
+    "path": [{"box": [1.0]}],
+    "terminal": [{"box": [0.35]}],
+}
+INSIDE["dictionaries"]["control"]["pieces"] = 5
+"""A state at one parameter is ``x(t) = int exp(a(t) - a(s)) (...) ds``: what of that each of the two has."""
+CLOSED: dict[str, tuple[Callable[[np.ndarray, float], np.ndarray], Callable[[float], float]]] = {
+    "decay": (lambda t, p: -t / 2 - p * (1 - np.cos(2 * t)) / 2, lambda p: 1 + p * p),
+    "inside": (lambda t, p: 0.3 * t - 2 * p * p * t + 0.2 * (1 - np.cos(t)), lambda p: 1 + p),
+}
+
+
+def least(config: Config, closed: str, places: int = 61) -> float:
+    """The least cost of a plant of one state, at many times and ``places`` of the parameter: a bound from below that
+    misses little."""
+    problem, (rate, gain) = config["problem"], CLOSED[closed]
+    horizon, N, fine = problem["horizon"], config["dictionaries"]["control"]["pieces"], 400
+    (most,), (held,), noise = problem["path"], problem["terminal"], problem["disturbance"]["box"][0]
+    marks = np.linspace(0.0, horizon, N * fine + 1)
+    middles, width = (marks[:-1] + marks[1:]) / 2, horizon / (N * fine)
     rows, limits = [], []
-    for p in np.linspace(-0.3, 0.6, 61).tolist():
-        a, inside = (-one / 2 - p * (1 - np.cos(2 * one)) / 2 for one in (marks, middles))
+    for p in np.linspace(*problem["system"]["parameters"]["p"], places).tolist():
+        a, inside = (rate(one, p) for one in (marks, middles))
         for k, t in enumerate(marks.tolist()):
-            if t < 1.2 - 1e-9 or (k % 10 and k < marks.size - 1):
+            if t < most.get("from", 0.0) - 1e-9 or (k % 10 and k < marks.size - 1):
                 continue
             gains = (np.exp(a[k] - inside) * (middles < t) * width).reshape(N, -1).sum(axis=1)
-            limit, begun = (0.1 if k == marks.size - 1 else 0.45), float(np.exp(a[k]))
+            limit = (held if k == marks.size - 1 else most)["box"][0]
+            begun = problem["initial_state"][0] * float(np.exp(a[k]))
             for sign in (1.0, -1.0):
-                rows.append(sign * (1 + p * p) * gains)
-                limits.append(limit - 0.02 * gains.sum() - sign * begun)
+                rows.append(sign * gain(p) * gains)
+                limits.append(limit - noise * gains.sum() - sign * begun)
     G = np.array(rows)
-    found = linprog(np.full(2 * N, 3.0 / N), np.hstack([G, -G]), limits, bounds=(0, 1.0))
+    bound = problem["control"]["box"]
+    found = linprog(np.full(2 * N, horizon / N), np.hstack([G, -G]), limits, bounds=(0, bound))
     assert found.success
     return float(found.fun)
 
@@ -93,7 +122,16 @@ def test_a_decay_at_an_uncertain_rate_costs_what_its_closed_form_says(
     config, time = (DECAY, 1.0) if units is None else (in_units(DECAY, *units), units[0])
     outcome = solved(config, tmp_path / "run")
     assert outcome.result.status == "certified"
-    assert outcome.result.cost / time == pytest.approx(least(), rel=2e-5)  # by the rule of midpoints, and between rows
+    found = least(DECAY, "decay")  # by the rule of midpoints, and between rows
+    assert outcome.result.cost / time == pytest.approx(found, rel=2e-5)
+
+
+@pytest.mark.slow
+def test_a_parameter_that_is_worst_inside_its_interval_is_found(tmp_path: Path) -> None:
+    outcome = solved(INSIDE, tmp_path / "run")
+    assert outcome.result.status == "certified"
+    assert outcome.result.cost == pytest.approx(least(INSIDE, "inside"), rel=1e-4)
+    assert least(INSIDE, "inside", 2) < 0.999 * outcome.result.cost  # than at the ends of its interval
 
 
 SPRING: Config = {

@@ -10,6 +10,7 @@ import sparserob_core as sr
 from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.response.response import Propagator, merge_grids
+from sparserob_core.control.response.varying.spread import tails
 from sparserob_core.control.response.varying_motion import Truncation, VaryingMotion
 from sparserob_core.control.transcription.transcribe import prepare
 
@@ -59,3 +60,9 @@ def test_bounds_on_cells_hold_what_the_closed_form_gives_there() -> None:
     truth = np.maximum(decay(t, p), -decay(t, p)).max(axis=0) - 0.5
     assert (truth <= found + 1e-14).all()
     assert np.median(found - truth) < 0.05
+
+
+def test_what_is_about_beyond_a_degree_is_the_rest_of_an_exponential() -> None:
+    found = tails(np.array([0.3, 0.5]), 4, 40)
+    assert found[0] == pytest.approx(np.exp(0.8) - 1)
+    assert found[2] == pytest.approx(np.exp(0.8) - 1 - 0.3 - 0.3**2 / 2 - 0.5)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from math import comb, factorial
+from math import comb
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -51,12 +51,16 @@ if TYPE_CHECKING:
 
     from sparserob_core.checker.sets.parameters import Corners
 
-LEFT = ((1e-19, 160), (1e-16, 160), (1e-13, 160), (1e-11, 160))
+LEFT = ((1e-16, 160), (1e-13, 160), (1e-11, 160))
 """Of the state, what is to be beyond the degree, and with how many coefficients times states at most: the first that is
-reached. Norms of transitions multiply it: with 1e-13 what rides a wall to 1e-9 was left open. Twice as many numbers
-take four times as long."""
-MOST_DEGREE = 24  # of the expansion
+reached. Norms of transitions multiply it by 1e3 and more, and walls are ridden to 1e-9. Twice as many numbers take four
+times as long."""
+MOST_DEGREE = 60  # of the expansion, which is that of a few states and one parameter
+FURTHER = 40  # degrees beyond one, whose sum is about what is beyond: of norms of a few the rest is far less
 LOOKS = 17  # times at which the numbers of the system are looked at, by which nothing is proven
+RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""What a degree more counts in the norms that transitions are off by: with the first alone each coefficient of a high
+degree is off by what the constant one is, and what is beyond never falls below rounding times the growth."""
 EXPONENTIAL = 40  # terms of the exponential of norms on an interval, which are a few: 4^40 / 40! is 1e-24
 REST = 1e-20  # of the norms, more than what is beyond these terms
 
@@ -122,10 +126,10 @@ class SpreadFlow:
         return Parts(self.system, tuple(self.system.parameters.interior_point().tolist()))
 
     @cached_property
-    def _looks(self) -> tuple[Array, int, float, Array]:
-        """About how large the entries of ``A`` are in the middle of the box, ``(d, d)``; the largest degree of an
-        entry; the integral of the norms of what the parameters add to ``A``; and how large inputs are, ``(m +
-        mw,)``."""
+    def _looks(self) -> tuple[Array, int, Array, Array]:
+        """Units of the states, by the entries of ``A`` in the middle of the box, ``(d,)``; the largest degree of an
+        entry; about the integral of the norms of all coefficients of ``A`` of every degree from 1 on; and how large
+        inputs are, ``(m + mw,)``."""
         d = self.system.states
         every, drives, degree = np.zeros((d, d)), np.zeros(1), 0
         tables = []
@@ -138,13 +142,11 @@ class SpreadFlow:
                 degree = max(degree, *(len(key) for key in sizes))
                 tables.append(((until - begin) / LOOKS, sizes))
         u = np.array(balanced(every, self.system.horizon, np.ones(d) / self.system.horizon))
-        pace = sum(
-            width * float((table[:, :d] * u / u[:, None]).sum(axis=1).max())
-            for width, sizes in tables
-            for key, table in sizes.items()
-            if key
-        )
-        return u, degree, pace, drives
+        paces = np.zeros(1 + degree)
+        for width, sizes in tables:
+            for key, table in sizes.items():
+                paces[len(key)] += width * float((table[:, :d] * u / u[:, None]).sum(axis=1).max())
+        return u, degree, paces[1:], drives
 
     @property
     def units(self) -> Array:
@@ -154,13 +156,23 @@ class SpreadFlow:
     @cached_property
     def monomials(self) -> Monomials:
         """Those of the shares; raises `Unchecked` where too many were needed."""
-        nu, (_, powers, pace, _) = len(self.parts.middle), self._looks
+        nu, (_, powers, paces, _) = len(self.parts.middle), self._looks
+        beyond = self._beyond_degrees(paces)
         for left, most in LEFT:
             for degree in range(powers, MOST_DEGREE + 1):
-                small = pace ** (degree + 1) / factorial(degree + 1) <= left
-                if small and self.system.states * comb(nu + degree, nu) <= most:
+                if beyond[degree] <= left and self.system.states * comb(nu + degree, nu) <= most:
                     return Monomials(nu, degree)
         raise Unchecked("the parameters beside the time move the state further than an expansion reaches")
+
+    @staticmethod
+    def _beyond_degrees(paces: Array) -> Array:
+        """About what is beyond every degree: the coefficients of ``exp(sum_b paces[b - 1] z^b)`` after it, summed."""
+        every = np.zeros(MOST_DEGREE + FURTHER + 1)
+        every[0] = 1.0
+        for n in range(1, every.size):
+            of = np.arange(1, min(n, paces.size) + 1)
+            every[n] = (of * paces[: of.size] * every[n - of]).sum() / n
+        return np.append(every[::-1].cumsum()[::-1][1:], 0.0)
 
     def _coefficients(self, law: LinearSystem, time: object) -> dict[tuple[int, ...], np.ndarray]:
         """``[A B E]`` at a time, by the numbers of the shares."""
@@ -394,31 +406,31 @@ class SpreadFlow:
     def _carried(self) -> Array:
         """The largest norms by degree of the transitions from the beginning of any segment to that of any later one,
         ``(D + 1,)``; of the computed products, and of what these are off by: with ``P`` the largest of their summed
-        norms and ``e`` the sum of what all steps are off by, ``P^2 e / (1 - P e)``."""
+        norms and ``e`` the sum of what all steps are off by, ``P^2 e / (1 - P e)``; in each of several norms, in which
+        a degree ``j`` counts ``ratio^j``, so that it is off by that over this."""
         d, u, M, first = self.system.states, self.units, self.monomials.size, np.array(self.monomials.products)
         steps = [self.over(*ends)[0] for ends in pairwise(self.marks)]
         tables = Enclosed.all([part for one in steps for part in one.parts], (len(steps), M, d, d))
         mid, rad = (one * u / u[:, None] for one in (tables.mid, tables.rad))
-        every = np.zeros((0, M, d, d))
-        unit = np.zeros((1, M, d, d))
+        every, unit = np.zeros((0, M, d, d)), np.zeros((1, M, d, d))
         unit[0, 0] = np.eye(d)
-        found, largest = self._degrees(_row_sums(unit))[0], 1.0
+        counted = np.array(RATIOS)[:, None] ** np.arange(self.monomials.degree + 1)  # powers of two
+        found = self._degrees(_row_sums(unit))[0]
+        largest = np.ones(len(RATIOS))
         for step in mid:
             every, moved = np.concatenate([every, unit]), np.zeros((len(every) + 1, M, d, d))
             for i, j, k in first.tolist():
                 moved[:, k] += step[i] @ every[:, j]
             every = moved
-            norms = _row_sums(every)
-            found, largest = (
-                np.maximum(found, self._degrees(norms).max(axis=0)),
-                max(largest, float(norms.sum(axis=1).max())),
-            )
-        sizes = _row_sums(mid).sum(axis=1)
-        off = float((_row_sums(rad).sum(axis=1) + rounding(d * M) * sizes).sum()) * OUTWARD
-        share = largest * off * OUTWARD
-        if not share < 0.5:
+            norms = self._degrees(_row_sums(every))
+            found, largest = np.maximum(found, norms.max(axis=0)), np.maximum(largest, (norms @ counted.T).max(axis=0))
+        missed = self._degrees(_row_sums(rad) + rounding(d * M) * _row_sums(mid)).sum(axis=0)
+        share = largest * (counted @ missed) * OUTWARD**2
+        near = share < 0.5
+        if not near.any():
             raise Unchecked("the transitions are not known closely enough")
-        return np.asarray((found + largest * share / (1.0 - share)) * OUTWARD)
+        off = ((largest * share)[near] / (1.0 - share[near]))[:, None] / counted[near]
+        return np.asarray((found + off.min(axis=0)) * OUTWARD**2)
 
     def lost(self, begun: Array, inputs: Array) -> Array:
         """What is beyond the degree of any state, ``(d,)``, that begins at no more than ``begun (d,)`` and is driven by

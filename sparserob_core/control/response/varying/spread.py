@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import comb, factorial
+from math import comb
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -12,12 +12,14 @@ from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.varying.expansion import balanced
 from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
 
 LEFT = ((1e-14, 64), (1e-12, 100), (1e-10, 140))
 """Of the state, what is beyond the degree is about, and with how many coefficients times states at most: the first that
 is reached. A proof needs 1e-8, and norms are counted many times on the way; of twice as many numbers a run takes some
 five times as long."""
-MOST_ORDERS = 20  # the degree, at most: the coefficients are then as many for one parameter alone
+MOST_ORDERS = 60  # the degree, at most, of one state and one parameter: nearly as many numbers as `LEFT` allows first
+FURTHER = 40  # degrees beyond, of which what is left out is added up: of norms of a few the rest is far below `LEFT`
 LOOKS = 17  # times at which the coefficients of A are looked at; of an estimate, with which nothing is proven
 _KNOWN: WeakKeyDictionary[VaryingSystem, tuple[Spread, VaryingSystem]] = WeakKeyDictionary()
 
@@ -32,27 +34,35 @@ def expanded(system: VaryingSystem) -> tuple[Spread, VaryingSystem]:
 
 
 def _spread(system: VaryingSystem) -> Spread:
-    """About ``(int sum_b |A_b| dt)^n / n!`` is the coefficient of degree ``n``."""
+    """What is beyond a degree is about that of ``exp(sum_b z^b int |A_b| dt)``, with ``|A_b|`` the norms of all
+    coefficients of a degree."""
     (centre, units), powers = system.deviations, system.powers
     assert powers is not None
     A = np.max([np.abs(np.asarray(one.A, dtype=float)) for one in system.at(centre).modes], axis=0)
-    scale, pace = balanced(A, system.horizon), 0.0
+    scale, paces = balanced(A, system.horizon), np.zeros(1 + powers)
     for begin, until, law in system.laws:
-        sizes = []
         for time in np.linspace(begin, until, LOOKS).tolist():
             parts = Split.of(law.entry("A"), time, centre, units).parts
-            every = [np.abs(table.astype(float)) for key, table in parts.items() if any(key)]
-            sizes.append(sum(float((one * scale / scale[:, None]).sum(axis=1).max()) for one in every))
-        pace += float(np.mean(sizes)) * (until - begin)
-    nu, d = centre.size, system.states
+            for key, table in parts.items():
+                size = float((np.abs(table.astype(float)) * scale / scale[:, None]).sum(axis=1).max())
+                paces[sum(key)] += size * (until - begin) / LOOKS
+    nu, d, beyond = centre.size, system.states, tails(paces[1:], MOST_ORDERS, FURTHER)
     for left, most in LEFT:
         for degree in range(powers, MOST_ORDERS + 1):
-            small = pace ** (degree + 1) / factorial(degree + 1) <= left
-            if small and d * comb(nu + degree, nu) <= most:
+            if beyond[degree] <= left and d * comb(nu + degree, nu) <= most:
                 return Spread(d, TaylorSpace(nu, degree), centre, units, powers)
     raise InputError(
         path="system.parameters",
         expected="a box, beside the time t and in A, over which the state has an expansion of at most"
         f" {LEFT[-1][1]} numbers: fewer parameters, smaller intervals, or a shorter horizon",
-        got=f"parameters that move the state by up to e^{pace:.2g}",
+        got=f"parameters that move the state by up to e^{paces[1:].sum():.2g}",
     )
+
+
+def tails(paces: Array, degree: int, further: int) -> Array:
+    """The sums ``(degree + 1,)`` of the coefficients of ``exp(sum_b paces[b - 1] z^b)`` beyond 0, 1, ..., ``degree``,
+    as far as ``further`` ones."""
+    found, count = [1.0], paces.size
+    for n in range(1, degree + further + 1):
+        found.append(sum((b * float(paces[b - 1]) * found[n - b] for b in range(1, min(n, count) + 1)), 0.0) / n)
+    return np.cumsum(found[::-1])[::-1][1 : degree + 2]

@@ -3,11 +3,14 @@ is beyond its degree is bounded by what is said."""
 
 from __future__ import annotations
 
+from math import factorial
+
 import numpy as np
 import pytest
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.jets import Monomials
+from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates, SpreadTube
@@ -39,6 +42,34 @@ def test_a_known_parameter_has_the_flow_of_its_own_system() -> None:
     found = SpreadFlow(SYSTEM, 3.0).at([0.4]).over(0.5, 2.0)[0][0, 0]
     exact = (-(flint.arb(1.5) / 2) - flint.arb(0.4) * (flint.arb(1).cos() - flint.arb(4).cos()) / 2).exp()
     assert abs(found - exact) < 1e-12
+
+
+@pytest.mark.slow
+def test_what_transitions_are_off_by_is_counted_degree_by_degree() -> None:
+    law, degree, share = flow(20), 20, 1e-3
+    exact, points = law.over, np.array(law.marks)
+
+    def less(start: float, stop: float) -> tuple[Series, Series, Series]:
+        found, *others = exact(start, stop)
+        parts = [part * (1 - share) + stacked([[flint.arb(0, 2 * share * abs(float(part[0, 0].mid())))]])
+                 for part in found.parts]  # fmt: skip
+        return Series(found.monomials, parts), *others
+
+    middle, unit = law.parts.middle[0], law.parts.scales[0]
+    rates = (np.cos(2 * points[:, None]) - np.cos(2 * points)) / 2  # of what transitions are the exponential of
+    first = np.exp((points - points[:, None]) / 2 + middle * rates)
+    sizes = [np.tril(first * np.abs(unit * rates) ** j / factorial(j)).max() for j in range(degree + 1)]
+    assert (law._carried >= np.array(sizes) * (1 - 1e-14)).all()
+    assert (law._carried <= np.array(sizes) * 1.02).all()  # to a coefficient of 1e-26
+    law = flow(20)
+    law.__dict__["over"] = less
+    assert (law._carried >= np.array(sizes) * (1 - 1e-14)).all()
+
+
+def test_what_is_about_beyond_a_degree_is_the_rest_of_an_exponential() -> None:
+    found = SpreadFlow._beyond_degrees(np.array([0.3, 0.5]))
+    assert found[0] == pytest.approx(np.exp(0.8) - 1)
+    assert found[2] == pytest.approx(np.exp(0.8) - 1 - 0.3 - 0.3**2 / 2 - 0.5)
 
 
 @pytest.mark.slow
