@@ -197,10 +197,10 @@ def test_a_control_that_is_refuted_shows_by_how_much(tmp_path: Path) -> None:
         (
             {
                 "system": {"A": A.tolist(), "B": B.tolist(), "delay": 0.1},
-                "disturbance": {"norm": {"p": 1, "radius": 0.01}},
+                "disturbance": {"norm": {"p": 2, "radius": 0.01}},
                 "disturbance_class": "measurable",
             },
-            "measurable disturbances in another set than a box",
+            "measurable disturbances in a curved set",
         ),
         ({"terminal": [{"norm": {"p": 2, "radius": 0.3}}]}, "curved sets of states"),
     ],

@@ -49,7 +49,19 @@ CASES: dict[str, dict[str, Any]] = {
         "disturbance": {"box": [0.02, 0.03]},
         "disturbance_class": "measurable",
     },
+    "measurable in a triangle and pieces": {
+        "system": TURNS,
+        "disturbance": {"polytope": {"H": [[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], "h": [0.03, 0.02, 0.04]}},
+        "disturbance_class": "measurable",
+    },
+    "measurable in a triangle and delay": {
+        "system": LATE,
+        "initial_control": [0.4, -0.6],
+        "disturbance": {"polytope": {"H": [[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], "h": [0.03, 0.02, 0.04]}},
+        "disturbance_class": "measurable",
+    },
 }
+TRIANGLE = np.array([[0.03, 0.02], [0.03, -0.07], [-0.06, 0.02]])  # its corners
 STATES, CONTROLS, TIME = np.array([7.0, 0.003]), np.array([40.0, 0.9]), 1100.0  # one of the other units
 
 
@@ -98,8 +110,13 @@ class Walk:
         self.piece = (np.arange(steps) - late) // FINE  # negative ones: what was commanded before
         self.before = np.array(problem.get("initial_control", [0.0, 0.0]))
         self.start = np.array(problem["initial_state"])
-        sizes = problem.get("disturbance", {"box": [0.0, 0.0]})["box"]
-        self.shares, self.far = np.array(problem["execution"]), np.array(sizes)
+        sizes = np.array(problem.get("disturbance", {"box": [0.0, 0.0]}).get("box", [0.0, 0.0]))
+        self.shares, self.corners = (
+            np.array(problem["execution"]),
+            np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * sizes,
+        )
+        if "polytope" in problem.get("disturbance", {}):
+            self.corners = TRIANGLE
 
     def row(self, c: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Of ``c'x`` after ``n`` steps: what commands give, what sizes of commands add, and the rest."""
@@ -115,7 +132,8 @@ class Walk:
             off[:, k] = self.shares * np.abs(each[self.piece[:n] == k]).sum(axis=0)
         rest = float(lines[n] @ self.start + each[early].sum(axis=0) @ self.before)
         rest += float(self.shares * np.abs(self.before) @ np.abs(each[early]).sum(axis=0))
-        return on, off, rest + float(np.abs(np.einsum("nd,ndm->nm", rows, self.moved[:n])).sum(axis=0) @ self.far)
+        pushed = np.einsum("nd,ndm->nm", rows, self.moved[:n]) @ self.corners.T
+        return on, off, rest + float(pushed.max(axis=1, initial=-np.inf).sum())
 
 
 def rows_of(problem: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -307,10 +307,10 @@ class OptimalControlProblem(Term):
                 self.terminal_equalities
             ),
             "parameters, but for those in a box that the state depends on affinely": not self._is_affine(),
-            "measurable disturbances in another set than a box where the system has pieces or a delay": self.measurable
-            is not None
-            and not self.measurable.is_box
-            and (bool(self.system.switches) or self.system.delay > 0.0),
+            "measurable disturbances in a curved set where the system has pieces, a delay or parameters": any(
+                one.halfspaces() is None for one in filter(None, [self.measurable])
+            )
+            and (bool(self.system.switches) or self.system.delay > 0.0 or self.system.parameter_count > 0),
             "curved sets of states": any(one.halfspaces() is None for one in sets),
         }
         for beside, given in refused.items():
