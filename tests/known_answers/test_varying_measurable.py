@@ -190,6 +190,15 @@ def test_a_diamond_is_a_box_that_is_turned(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_segment_is_a_box_of_one_channel_and_takes_as_long(tmp_path: Path) -> None:
+    turned: Problem = {**CART["system"], "E": [["0.1*t"], ["cos(3*t) - 0.5"]]}
+    segment = {"polytope": {"H": [[1, 1], [-1, -1], [1, -1], [-1, 1]], "h": [0.0, 0.0, 0.1, 0.1]}}
+    every = [{**CART, "disturbance": segment}, {**CART, "disturbance": {"box": 0.05}, "system": turned}]
+    costs = [verified(tmp_path / str(k), one, pieces(PIECES))["cost"] for k, one in enumerate(every)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-8)
+
+
+@pytest.mark.slow
 def test_the_worst_signal_in_a_triangle_attains_what_is_claimed(leaning: Path) -> None:
     functionals, none = assemble(load_config(leaning / "config.yaml")).transcription.functionals, np.zeros(0)
     support = functionals.measurable

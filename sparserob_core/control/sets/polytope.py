@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
+from itertools import combinations
+from math import comb
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +20,9 @@ from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_exc
 
 _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
+_MEETINGS = 20_000  # of rows, in which corners of a set without interior are looked for: a second or two
+_REGULAR = 1e-12  # a determinant of rows of length 1 from which on where they meet is known to a thousandth
+_BESIDE = 1e-9  # of a row's numbers, by which a meeting must miss it to be no corner without a look at fractions
 _SWEEPS = 12
 _ORDINARY = 10  # binary orders of magnitude between which rows and columns are left as they are
 _TOGETHER = 64  # linear programs that are solved as one
@@ -139,8 +146,7 @@ class Polytope(ConvexSet):
 
     @cached_property
     def vertices(self) -> Array | None:
-        """All vertices ``(v, d)`` of a bounded polytope with an interior, or ``None`` when they are too many or do not
-        exist."""
+        """All vertices ``(v, d)`` of a bounded polytope, or ``None`` when they are too many."""
         rows, d = self.H.shape
         if d > _VERTEX_DIMENSIONS or rows > _VERTEX_ROWS or not self.is_bounded:
             return None
@@ -150,7 +156,7 @@ class Polytope(ConvexSet):
         (centre, radius), (H, h, units) = self.chebyshev, self._balanced
         centre = centre / units
         if radius <= 1e-9 * (1.0 + float(np.abs(centre).max())):
-            return None
+            return self._corners()
         from scipy.spatial import HalfspaceIntersection, QhullError
 
         try:
@@ -158,6 +164,28 @@ class Polytope(ConvexSet):
         except QhullError:
             return None
         return self._polished(found.intersections, found.dual_facets) * units
+
+    def _corners(self) -> Array | None:
+        """The vertices of a set without interior: every point where ``d`` rows meet and that no row excludes, in
+        fractions. ``None`` where there are too many meetings, or where the set is empty but for rounding."""
+        (rows, d), norms = self.H.shape, np.linalg.norm(self.H, axis=1)
+        if comb(rows, d) > _MEETINGS:
+            return None
+        chosen = np.array(list(combinations(range(rows), d)))
+        several, ends = (self.H / norms[:, None])[chosen], (self.h / norms)[chosen]
+        regular = np.abs(np.linalg.det(several)) > _REGULAR
+        points = np.linalg.solve(several[regular], ends[regular][..., None])[..., 0]
+        missed = points @ self.H.T - self.h > _BESIDE * (np.abs(points) @ np.abs(self.H).T + np.abs(self.h))
+        possible = np.concatenate([chosen[regular][~missed.any(axis=1)], chosen[~regular]])
+        H, h = ([[Fraction(float(x)) for x in row] for row in one] for one in (self.H, self.h[:, None]))
+        met = {_meeting([H[i] for i in which], [h[i][0] for i in which]) for which in possible}
+        corners = [
+            x
+            for x in met
+            if x is not None
+            and all(sum(a * b for a, b in zip(row, x, strict=True)) <= end[0] for row, end in zip(H, h, strict=True))
+        ]
+        return np.array([[float(a) for a in x] for x in sorted(corners)]) if corners else None
 
     @shaped
     def _polished(self, points: Float[Array, "v d"], facets: list[list[int]]) -> Float[Array, "u d"]:
@@ -300,3 +328,19 @@ class Polytope(ConvexSet):
             y = np.maximum(-np.asarray(answer.ineqlin.marginals), 0.0)
             highest, left = max(highest, float(y @ h)), max(left, float(np.abs(axis - y @ H).sum()))
         return 2.0 * abs(highest) / (1.0 - left) if left < 0.5 else np.inf
+
+
+def _meeting(rows: Sequence[Sequence[Fraction]], ends: Sequence[Fraction]) -> tuple[Fraction, ...] | None:
+    """Where as many hyperplanes as there are coordinates meet, ``None`` where that is no single point (Gauss and
+    Jordan)."""
+    left = [[*row, end] for row, end in zip(rows, ends, strict=True)]
+    for i in range(len(left)):
+        pivot = next((k for k in range(i, len(left)) if left[k][i]), None)
+        if pivot is None:
+            return None
+        left[i], left[pivot] = left[pivot], left[i]
+        left[i] = [x / left[i][i] for x in left[i]]
+        for k, row in enumerate(left):
+            if k != i and row[i]:
+                left[k] = [a - row[i] * b for a, b in zip(row, left[i], strict=True)]
+    return tuple(row[-1] for row in left)

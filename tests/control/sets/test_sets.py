@@ -206,8 +206,31 @@ def test_a_polytope_that_contains_a_line_is_bounded_across_it_only_and_almost_a_
 
 def test_a_polytope_without_interior_still_has_its_support_function() -> None:
     segment = Polytope(np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, 0.0], [-1.0, 0.0]]), np.array([1.0, -1.0, 1.0, 0.0]))
-    assert segment.vertices is None
+    assert segment.vertices is not None and segment.vertices.tolist() == [[0.0, 1.0], [1.0, 0.0]]
     np.testing.assert_allclose(segment.support(np.array([[0.0, 1.0], [1.0, 0.0]])), [1.0, 1.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_polytope_that_is_flat_in_some_direction_has_the_corners_of_its_shadow(d: int) -> None:
+    rng = np.random.default_rng(d)
+    normal = rng.integers(-3, 4, d).astype(float)
+    normal[-1] = 2.0  # the last entry follows from the others, exactly
+    H = np.vstack([normal, -normal, np.eye(d)[:-1], -np.eye(d)[:-1], np.ones(d), -rng.random(d)])
+    thin = Polytope(H, np.concatenate([[0.5, -0.5], np.full(2 * d - 2, 1.0), [0.75, 0.75]]))
+    shadow, ends = H[2:, :-1] - H[2:, -1:] * normal[:-1] / 2.0, thin.h[2:] - H[2:, -1] * 0.25
+    flat = Polytope(shadow, ends)
+    assert thin.vertices is not None and flat.vertices is not None
+    c = rng.normal(size=(50, d))
+    beside = flat.support(c[:, :-1] - c[:, -1:] * normal[:-1] / 2.0) + 0.25 * c[:, -1]
+    np.testing.assert_allclose(thin.support(c), beside, rtol=1e-12, atol=1e-12)
+    apart = np.concatenate([[0.5, -0.5 - 1e-10], thin.h[2:]])
+    assert Polytope(H, apart).vertices is None  # no point, but for what is a tolerance: nothing is known of its corners
+
+
+def test_a_point_where_many_rows_meet_is_its_own_corner() -> None:
+    H = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0], [-3.0, 1.0]])
+    point = Polytope(H, H @ [0.25, -0.5])
+    assert point.vertices is not None and point.vertices.tolist() == [[0.25, -0.5]]
 
 
 def test_the_vertices_of_a_cross_polytope_are_its_unit_vectors() -> None:
