@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.control.studies.initial_states import InitialPlane
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -174,6 +175,25 @@ ADDED: dict[str, Config] = {
 
 
 @pytest.mark.slow
+def test_a_plan_is_solved_anew_as_that_of_a_system_that_does_not_change() -> None:
+    used = []
+    for entry in ("-0.5 + p", "-0.5 + p + 0*t"):
+        config = copy.deepcopy(DECAY)
+        config["problem"]["system"].update(A=[[entry]], parameters={"p": [-0.1, 0.2]})
+        controller = sr.controller(config, resolve=True)
+        state, spent, p = 1.0, 0.0, 0.15  # which the controller is not told
+        for begin, end in pairwise(controller.breakpoints):
+            (u,), length = controller.step(begin, [state]), end - begin
+            a, pushed = -0.5 + p, (1 + p * p) * u + 0.02 * np.sin(7 * begin)
+            state = float(np.exp(a * length) * state + np.expm1(a * length) / a * pushed)
+            spent += abs(float(u)) * length
+            assert begin + length < 1.2 or abs(state) <= 0.45
+        assert abs(state) <= 0.1 and controller.covered and any(one.resolved for one in controller.steps)
+        used.append(spent)
+    assert used[1] == pytest.approx(used[0], rel=1e-5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("added", ADDED)
 def test_entries_that_do_not_change_cost_what_the_system_without_the_time_does(added: str, tmp_path: Path) -> None:
     config = copy.deepcopy(SPRING)
@@ -281,3 +301,56 @@ def test_a_box_over_which_no_expansion_reaches_is_refused() -> None:
     system = {"A": [["-0.5 - p*sin(2*t) + q"]], "B": [[1]], "parameters": {"p": [-30, 60], "q": [-1, 1]}}
     with pytest.raises(sr.InputError, match=r"system\.parameters: .*expansion"):
         assemble(load_config(changed(system=system, disturbance=None)))
+
+
+def farthest() -> float:
+    """How far from 0 the rate of `DECAY` may begin, to end within 0.1 after 2: a linear program at many parameters."""
+    N, fine = 4, 400
+    marks = np.linspace(0.0, 2.0, N * fine + 1)
+    middles, rows, limits = (marks[:-1] + marks[1:]) / 2, [], []
+    for p in np.linspace(-0.3, 0.6, 2001).tolist():
+        a, inside = (-one / 2 - p * (1 - np.cos(2 * one)) / 2 for one in (marks, middles))
+        gains = (np.exp(a[-1] - inside) * 2.0 / (N * fine)).reshape(N, -1).sum(axis=1)
+        for sign in (1.0, -1.0):
+            rows.append([*(sign * (1 + p * p) * gains), sign * np.exp(a[-1])])
+            limits.append(0.1 - 0.02 * gains.sum())
+    found = linprog([0.0] * N + [-1.0], np.array(rows), limits, bounds=[(-1.0, 1.0)] * N + [(None, None)])
+    assert found.success
+    return float(found.x[-1])
+
+
+def of_two() -> Config:
+    """`DECAY` until 2 beside a second state that decays at a known rate."""
+    config = copy.deepcopy(DECAY)
+    config["problem"]["system"].update(A=[[DECAY["problem"]["system"]["A"][0][0], 0], [0, -1]], B=[["1 + p^2"], [0]])
+    config["problem"]["system"]["E"] = [[1], [0]]
+    config["problem"].update(horizon=2.0, initial_state=[0, 0], path=[], terminal=[{"box": [0.1, 0.3]}])
+    config["dictionaries"]["control"]["pieces"] = 4
+    return config
+
+
+@pytest.mark.slow
+def test_the_states_that_are_feasible_at_every_rate_are_as_many_as_a_closed_form_says() -> None:
+    found = sr.initial_states(of_two(), directions=4, values=0, within=5)
+    ends = [farthest(), 0.3 * np.exp(2.0)]
+    np.testing.assert_allclose(np.abs(found.outer).max(axis=0), ends, rtol=3e-7)
+    np.testing.assert_allclose(np.abs(found.inner).max(axis=0), ends, rtol=3e-6)
+
+
+@pytest.mark.slow
+def test_what_an_expansion_leaves_out_widens_the_rows_from_which_states_are_feasible() -> None:
+    model = assemble(load_config(of_two())).transcription
+    plane = InitialPlane(model, (0, 1), np.array([0.5, -0.2]), np.array([1.0, 2.0]))
+    for z in ([1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [0.3, 0.2]):
+        begun = model.functionals.from_state(plane.point(np.array(z)))
+        assert (plane.beyond * (1 + 1e-12) >= begun.beyond(np.array([1.0]))).all()
+    (family,) = plane._families
+    index = np.array([[0.4]])
+    with_it = family.rows(index)[1]
+    vars(plane)["beyond"] = 0.0 * plane.beyond
+    constraint = model.constraint(model.program.families[0])
+    directions = constraint.functionals_at(index)[1]
+    wider = with_it.ravel() - family.rows(index)[1].ravel()
+    vars(plane)["beyond"] = np.ones(2)
+    assert (wider <= 1e-9).all()  # the degree is high
+    np.testing.assert_allclose((family.rows(index)[1] - with_it).ravel(), np.abs(directions).sum(axis=1), rtol=1e-6)

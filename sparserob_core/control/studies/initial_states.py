@@ -181,6 +181,15 @@ class InitialPlane:
         """The problem from the centre of the plane."""
         return from_state(self.model, self._state(np.zeros(2)))
 
+    @cached_property
+    def beyond(self) -> Array:
+        """What an expansion in the parameters leaves out of any state, ``(d,)``, wherever in the plane it begins."""
+        far = np.abs(self._state(np.zeros(2)))
+        far[list(self.states)] += np.abs(self.radius)
+        control = self.model.problem.control
+        reach = control.reach(np.eye(control.dimension))
+        return self.centred.functionals.from_state(far).beyond(reach)
+
     def _state(self, z: Array) -> Array:
         state = np.array(self.model.problem.initial_state, dtype=float)
         state[list(self.states)] = self.point(z)
@@ -252,8 +261,8 @@ class _Joined(_OfPlane):
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """The rows at the centre, and two columns more: ``c'e^{A(p)t}`` at the two coordinates. Of a system that
-        changes with time they are met by all that meets the true ones: by what steps may be off, wherever in the plane
-        it begins, and by what rounding is."""
+        changes with time they are met by all that meets the true ones: by what steps may be off, and an expansion in
+        the parameters leaves out, wherever in the plane it begins, and by what rounding is."""
         G, h = self.base.rows(indices)
         constraint = self.plane.centred.constraint(self.base)
         if constraint is None:
@@ -264,7 +273,8 @@ class _Joined(_OfPlane):
         expansion = constraint.functionals.response.propagator.expansion
         if expansion is not None:
             sizes = added_up(self.plane.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
-            h = h + (SHARE + expansion.slack) * sizes.reshape(h.shape)
+            sizes = (SHARE + expansion.slack) * sizes + np.abs(directions) @ self.plane.beyond
+            h = h + sizes.reshape(h.shape)
         return np.concatenate([G, columns.reshape(*G.shape[:2], 2)], axis=2), h
 
 

@@ -78,11 +78,6 @@ def initial_states(
         refused = {
             "policy.name": ("open_loop", model.feedback is not None, "a policy that answers"),
             "problem.terminal": ("a set with an interior", bool(model.problem.terminal_equalities), "fixed values"),
-            "problem.system.parameters": (
-                "such that the state depends on affinely",
-                system.powers is not None,
-                "others",
-            ),
         }
         for path, (expected, given, got) in refused.items():
             if given:
