@@ -25,9 +25,9 @@ EQUAL = 1e-9  # durations that differ by less than this share of them, or by `NO
 NOTHING = 1e-12
 MOST = 10_000_000  # numbers in the matrices of one kind, beyond which durations that differ by `NEAR` share one too
 NEAR = 1e-2
-# Multiplications that exponentials of cells may take, beyond which cells whose widths differ by `WIDE` share one: with
-# ten times as many, a look at a plant of 350 states, at cells of hundreds of widths, takes half a minute; with a tenth,
-# bounds of plants of 50 states are rougher than they need be.
+# Multiplications that exponentials of cells, and of slack, may take, beyond which those whose widths differ by `WIDE`
+# share one: with ten times as many, a look at a plant of 350 states, at cells of hundreds of widths, takes half a
+# minute; with a tenth, bounds of plants of 50 states are rougher than they need be.
 WORK, WIDE = 5e7, 0.2
 BITS = 30  # to which the ends of durations that differ are rounded outwards
 AT_ONCE = 4_000_000  # numbers of the exponentials that are made at a time
@@ -156,7 +156,7 @@ class ComparisonSystem:
         if widths.size * self.sizes.size <= SMALL:  # each for itself: it takes longer to see which are alike
             shortest, longest, which = widths, widths, np.arange(widths.size)
         else:
-            shortest, longest, which = alike(widths, self.sizes.size, cells)
+            shortest, longest, which = alike(widths, self.sizes.size, rough=cells)
         key = shortest.tobytes() + longest.tobytes()
         if key not in self._known:
             most = MOST // max(1, shortest.size * self.sizes.size)
@@ -177,7 +177,7 @@ class ComparisonSystem:
         """
         q = slack.shape[0]
         both = np.block([[self.metzler, slack], [np.zeros((q, q)), self.metzler + slack]])
-        shortest, longest, which = alike(widths, both.size)
+        shortest, longest, which = alike(widths, both.size, rough=True)  # however rough, they are as small as the slack
         with np.errstate(over="ignore", invalid="ignore"):
             flow, integral = (part[:, :q, q:] for part in flows_between(both, shortest, longest))
         return NormBounds(flow, which), NormBounds(integral, which)
@@ -198,16 +198,16 @@ class ComparisonSystem:
 
 @shaped
 def alike(
-    durations: Float[Array, " k"], numbers: int, cells: bool = False
+    durations: Float[Array, " k"], numbers: int, rough: bool = False
 ) -> tuple[Float[Array, " u"], Float[Array, " u"], Int[np.ndarray, " k"]]:
     """Nearly equal durations together: the shortest and the longest ``(u,)`` of each group, those of a group that
     differ rounded outwards, and which group each is of; ``numbers`` are there to be kept of every group, in a square
-    matrix, and ``cells`` need no closer ones."""
+    matrix; ``rough``: groups may be wide where they would take long."""
     distinct, which = np.unique(durations, return_inverse=True)
     nothing, share = NOTHING * distinct.max(initial=0.0), EQUAL
     group = np.cumsum(np.diff(distinct, prepend=distinct[:1]) > share * distinct + nothing)
     count = int(group[-1]) + 1 if group.size else 0
-    ratio = WIDE if cells and count * numbers**1.5 > WORK else NEAR if count * numbers > MOST else 0.0
+    ratio = WIDE if rough and count * numbers**1.5 > WORK else NEAR if count * numbers > MOST else 0.0
     if ratio:  # in steps of a ratio, where there are very many
         steps = np.floor(np.log(np.maximum(distinct, nothing) / nothing) / np.log1p(ratio))
         group = np.unique(steps, return_inverse=True)[1]

@@ -126,15 +126,24 @@ class Leaps:
         return found[0], found[1]
 
     def _rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
-        durations = np.maximum(durations, 0.0)  # differences of times may be less by rounding
-        whole = np.floor(durations / self.step).astype(int)
-        rest = (durations - whole * self.step)[:, None]
+        whole, rest = self._parted(durations)
         flown, driven = np.array(rows, dtype=float), np.zeros(rows.shape)
         for place, (flow, integral) in enumerate(self._over(int(whole.max(initial=0)).bit_length())):
             far = np.flatnonzero(whole >> place & 1)
             if far.size:
                 driven[far] += flown[far] @ integral
                 flown[far] = flown[far] @ flow
+        return self._through(flown, driven, rest)
+
+    def _parted(self, durations: Array) -> tuple[np.ndarray, Array]:
+        """How many short times durations ``(k,)`` have, and what is left of them."""
+        durations = np.maximum(durations, 0.0)  # differences of times may be less by rounding
+        whole = np.floor(durations / self.step).astype(int)
+        return whole, durations - whole * self.step
+
+    def _through(self, flown: Array, driven: Array, rest: Array) -> tuple[Array, Array]:
+        """What ``rest (k,)`` of the durations makes of both of rows, ``(k, d)`` each."""
+        rest = rest[:, None]
         if self.A.shape[0] <= FEW_STATES:
             both = ((rest / self.step) ** np.arange(TERMS) @ self._table).reshape(-1, 2, *self.A.shape)
             moved = (flown[:, None, None] @ both)[:, :, 0]
@@ -149,11 +158,37 @@ class Leaps:
         return flown, driven
 
     @shaped
+    def orbits(
+        self, rows: Float[Array, "r d"], durations: Float[Array, " k"]
+    ) -> tuple[Float[Array, "k r d"], Float[Array, "k r d"]]:
+        """`rows` where each goes over every duration: what durations begin with, in short times, is gone over once."""
+        whole, rest = self._parted(durations)
+        wholes, which = np.unique(whole, return_inverse=True)
+        flown = np.array(rows[None] * self._scale, dtype=float)
+        driven, numbers = np.zeros(flown.shape), np.zeros(1, dtype=int)
+        doubled = self._over(int(wholes.max(initial=0)).bit_length())
+        for place in range(len(doubled) - 1, -1, -1):
+            begun, numbers = numbers, np.unique(wholes >> place)
+            before, odd = np.searchsorted(begun, numbers >> 1), np.flatnonzero(numbers & 1)
+            flown, driven = flown[before], driven[before]
+            through, shape = flown[odd].reshape(-1, rows.shape[1]), (odd.size, *rows.shape)
+            driven[odd] += (through @ doubled[place][1]).reshape(shape)
+            flown[odd] = (through @ doubled[place][0]).reshape(shape)
+        found = np.empty((2, durations.size, *rows.shape))
+        count = max(1, NEAR // rows.size)
+        for start in range(0, durations.size, count):
+            part = slice(start, start + count)
+            begun, shape = which.reshape(-1)[part], (-1, rows.shape[1])
+            late = np.repeat(rest[part], len(rows))
+            both = self._through(flown[begun].reshape(shape), driven[begun].reshape(shape), late)
+            found[:, part] = np.stack(both).reshape(2, begun.size, *rows.shape)
+        found /= self._scale
+        return found[0], found[1]
+
+    @shaped
     def transitions(self, durations: Float[Array, " k"]) -> tuple[Float[Array, "k d d"], Float[Array, "k d d"]]:
         """`Exponentials.transitions`, of the rows of the identity: few of them at once are in the making."""
-        d = self.A.shape[0]
-        found = self.rows(np.tile(np.eye(d), (durations.size, 1)), np.repeat(durations, d))
-        return found[0].reshape(-1, d, d), found[1].reshape(-1, d, d)
+        return self.orbits(np.eye(self.A.shape[0]), durations)
 
 
 def _norm(A: Array) -> float:

@@ -299,7 +299,7 @@ class WorstCase:
         model, (k, r) = self.disturbance, (times.size, directions.shape[0])
         changes = self.response.grid.mode is not None
         by_block, measurable = None if model is None else model.on_blocks, self.measurable
-        aged = model is None or (self.response.uniform and (by_block is None or by_block.by_piece))
+        aged = by_block is None or (self.response.uniform and by_block.by_piece)
         if (changes or not aged) and r > directions.shape[1] and measurable is None:
             return self._profile_by_axes(times, directions, parameter)
         if changes or not aged:

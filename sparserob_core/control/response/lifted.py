@@ -585,17 +585,18 @@ class LiftedSystem:
 
     def _slips(self, rows: bool) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
         """`ComparisonSystem.slips` at the end of every span, and the largest on it; remembered."""
-        if rows not in self._slipping:
-            comparison, slack, lengths = self.comparison, self.slack_A.T if rows else self.slack_A, self._durations
-            here = ComparisonSystem(comparison.metzler.T, comparison.sizes.T) if rows else comparison
-            # where nothing decays, slips grow with the time, so that the last is the largest
-            grown = ComparisonSystem(here.rising, here.sizes)
-            self._slipping[rows] = here.slips(slack, lengths), grown.slips(slack, lengths)
-        return self._slipping[rows]
+        if not rows:
+            return self._slipping
+        # e^{(A + S) r} - e^{A r} is what it is from either side
+        here, grown = (tuple(part.transposed for part in both) for both in self._slipping)
+        return (here[0], here[1]), (grown[0], grown[1])
 
     @cached_property
-    def _slipping(self) -> dict[bool, tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]]:
-        return {}
+    def _slipping(self) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
+        # where nothing decays, slips grow with the time, so that the last is the largest
+        grown = ComparisonSystem(self.comparison.rising, self.comparison.sizes)
+        slack, lengths = self.slack_A, self._durations
+        return self.comparison.slips(slack, lengths), grown.slips(slack, lengths)
 
     def _relative(self, lengths: Array) -> Array:
         """What transitions over such ``lengths (S,)`` and a product with them may be off by, relative to the sizes."""

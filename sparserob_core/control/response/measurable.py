@@ -333,8 +333,7 @@ class MeasurableSupport:
         A, units, speed, E = known.A, known.units, known.speed, E / known.units[:, None]
         lengths, far, count = np.tile(np.diff(starts), len(directions)), self.bound.radius_bound, len(directions)
         once, sized = known.products
-        every = np.repeat(directions * units, starts.size - 1, axis=0)
-        row = known.leaps.rows(every, np.tile(starts[:-1], count))[0]
+        row = known.leaps.orbits(directions * units, starts[:-1])[0].swapaxes(0, 1).reshape(-1, A.shape[0])
         terms, sizes, size = [row @ E], np.abs(row) @ np.abs(E), np.abs(row)
         for order in range(1, ORDER + 1):
             step = (lengths / order)[:, None]

@@ -31,6 +31,10 @@ from sparserob_core.sip.convex_set import Array
 FEWEST = 64
 LITTLE = 0.5  # norm of A times the duration of a block, at most
 BLOCK = 32  # pieces of a block in which outputs are computed: what grows with it is as large as what does not
+# Numbers in transitions over several pieces, beyond as many as those of single ones have (16 MB). Of pieces that all
+# differ there are no more; of few kinds that follow each other in any order there would be one for every piece. With a
+# tenth of it rows of such a plant of many pieces go from piece to piece, ten times as many are 160 MB.
+STRETCHED = 2_000_000
 TINY = float(np.finfo(float).tiny)
 STEP = 4 * EPSILON  # of the horizon: times that differ by less are a whole piece apart, or not at all
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
@@ -297,6 +301,58 @@ class Impulses:
 
 
 @dataclass(frozen=True, eq=False)
+class Stretches:
+    """What inputs on pieces of any lengths give to later states, over stretches of 1, 2, 4, ... pieces, one beside the
+    other from the first piece on: which ``kinds`` they are of, what the ``inputs (q, d, 2^s w)`` on them make of the
+    state at their end, and their ``flows (q, d, d)``.
+
+    A row goes back through one stretch for every bit of the number of its piece, where it went through every piece; and
+    what it meets within a stretch is a product with few columns. For a known system.
+    """
+
+    kinds: list[np.ndarray]
+    inputs: list[Array]
+    flows: list[Array]
+
+    @staticmethod
+    def of(which: np.ndarray, inputs: Array, flows: Array) -> Stretches:
+        """Those of pieces of which ``which (L,)`` says what inputs on them make, ``(q, d, w)``, and their transition,
+        ``(q, d, d)``: as long ones as have, in all, `STRETCHED` numbers more than those of pieces."""
+        every, left = Stretches([which], [inputs], [flows]), flows.size + STRETCHED
+        while which.size > 1:
+            apart, which = np.unique(which[: which.size // 2 * 2].reshape(-1, 2), axis=0, return_inverse=True)
+            which, left = which.reshape(-1), left - len(apart) * flows[0].size
+            if left < 0:
+                break
+            early, late = apart.T
+            inputs = np.concatenate([flows[late] @ inputs[early], inputs[late]], axis=2)
+            flows = np.stack([flows[second] @ flows[first] for first, second in apart.tolist()])
+            every.kinds.append(which)
+            every.inputs.append(inputs)
+            every.flows.append(flows)
+        return every
+
+    def on(self, at: np.ndarray, rows: Array, found: Array) -> None:
+        """Take ``rows (k, d)`` at the beginnings of pieces ``at (k,)``, which fall, back to the beginning; what they
+        meet is ``found (k, L, w)``."""
+        width, longest = found.shape[2], len(self.kinds) - 1
+        for level, (kinds, inputs, flows) in enumerate(zip(self.kinds, self.inputs, self.flows, strict=True)):
+            numbers, size = at >> level, 2**level
+            if level < longest:  # the stretch before, where that is no half of a longer one
+                ends = np.append(np.flatnonzero(np.diff(numbers, prepend=-1)), numbers.size).tolist()
+                turns = [(int(numbers[first]) - 1, slice(first, last)) for first, last in pairwise(ends)]
+                turns = [(number, here) for number, here in turns if number % 2 == 0]
+            else:  # of the longest ones, one before the other
+                last = int(numbers.max(initial=0))
+                begun = np.searchsorted(-numbers, -np.arange(last)).tolist()
+                turns = [(number, slice(0, begun[number])) for number in range(last - 1, -1, -1)]
+            for number, here in turns:
+                kind, rest = kinds[number], rows[here]
+                met = (rest @ inputs[kind]).reshape(len(rest), size, width)
+                found[here, number * size : (number + 1) * size], rows[here] = met, rest @ flows[kind]
+
+
+@dataclass(frozen=True, eq=False)
 class Propagator:
     """What the responses of one system on one time grid share, from whatever initial state: transition matrices, and
     functionals as weights. ``propagate``: the exponentials of a known system whose matrix has a structure.
@@ -310,7 +366,7 @@ class Propagator:
     propagate: Exponentials | None = None
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
     _flows: dict[bytes, Flow] = field(default_factory=dict, repr=False)
-    _exponentials: dict[int, Exponentials] = field(default_factory=dict, repr=False)
+    _exponentials: dict[int, Leaps] = field(default_factory=dict, repr=False)
 
     @cached_property
     def which(self) -> np.ndarray:
@@ -383,8 +439,10 @@ class Propagator:
 
     def exponentials(self, mode: int = 0) -> Exponentials:
         """Those of a mode of a known system."""
-        if self.propagate is not None:
-            return self.propagate
+        return self._own(mode) if self.propagate is None else self.propagate
+
+    def _own(self, mode: int = 0) -> Leaps:
+        """Those of the matrix of a mode as it is."""
         if mode not in self._exponentials:
             self._exponentials[mode] = Leaps(self.system.modes[mode].matrices(np.zeros((1, 0)))[0][0])
         return self._exponentials[mode]
@@ -525,14 +583,24 @@ class Propagator:
         order = np.argsort(-pieces, kind="stable")
         at, within = pieces[order], np.clip(times - self.grid.breakpoints[pieces], 0.0, None)[order]
         rows, last = self._inside(steps, which[order], at, directions[order], within)
-        over = steps.driven if drives else steps.pushed
         if not drives:
             last = (last[:, None] @ steps.inputs[which[order], self.grid.modes[at]])[:, 0]
         found = np.zeros((times.size, self.grid.pieces, last.shape[1]))
         found[np.arange(times.size), at] = last
-        known, width, first = over.shape[0] == 1, last.shape[1], int(at[0]) if at.size else 0
+        if drives or self._depends:
+            self._by_recursion(steps.driven if drives else steps.pushed, which[order], at, rows, found)
+        else:
+            self._stretches.on(at, rows, found)
+        back = np.empty_like(order)
+        back[order] = np.arange(order.size)
+        return rows[back], found[back], steps, which
+
+    def _by_recursion(self, over: Array, mine: np.ndarray, at: np.ndarray, rows: Array, found: Array) -> None:
+        """Take ``rows (k, d)`` at the beginnings of pieces ``at (k,)``, which fall, back to the beginning from piece to
+        piece, by ``over (v, q, d, w + d)`` of which each has its parameters ``mine (k,)``; what they meet is
+        ``found (k, L, w)``."""
+        known, width, first = over.shape[0] == 1, found.shape[2], int(at[0]) if at.size else 0
         begun = np.searchsorted(-at, -np.arange(first)).tolist()  # how many functionals reach back to a piece
-        mine = which[order]
         alike = over[mine, 0][:, None] if self.uniform and not known else None
         for piece in range(first - 1, -1, -1):
             active, length = begun[piece], self.which[piece]
@@ -542,9 +610,12 @@ class Propagator:
                 each = over[mine[:active], length] if alike is None else alike[:active, 0]
                 both = (rows[:active, None] @ each)[:, 0]
             found[:active, piece], rows[:active] = both[:, :width], both[:, width:]
-        back = np.empty_like(order)
-        back[order] = np.arange(order.size)
-        return rows[back], found[back], steps, which
+
+    @cached_property
+    def _stretches(self) -> Stretches:
+        """What inputs through the columns of ``B`` and of ``E`` give, for a known system."""
+        steps = self.steps(np.zeros((1, 0)))
+        return Stretches.of(self.which, steps.Gamma[0] @ steps.inputs[0, self._modes], steps.Phi[0])
 
     def _inside(
         self, steps: Steps, which: np.ndarray, pieces: np.ndarray, rows: Array, within: Array
@@ -616,13 +687,11 @@ class Propagator:
         that are alike together, then over whole ones."""
         (k, r), d = (times.size, directions.shape[0]), directions.shape[1]
         if not self.aged(parameter.size):
-            known = Leaps(self.steps(parameter[None]).A[0, 0]) if self._depends else self.exponentials()
-            moved = known.rows(np.tile(directions, (k, 1)), np.repeat(times, r))
-            return moved[0].reshape(k, r, d)
+            known = Leaps(self.steps(parameter[None]).A[0, 0]) if self._depends else self._own()
+            return known.orbits(directions, times)[0]
         pieces = self.grid.locate(times)
         within, which = self.grid.distinct(np.maximum(times - self.grid.breakpoints[pieces], 0.0))
-        inside = self.exponentials().rows(np.tile(directions, (within.size, 1)), np.repeat(within, r))[0]
-        rows = inside.reshape(-1, r, d)[which].reshape(-1, d)
+        rows = self._own().orbits(directions, within)[0][which].reshape(-1, d)
         return self._leapt(rows, np.repeat(pieces, r)).reshape(k, r, d)
 
     def _leapt(self, rows: Array, pieces: np.ndarray) -> Array:

@@ -201,22 +201,22 @@ class _Way:
 
     def at(self, times: Array, inside: Array) -> Array:
         """``E' Phi(time, s)' direction`` at ``times (k,)``, with the system that acts ``inside (k,)``: ``(k, mw)``."""
-        return self._over(times, inside, lambda leaps, rows, spent, which: leaps.rows(rows, spent)[0])
+        return self._over(times, inside, lambda leaps, rows, which: rows)
 
     def gains(self, starts: Array, ends: Array) -> Array:
         """Its integrals from ``starts (k,)`` to ``ends (k,)``, of which each is within one turn, ``(k, mw)``."""
 
-        def integrated(leaps: Leaps, rows: Array, spent: Array, which: np.ndarray) -> Array:
-            return leaps.rows(leaps.rows(rows, spent)[0], (ends - starts)[which])[1]
+        def integrated(leaps: Leaps, rows: Array, which: np.ndarray) -> Array:
+            return leaps.rows(rows, (ends - starts)[which])[1]
 
         return self._over(ends, (starts + ends) / 2, integrated)
 
-    def _over(self, times: Array, inside: Array, made: Callable[[Leaps, Array, Array, np.ndarray], Array]) -> Array:
+    def _over(self, times: Array, inside: Array, made: Callable[[Leaps, Array, np.ndarray], Array]) -> Array:
         found, modes = np.zeros((times.size, self.E[0].shape[1])), np.searchsorted(self.ends[:-1], inside)
         for mode in np.unique(modes):
             which = np.flatnonzero(modes == mode)
-            rows = np.tile(self.rows[mode], (which.size, 1))
-            found[which] = made(self.leaps[mode], rows, self.ends[mode] - times[which], which) @ self.E[mode]
+            rows = self.leaps[mode].orbits(self.rows[[mode]], self.ends[mode] - times[which])[0][:, 0]
+            found[which] = made(self.leaps[mode], rows, which) @ self.E[mode]
         return found
 
 

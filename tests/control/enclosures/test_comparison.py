@@ -196,7 +196,7 @@ def test_bounds_of_cells_whose_widths_differ_little_hold_for_each(name, monkeypa
     """And are those of a width that is a fifth longer, at most."""
     monkeypatch.setattr(comparison, "WORK", 0.0)
     system, widths = made(name), np.concatenate([np.geomspace(1e-5, 0.3, 60), [0.0]])
-    groups = alike(widths, 9, cells=True)
+    groups = alike(widths, 9, rough=True)
     assert np.unique(groups[2]).size < 60 <= np.unique(alike(widths, 9)[2]).size
     assert (groups[1][groups[2]] <= 1.2 * (1 + 1e-8) * np.maximum(widths, 1e-12)).all()
     states = np.random.default_rng(0).uniform(0.0, 1.0, (widths.size, 3))

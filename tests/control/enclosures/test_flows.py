@@ -34,6 +34,16 @@ def test_leaps_are_the_exponential_and_its_integral_on_rows(A: np.ndarray) -> No
             assert (np.abs(found[k] - rows[k] @ exact) <= allowed).all()
 
 
+@pytest.mark.parametrize("A", [TURNING, DEFECTIVE, np.kron(np.eye(3), TURNING)])
+def test_orbits_are_every_row_over_every_duration(A: np.ndarray) -> None:
+    rows, leaps = RNG.normal(size=(2, A.shape[0])), Leaps(A)
+    durations = np.concatenate([DURATIONS[::-1], DURATIONS[:2], [-1e-18]])
+    each = leaps.rows(np.tile(rows, (durations.size, 1)), np.repeat(durations, 2))
+    for found, known in zip(leaps.orbits(rows, durations), each, strict=True):
+        assert found.reshape(known.shape) == pytest.approx(known, rel=1e-12, abs=1e-12 * np.abs(known).max())
+    assert leaps.orbits(rows, np.zeros(0))[0].shape == (0, *rows.shape)
+
+
 @pytest.mark.parametrize("A", [TURNING, DEFECTIVE, STILL])
 def test_flows_are_those_of_the_normal_form_on_rows_and_columns(A: np.ndarray) -> None:
     d = A.shape[0]

@@ -66,6 +66,25 @@ def test_rows_by_baby_and_giant_steps_are_the_closed_form(kind, pieces, horizon)
     assert (np.abs(np.concatenate([found.control, found.disturbance], axis=2) - value) <= allowed).all()
 
 
+@pytest.mark.parametrize("kind", sorted(RATES))
+@pytest.mark.parametrize(("pieces", "lengths"), [(2, 2), (37, 37), (300, 3), (600, 600)])
+def test_rows_over_stretches_are_the_closed_form(kind, pieces, lengths):
+    """With pieces that all differ, and with few lengths in any order, where not all stretches may be kept."""
+    rng, rates = np.random.default_rng(pieces), RATES[kind]
+    system, V = symmetric(rng, rates, 3.0)
+    ends = np.append(0.0, np.cumsum(rng.choice(rng.uniform(0.5, 1.5, lengths), pieces, replace=lengths < pieces)))
+    ends = 3.0 * ends / ends[-1]
+    grid = merge_grids(ends, ends)
+    times = np.concatenate([[0.0, 3.0], rng.choice(ends, 4), rng.uniform(0, 3.0, 6)])
+    directions = rng.normal(size=(times.size, 4))
+    value, size = exact(system, V, rates, grid, times, directions)
+    allowed = 1e-13 * (10.0 + np.abs(rates).max()) * size.max(axis=(1, 2), keepdims=True)
+    for kept in (0, 3000, 2_000_000):
+        with patch(f"{HOME}.STRETCHED", kept):
+            found = Response(system, grid, np.zeros(4)).weights(times, directions, np.zeros((times.size, 0)))
+        assert (np.abs(np.concatenate([found.control, found.disturbance], axis=2) - value) <= allowed).all()
+
+
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10**6), pieces=st.integers(1, 400), states=st.integers(1, 6), fast=st.floats(0.01, 30.0))
 def test_rows_by_baby_and_giant_steps_are_those_of_the_plain_recursion(seed, pieces, states, fast):
