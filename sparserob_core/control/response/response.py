@@ -439,9 +439,9 @@ class Propagator:
 
     def exponentials(self, mode: int = 0) -> Exponentials:
         """Those of a mode of a known system."""
-        return self._own(mode) if self.propagate is None else self.propagate
+        return self.own(mode) if self.propagate is None else self.propagate
 
-    def _own(self, mode: int = 0) -> Leaps:
+    def own(self, mode: int = 0) -> Leaps:
         """Those of the matrix of a mode as it is."""
         if mode not in self._exponentials:
             self._exponentials[mode] = Leaps(self.system.modes[mode].matrices(np.zeros((1, 0)))[0][0])
@@ -687,11 +687,11 @@ class Propagator:
         that are alike together, then over whole ones."""
         (k, r), d = (times.size, directions.shape[0]), directions.shape[1]
         if not self.aged(parameter.size):
-            known = Leaps(self.steps(parameter[None]).A[0, 0]) if self._depends else self._own()
+            known = Leaps(self.steps(parameter[None]).A[0, 0]) if self._depends else self.own()
             return known.orbits(directions, times)[0]
         pieces = self.grid.locate(times)
         within, which = self.grid.distinct(np.maximum(times - self.grid.breakpoints[pieces], 0.0))
-        rows = self._own().orbits(directions, within)[0][which].reshape(-1, d)
+        rows = self.own().orbits(directions, within)[0][which].reshape(-1, d)
         return self._leapt(rows, np.repeat(pieces, r)).reshape(k, r, d)
 
     def _leapt(self, rows: Array, pieces: np.ndarray) -> Array:
@@ -806,22 +806,27 @@ class Outputs:
         return pieces, np.bincount(which, since) / np.bincount(which), which
 
     @cached_property
-    def _steps(self) -> tuple[Array, Array]:
-        """``H e^{A r}`` and ``H Gamma(r)`` for the distinct durations: ``(v, q, r, d)`` each, of several modes ``(v, T,
-        r, d)``."""
-        steps, grid = self.propagator.steps(self.points), self.propagator.grid
+    def _kinds(self) -> tuple[np.ndarray, Array, np.ndarray]:
+        """The distinct modes and durations, ``(q,)`` each, and which of them every time has, ``(T,)``; of a single mode
+        they are those of `within`."""
         pieces, durations, which = self.within
-        if self.propagator.expansion is None and steps.A.shape[:2] == (1, 1):
-            rows = np.tile(self.H, (durations.size, 1))
-            known = Leaps(steps.A[0, 0]) if self.points.shape[1] else self.propagator.exponentials()
-            both = known.rows(rows, np.repeat(durations, self.H.shape[0]))
-            flown, driven = (part.reshape(1, durations.size, *self.H.shape) for part in both)
-            return flown, driven
-        if grid.mode is None:
-            found = transitions(steps.A, durations[None])
-        else:
-            found = transitions(steps.A[:, grid.mode[pieces]], durations[which][None])
-        return self.H @ found[0], self.H @ found[1]
+        modes = self.propagator.grid.modes[pieces]
+        kinds, each = np.unique(np.stack([modes, which]), axis=1, return_inverse=True)
+        return kinds[0], durations[kinds[1]], each.reshape(-1)
+
+    @cached_property
+    def _steps(self) -> tuple[Array, Array]:
+        """``H e^{A r}`` and ``H Gamma(r)`` for the distinct modes and durations: ``(v, q, r, d)`` each."""
+        steps, (modes, durations, _) = self.propagator.steps(self.points), self._kinds
+        if steps.A.shape[0] > 1:
+            flow, driven = transitions(steps.A[:, modes], durations[None])
+            return self.H @ flow, self.H @ driven
+        found = np.empty((2, 1, durations.size, *self.H.shape))
+        for mode in np.unique(modes):
+            mine = modes == mode
+            known = Leaps(steps.A[0, mode]) if self.points.shape[1] else self.propagator.own(mode)
+            found[0, 0, mine], found[1, 0, mine] = known.orbits(self.H, durations[mine])
+        return found[0], found[1]
 
     @cached_property
     def _over_pieces(self) -> tuple[Array, Array] | None:
@@ -848,8 +853,7 @@ class Outputs:
             held = np.einsum("trm,tm->rt", driven, inputs[pieces])
             return np.asarray(np.einsum("tri,ti->rt", flow, nodes[pieces]) + held)[None]
         nodes, drive = response.nodes(control, self.points), grid.driven(steps.B, grid.inputs(control))
-        pieces, _, which = self.within
-        which = which if grid.mode is None else np.arange(which.size)
+        pieces, which = self.within[0], self._kinds[2]
         flow, driven = (part[:, which] for part in self._steps)
         found = np.einsum("vtri,vti->vrt", flow, nodes[:, pieces]) + np.einsum(
             "vtri,vti->vrt", driven, drive[:, pieces]
