@@ -128,7 +128,8 @@ def _beyond(model: Transcription, result: Result) -> float:
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:
     """The numbers ``(k,)`` that are added up to rows ``c'x(t)``, ``directions (k, d)``, at their largest."""
     weights = model.response.weights(times, directions, parameters)
-    return _beside_control(model, weights, times, directions) + _controlled(model, weights.control).sum(axis=(1, 2))
+    controlled = _controlled(model, weights.control).sum(axis=(1, 2))
+    return np.asarray(_beside_control(model, weights, times, directions) + controlled)
 
 
 def _controlled(model: Transcription, weights: Array) -> Array:
