@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.control.problem.expression import kepler
 from sparserob_core.control.studies.initial_states import InitialPlane
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
@@ -276,6 +277,68 @@ def test_parameters_that_are_changed_afterwards_are_found(
     change: tampering.Change, mathieu: tuple[sr.Outcome, Path], tmp_path: Path
 ) -> None:
     assert check(tampering.forged(mathieu[1], tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
+RELAXING: Config = {
+    "problem": {
+        "name": "linear",
+        "system": {
+            "A": [["-exp(-p*t)"]],
+            "B": [["sqrt(1 + p*cos(t))"]],
+            "E": [["1/(1 + p)"]],
+            "c": ["0.1*kepler(t/2 + p, 0.1)/(1 + t)"],
+            "parameters": {"p": [0.2, 0.3]},
+        },
+        "horizon": 2.0,
+        "initial_state": [1.0],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0.02]},
+        "path": [{"box": [0.4], "from": 1.0}],
+        "terminal": [{"box": [0.1]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+    "observers": [],
+}
+
+
+def relaxing_in_units(time: float, length: float, unit: float) -> Config:
+    """`RELAXING` with its time, its state and its parameter in other units."""
+    made = copy.deepcopy(RELAXING)
+    problem, (t, p) = made["problem"], (f"(t / {time!r})", f"(p / {unit!r})")
+    rate = length / time
+    problem["system"] = {
+        "A": [[f"-exp(-{p}*{t}) / {time!r}"]],
+        "B": [[f"sqrt(1 + {p}*cos({t})) * {rate!r}"]],
+        "E": [[f"{rate!r}/(1 + {p})"]],
+        "c": [f"{0.1 * rate!r}*kepler({t}/2 + {p}, 0.1)/(1 + {t})"],
+        "parameters": {"p": [0.2 * unit, 0.3 * unit]},
+    }
+    problem.update(horizon=2.0 * time, initial_state=[length])
+    problem["path"], problem["terminal"] = [{"box": [0.4 * length], "from": time}], [{"box": [0.1 * length]}]
+    return made
+
+
+@pytest.mark.slow
+def test_entries_that_are_any_function_of_the_parameters_are_kept_inside(tmp_path: Path) -> None:
+    """In units of a 60th of the time, a thousandth of the state and a 40th of the parameter."""
+    outcome = solved(relaxing_in_units(60.0, 1e-3, 40.0), tmp_path / "run")
+    assert outcome.result.status == "certified"
+    values, rng, closest = outcome.result.control.values[0], np.random.default_rng(31), np.inf
+    for p in (0.2, 0.3, *rng.uniform(0.2, 0.3, 8)):
+        state, noise = np.array([1.0]), rng.choice([-0.02, 0.02]) * np.ones(4)
+        for k in range(4):
+
+            def rate(t: float, x: np.ndarray, p=p, u=values[k], w=noise[k]) -> np.ndarray:
+                drift = 0.1 * kepler(t / 2 + p, 0.1) / (1.0 + t)
+                return -np.exp(-p * t) * x + np.sqrt(1.0 + p * np.cos(t)) * u + w / (1.0 + p) + drift
+
+            times = np.linspace(k / 2, (k + 1) / 2, 9)
+            path = solve_ivp(rate, (k / 2, (k + 1) / 2), state, t_eval=times, rtol=1e-10, atol=1e-12).y
+            state = path[:, -1]  # of a control that has no units
+            assert np.abs(path[0, times >= 1.0]).max(initial=0.0) <= 0.4 + 1e-8
+        assert abs(state[0]) <= 0.1 + 1e-8
+        closest = min(closest, 0.1 - abs(state[0]))
+    assert closest < 0.02
 
 
 def changed(**problem: Any) -> Config:

@@ -116,8 +116,7 @@ class Timed:
         return self._of(lambda s: s.sqrt())
 
     def tanh(self) -> Timed:
-        twice = (self * 2.0).exp()
-        return (twice - 1.0) / (twice + 1.0)
+        return 1.0 - 2.0 / ((self * 2.0).exp() + 1.0)  # a ball is there once, so that of wide ones little is lost
 
     def kepler(self, eccentricity: float) -> Timed:
         return self._of(lambda s: kepler_series(s, eccentricity, s.prec))

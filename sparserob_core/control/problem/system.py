@@ -600,8 +600,8 @@ class VaryingSystem:
     ``law``: a `LinearSystem` whose first parameter is the time: its matrices at ``p = (t,)`` are those at the time
     ``t``. ``later``: times, one after another, each with the law that holds from then on. ``delay``, as that of a
     `LinearSystem`: what was commanded acts through the ``B`` of the time at which it acts. ``parameters``: a box of
-    uncertain parameters, which follow the time in the laws, and in which entries must be polynomials; ``None``
-    where everything is known. Made of expressions by `of` and `taking_turns`. Raises `InputError`.
+    uncertain parameters, which follow the time in the laws; ``None`` where everything is known. Made of expressions by
+    `of` and `taking_turns`. Raises `InputError`.
     """
 
     law: LinearSystem
@@ -639,19 +639,8 @@ class VaryingSystem:
 
     @cached_property
     def _depends(self) -> Dependence | int:
-        """That, or the largest degree of an entry; raises `InputError` for one that is no polynomial in them."""
-        entries = [[law.entry(name) for name in PARTS] for _, _, law in self.laws]
-        found = dependence(entries, *self.deviations)
-        if isinstance(found, Dependence | int):
-            return found
-        number, name, i, j = found
-        entry = entries[number][PARTS.index(name)]
-        raise InputError(
-            path=(f"system.pieces.{number}" if self.later else "system") + f".{name}.{i}.{j}",
-            expected="polynomials in the parameters, beside the time t; of others nothing is proven yet. What they do"
-            " to the state may be put into the disturbance, with a bound of the states",
-            got=entry.entries[i][j].text if isinstance(entry, ExpressionMatrix) else "a function of them",
-        )
+        """That, or the largest degree of an entry that is a polynomial in them."""
+        return dependence([[law.entry(name) for name in PARTS] for _, _, law in self.laws], *self.deviations)
 
     @property
     def deviations(self) -> tuple[Array, Array]:
@@ -664,7 +653,8 @@ class VaryingSystem:
 
     @property
     def powers(self) -> int | None:
-        """Of a system whose state is no affine function of its parameters, the largest degree of an entry in them."""
+        """Of a system whose state is no affine function of its parameters, the largest degree of an entry that is a
+        polynomial in them."""
         return self._depends if isinstance(self._depends, int) else None
 
     def superposed(self, depends: Dependence | Spread) -> VaryingSystem:

@@ -11,7 +11,8 @@ expansion in them. With ``x = sum_a delta^a x_a + R`` (`Spread`), what is beyond
 R`` plus the products of coefficients of ``A`` and of the state whose degrees add up to more than ``D``. So it is at
 most the transitions' norm times the integral of ``sum_j n_j sum_(b > D - j) a_b``, with ``a_b`` and ``n_j`` the norms
 of all coefficients of ``A`` and of the state of a degree; and the transitions themselves are such an expansion, whose
-norm is bounded by what it is of its own coefficients.
+norm is bounded by what it is of its own coefficients. Of entries that are no polynomials what their own power series
+leave (`Left`) is there too: that of ``A`` times all coefficients of the state, and that of ``[B E]`` times inputs.
 """
 
 from __future__ import annotations
@@ -502,6 +503,16 @@ class Truncation:
         return np.stack([norms[:, space.degrees == j].sum(axis=1) for j in range(space.degree + 1)], axis=1)
 
     @cached_property
+    def _off(self) -> tuple[Array, Array]:
+        """What the entries themselves leave out on every piece: the norm of ``A``, ``(K,)``, and how fast it drives
+        states, ``(K, m + mw)``."""
+        d, K = self.spread.d, self.motion.grid.pieces
+        if self.spread.left is None:
+            return np.zeros(K), np.zeros((K, self.motion.most.shape[2] - self.motion.states))
+        sizes = self.spread.left.over(self.motion.grid.breakpoints) / self.units[:, None]
+        return (sizes[:, :, :d] * self.units).sum(axis=2).max(axis=1) * OUTWARD, sizes[:, :, d:].max(axis=1) * OUTWARD
+
+    @cached_property
     def _within(self) -> Array:
         """What a piece makes of norms at most, anywhere on it, ``(K, D + 1, D + 1)``."""
         size, count = self.spread.space.degree + 1, self._sizes.shape[0]
@@ -520,14 +531,15 @@ class Truncation:
     def _beyond(self) -> Array:
         """What coefficients of every degree are multiplied by in the products beyond, ``(K, D + 1)``."""
         found = np.cumsum(self._sizes[:, ::-1], axis=1)  # of the degrees D, D and D - 1, ...: for j = 0, 1, ...
-        return np.concatenate([np.zeros((found.shape[0], 1)), found[:, :-1]], axis=1) * OUTWARD
+        above = np.concatenate([np.zeros((found.shape[0], 1)), found[:, :-1]], axis=1)
+        return np.asarray((above + self._off[0][:, None]) * OUTWARD)
 
-    def _added(self, begun: Array, driven: Array) -> Array:
+    def _added(self, begun: Array, driven: Array, off: Array) -> Array:
         """The integral over every piece of what is beyond the degree, ``(K,)``, of states whose norms are ``begun (K, D
-        + 1)`` at its beginning and that are driven so fast, ``(K, D + 1)``."""
+        + 1)`` at its beginning and that are driven so fast, ``(K, D + 1)``, and ``off (K,)`` by what entries leave."""
         lengths = self.motion.grid.lengths[:, None]
         most = np.einsum("kij,kj->ki", self._within, begun + lengths * driven)
-        return np.asarray((most * self._beyond).sum(axis=1) * lengths[:, 0] * OUTWARD)
+        return np.asarray(((most * self._beyond).sum(axis=1) + off) * lengths[:, 0] * OUTWARD)
 
     @cached_property
     def _carried(self) -> Array:
@@ -547,16 +559,18 @@ class Truncation:
     @cached_property
     def growth(self) -> float:
         """The norm of the transitions from any time to any later one, at any parameter."""
-        ends = float(np.exp((self._sizes.sum(axis=1) * self.motion.grid.lengths).max()) * OUTWARD)
+        sizes = self._sizes.sum(axis=1) + self._off[0]
+        ends = float(np.exp((sizes * self.motion.grid.lengths).max()) * OUTWARD)
         marks = self._carried[:-1]
-        share = ends * float(self._added(marks, np.zeros(marks.shape)).sum())
+        share = ends * float(self._added(marks, np.zeros(marks.shape), np.zeros(len(marks))).sum())
         largest = float(self._carried.sum(axis=1).max())
         return ends * ends * largest / (1.0 - share) * OUTWARD if share < 0.5 else np.inf
 
     def lost(self, sizes: Array, inputs: Array) -> Array:
         """What is beyond the degree of states that are at most ``sizes (K, states)`` at the beginning of every piece
         and are driven by at most ``inputs (K, m + mw)``: state by state, ``(K, d)``."""
-        added = np.cumsum(self._added(self.norms(sizes), self.driven(inputs)))
+        off = (self._off[1] * inputs).sum(axis=1)
+        added = np.cumsum(self._added(self.norms(sizes), self.driven(inputs), off))
         return np.asarray(self.growth * added[:, None] * self.units * OUTWARD)
 
     def at_most(self, begun: Array, inputs: Array) -> Array:
@@ -568,7 +582,8 @@ class Truncation:
         pushed[0] += (begun / self.units).max(initial=0.0)
         most = self._carried.max(axis=0)
         norms = np.array([sum(most[j - i] * pushed[i] for i in range(j + 1)) for j in range(size)])
-        return self.growth * float(self._added(np.tile(norms, (pieces, 1)), driven).sum()) * self.units * OUTWARD
+        added = self._added(np.tile(norms, (pieces, 1)), driven, self._off[1] @ inputs)
+        return self.growth * float(added.sum()) * self.units * OUTWARD
 
 
 @dataclass(frozen=True, eq=False)

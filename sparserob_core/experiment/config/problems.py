@@ -141,7 +141,7 @@ class SystemOptions(Options):
 
     parameters: Parameters | None = None
     """Intervals ``{name: [lower, upper]}``, or names and a set, as ``{names: [...], polytope: {H: ..., h: ...}}``; none
-    if known. Beside entries in ``t`` intervals, of parameters that entries are polynomials in."""
+    if known. Beside entries in ``t`` intervals."""
 
     c: Column | None = None
     """Constant drift such as gravity, one entry per state, in units of the state per time; none unless given."""

@@ -2,10 +2,13 @@
 as the known system that it is there, and over a box of them as a polynomial in their shares, by power series of its
 own.
 
-With ``s`` the shares of the parameters and ``A = sum_b A_b s^b``, the coefficients of ``x = sum_a x_a s^a + R`` up to a
-degree ``D`` obey ``x_a' = sum_b A_b x_(a-b) + B_a u + E_a w``: matrices of such polynomials are a ring, in which power
-series in time solve as they do for numbers. What is beyond is ``R' = A R`` plus the products whose degrees add up to
-more than ``D``: at most what transitions make of them, whose own norm is bounded by what it is of their coefficients.
+With ``s`` the shares of the parameters and ``A = sum_b A_b s^b + A'``, the coefficients of ``x = sum_a x_a s^a + R``
+up to a degree ``D`` obey ``x_a' = sum_b A_b x_(a-b) + B_a u + E_a w``: matrices of such polynomials are a ring, in
+which power series in time solve as they do for numbers. What is beyond is ``R' = A R`` plus the products whose degrees
+add up to more than ``D``: at most what transitions make of them, whose own norm is bounded by what it is of their
+coefficients. What a power series of ``D`` factors leaves of entries, ``A'``, ``B'`` and ``E'``, is there as well, times
+states and inputs: by the integral form of Taylor's remainder along the line from the middle, whose terms of ``D + 1``
+factors are enclosed on boxes.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from sparserob_core.checker.arithmetic.timed import Timed
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene, bounded
 from sparserob_core.checker.reach.flow import balanced, stacked
-from sparserob_core.checker.reach.superposition import FREE, Parts
+from sparserob_core.checker.reach.superposition import FREE, MOST_FACTORS, Parts, Something
 from sparserob_core.checker.reach.tube import Known, Polynomial
 from sparserob_core.checker.reach.varying.flow import (
     LONG,
@@ -56,7 +59,13 @@ LEFT = ((1e-16, 160), (1e-13, 160), (1e-11, 160))
 reached. Norms of transitions multiply it by 1e3 and more, and walls are ridden to 1e-9. Twice as many numbers take four
 times as long."""
 MOST_DEGREE = 60  # of the expansion, which is that of a few states and one parameter
+MOST_TERMS = 30  # of power series of entries that are no polynomials; with q^n of them 40 take twice the time
 FURTHER = 40  # degrees beyond one, whose sum is about what is beyond: of norms of a few the rest is far less
+AHEAD = 4  # degrees beyond the last one that are looked at: what is beyond these is a small part of what is there
+SLICES = 8
+"""Parts of the way from the middle of the box to its sides, on which terms beyond the degree are enclosed; of two of
+them they are a thousand times what they are, of more a few times less."""
+PARTS_IN_TIME = 2  # of a segment, for these terms; more of them find the same where segments are short anyway
 LOOKS = 17  # times at which the numbers of the system are looked at, by which nothing is proven
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """What a degree more counts in the norms that transitions are off by: with the first alone each coefficient of a high
@@ -85,13 +94,15 @@ class Fixed:
 @dataclass(frozen=True, eq=False)
 class Segment:
     """``[A B E]`` from ``start`` to ``stop``, part by part of the shares' monomials: polynomials in the time since
-    ``centre``, and balls ``left`` that hold what stands before the next power of it."""
+    ``centre``, and balls ``left`` that hold what stands before the next power of it. ``beyond (d, d + m + mw)``: what
+    is beyond these monomials at most."""
 
     start: float
     stop: float
     centre: float
     law: list[list[list[arb_poly]]]
     left: list[list[list[arb]]]
+    beyond: Array
 
 
 @final
@@ -126,27 +137,31 @@ class SpreadFlow:
         return Parts(self.system, tuple(self.system.parameters.interior_point().tolist()))
 
     @cached_property
-    def _looks(self) -> tuple[Array, int, Array, Array]:
+    def _looks(self) -> tuple[Array, int, Array, Array, Array]:
         """Units of the states, by the entries of ``A`` in the middle of the box, ``(d,)``; the largest degree of an
-        entry; about the integral of the norms of all coefficients of ``A`` of every degree from 1 on; and how large
-        inputs are, ``(m + mw,)``."""
-        d = self.system.states
+        entry that is a polynomial; about the integral of the norms of all coefficients of ``A`` of every degree from 1
+        on; what power series of inputs leave beyond every degree; and how large inputs are, ``(m + mw,)``."""
+        d, horizon = self.system.states, self.system.horizon
+        most = self.degrees[-1] + AHEAD if self._bent.any() else MOST_FACTORS
         every, drives, degree = np.zeros((d, d)), np.zeros(1), 0
         tables = []
         for begin, until, law in self.system.laws:
-            for time in np.linspace(begin, until, LOOKS).tolist():
-                found = self._coefficients(law, time)
+            for time in np.linspace(begin, until, LOOKS):
+                found = self._coefficients(law, time, most)[0]
                 sizes = {key: np.abs(table.astype(float)) for key, table in found.items()}
                 every = np.maximum(every, sizes[FREE][:, :d])
                 drives = np.maximum(drives, sum(sizes.values())[:, d:].max(axis=0))
-                degree = max(degree, *(len(key) for key in sizes))
+                degree = max(degree, *(len(key) for key, table in sizes.items() if table[~self._bent].any() or not key))
                 tables.append(((until - begin) / LOOKS, sizes))
-        u = np.array(balanced(every, self.system.horizon, np.ones(d) / self.system.horizon))
-        paces = np.zeros(1 + degree)
+        u = np.array(balanced(every, horizon, np.ones(d) / horizon))
+        paces, rates = np.zeros(most + 1), np.zeros(most + 1)
+        inputs = np.where(drives > 0.0, drives, 1.0)
         for width, sizes in tables:
             for key, table in sizes.items():
                 paces[len(key)] += width * float((table[:, :d] * u / u[:, None]).sum(axis=1).max())
-        return u, degree, paces[1:], drives
+                rates[len(key)] += width / horizon * float((table[:, d:] / inputs).max(initial=0.0))
+        rest = 2.0 * np.append(rates[::-1].cumsum()[::-1][1:], 0.0)
+        return u, degree, paces[1:], rest, drives
 
     @property
     def units(self) -> Array:
@@ -154,13 +169,26 @@ class SpreadFlow:
         return self._looks[0]
 
     @cached_property
+    def _bent(self) -> np.ndarray:
+        """Which entries of ``[A B E]`` are no polynomials."""
+        laws = self.system.laws
+        return np.asarray(np.any([self._coefficients(law, Something(), MOST_FACTORS)[1] for _, _, law in laws], axis=0))
+
+    @cached_property
+    def degrees(self) -> list[int]:
+        """Those of which there are not too many monomials."""
+        nu, d, most = len(self.parts.middle), self.system.states, MOST_TERMS if self._bent.any() else MOST_DEGREE
+        return [n for n in range(most + 1) if d * comb(nu + n, nu) <= LEFT[-1][1]]
+
+    @cached_property
     def monomials(self) -> Monomials:
         """Those of the shares; raises `Unchecked` where too many were needed."""
-        nu, (_, powers, paces, _) = len(self.parts.middle), self._looks
+        nu, (_, powers, paces, rest, _) = len(self.parts.middle), self._looks
         beyond = self._beyond_degrees(paces)
         for left, most in LEFT:
-            for degree in range(powers, MOST_DEGREE + 1):
-                if beyond[degree] <= left and self.system.states * comb(nu + degree, nu) <= most:
+            for degree in self.degrees[max(1, powers) :]:
+                small = beyond[degree] <= left and (not self._bent.any() or (degree + 1) * rest[degree] <= left)
+                if small and self.system.states * comb(nu + degree, nu) <= most:
                     return Monomials(nu, degree)
         raise Unchecked("the parameters beside the time move the state further than an expansion reaches")
 
@@ -174,14 +202,17 @@ class SpreadFlow:
             every[n] = (of * paces[: of.size] * every[n - of]).sum() / n
         return np.append(every[::-1].cumsum()[::-1][1:], 0.0)
 
-    def _coefficients(self, law: LinearSystem, time: object) -> dict[tuple[int, ...], np.ndarray]:
-        """``[A B E]`` at a time, by the numbers of the shares."""
+    def _coefficients(
+        self, law: LinearSystem, time: object, most: int, middle: Sequence[Any] | None = None
+    ) -> tuple[dict[tuple[int, ...], np.ndarray], np.ndarray]:
+        """``[A B E]`` at a time up to so many factors, by the numbers of the shares, and where it is not all."""
         entries = [law.A, law.B, *([] if law.c is None else [law.c]), law.E]
-        every = [self.parts.coefficients(one, time) for one in entries]
-        keys = dict.fromkeys(key for one in every for key in one)
-        return {
-            key: np.hstack([one.get(key, np.zeros(one[FREE].shape, dtype=object)) for one in every]) for key in keys
+        every = [self.parts.coefficients(one, time, most, middle) for one in entries]
+        keys = dict.fromkeys(key for one, _ in every for key in one)
+        found = {
+            key: np.hstack([one.get(key, np.zeros(bent.shape, dtype=object)) for one, bent in every]) for key in keys
         }
+        return found, np.hstack([bent for _, bent in every])
 
     def _table(self, law: LinearSystem, centre: arb, length: int) -> list[list[list[list[arb]]]]:
         """The first coefficients in time of every entry of ``[A B E]``, part by part, at all times of a ball."""
@@ -189,7 +220,7 @@ class SpreadFlow:
 
         before, ctx.cap = ctx.cap, length
         try:
-            found = self._coefficients(law, Timed.time(centre, length))
+            found, _ = self._coefficients(law, Timed.time(centre, length), self.monomials.degree)
             none = [arb(0)] * length
             rows, columns = found[FREE].shape
             parts = [[[none] * columns for _ in range(rows)] for _ in range(self.monomials.size)]
@@ -203,6 +234,41 @@ class SpreadFlow:
             return parts
         finally:
             ctx.cap = before
+
+    def beyond(self, law: LinearSystem, start: float, stop: float) -> Array:
+        """What is beyond the monomials of every entry of ``[A B E]`` at most, ``(d, d + m + mw)``, at any time between
+        two and any parameter: with the terms ``f_a`` of ``D + 1`` factors ``(D + 1) int_0^1 (1 - z)^D sum_a
+        |f_a(z s)| dz``. Raises `Unchecked` where it is not finite."""
+        from flint import arb, ctx
+
+        degree = self.monomials.degree
+        bent = self._coefficients(law, Something(), degree)[1]
+        total = np.zeros(bent.shape)
+        if not bent.any():
+            return total
+        before, ctx.cap = ctx.cap, 1
+        try:
+            cuts = np.linspace(start, stop, PARTS_IN_TIME + 1).tolist()
+            for begin, until in pairwise(cuts):
+                time, sums = Timed.time(arb(begin).union(arb(until)), 1), np.full(bent.shape, arb(0), dtype=object)
+                for k in range(SLICES):
+                    low, high = arb(k) / SLICES, arb(k + 1) / SLICES
+                    weight = (1 - low) ** (degree + 1) - (1 - high) ** (degree + 1)
+                    middle = [
+                        Timed.time(arb(value), 1) + Timed.time(arb(0, 1) * arb(scale) * high, 1)
+                        for value, scale in zip(self.parts.middle, self.parts.scales, strict=True)
+                    ]
+                    found, _ = self._coefficients(law, time, degree + 1, middle)
+                    for key, table in found.items():
+                        if len(key) == degree + 1:
+                            for place in np.argwhere(bent).tolist():
+                                one = table[tuple(place)]
+                                term = one.coefficients(1)[0] if isinstance(one, Timed) else arb(float(one))
+                                sums[tuple(place)] += upper(abs(term)) * weight
+                total = np.maximum(total, [[float(upper(one).upper()) for one in row] for row in sums])
+        finally:
+            ctx.cap = before
+        return total * OUTWARD
 
     @cached_property
     def segments(self) -> list[Segment]:
@@ -220,7 +286,7 @@ class SpreadFlow:
             wide = self._table(law, arb(start).union(arb(stop)), ORDER + 2)
         except Unchecked:
             return None
-        d, u, drives = self.system.states, self.units.tolist(), self._looks[3]
+        d, u, drives = self.system.states, self.units.tolist(), self._looks[4]
         size, lost = arb(0), arb(0)
         for i in range(d):
             sums, over = arb(0), arb(0)
@@ -237,12 +303,17 @@ class SpreadFlow:
         most = size.max(arb(1.0 / self.system.horizon))
         if not (size * (arb(stop) - arb(start)) <= LONG and lost <= arb(SHARP) * most):
             return None
+        try:
+            beyond = self.beyond(law, start, stop)
+        except Unchecked:
+            return None
         return Segment(
             start,
             stop,
             centre,
             [[[arb_poly(entry) for entry in row] for row in part] for part in exact],
             [[[entry[ORDER + 1] for entry in row] for row in part] for part in wide],
+            beyond,
         )
 
     @cached_property
@@ -377,6 +448,14 @@ class SpreadFlow:
         return self._degrees(np.array(states)), self._degrees(np.array(inputs))
 
     @cached_property
+    def _off(self) -> tuple[Array, Array]:
+        """What power series leave of entries on every segment: the norm of ``A``, ``(K,)``, and how fast inputs drive
+        states by it, ``(K, m + mw)``."""
+        d, u = self.system.states, self.units
+        every = np.array([one.beyond for one in self.segments]) / u[:, None]
+        return (every[:, :, :d] * u).sum(axis=2).max(axis=1) * OUTWARD, every[:, :, d:].max(axis=1) * OUTWARD
+
+    @cached_property
     def _lengths(self) -> Array:
         return np.diff(self.marks) * (1.0 + rounding(2))
 
@@ -399,7 +478,7 @@ class SpreadFlow:
         """The integral over the horizon of what is beyond the degree where the state's norms by degree are at most
         ``norms (K, D + 1)`` on every segment."""
         sizes = np.cumsum(self._most[0][:, ::-1], axis=1)
-        factors = np.concatenate([np.zeros((len(sizes), 1)), sizes[:, :-1]], axis=1)
+        factors = np.concatenate([np.zeros((len(sizes), 1)), sizes[:, :-1]], axis=1) + self._off[0][:, None]
         return float(((norms * factors).sum(axis=1) * self._lengths).sum() * OUTWARD)
 
     @cached_property
@@ -437,7 +516,7 @@ class SpreadFlow:
         at most ``inputs (m + mw,)``."""
         sizes, lengths, u, n = self._most, self._lengths, self.units, self.monomials.degree + 1
         driven = np.einsum("kcj,c->kj", sizes[1], inputs)
-        ends = float(np.exp((sizes[0].sum(axis=1) * lengths).max())) * OUTWARD
+        ends = float(np.exp(((sizes[0].sum(axis=1) + self._off[0]) * lengths).max())) * OUTWARD
         carried, within = self._carried, self._within_norms
         share = ends * self._beyond(np.einsum("kij,j->ki", within, carried))
         if not share < 0.5:
@@ -447,7 +526,8 @@ class SpreadFlow:
         pushed[0] += float((begun / u).max(initial=0.0))
         at_marks = np.array([sum(carried[j - i] * pushed[i] for i in range(j + 1)) for j in range(n)])
         norms = np.einsum("kij,kj->ki", within, at_marks + lengths[:, None] * driven)
-        return growth * self._beyond(norms) * u * OUTWARD
+        missing = float((self._off[1] @ inputs * lengths).sum() * OUTWARD)
+        return growth * (self._beyond(norms) + missing) * u * OUTWARD
 
 
 @final

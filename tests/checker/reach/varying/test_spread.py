@@ -14,13 +14,13 @@ from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates, SpreadTube
-from tests.control.response.test_spread_motion import SYSTEM, decay
+from tests.control.response.test_spread_motion import FILLING, RELAXING, SYSTEM, decay
 
 flint = pytest.importorskip("flint")
 
 
-def flow(degree: int) -> SpreadFlow:
-    made = SpreadFlow(SYSTEM, 3.0)
+def flow(degree: int, system: sr.VaryingSystem = SYSTEM) -> SpreadFlow:
+    made = SpreadFlow(system, system.horizon)
     made.__dict__["monomials"] = Monomials(1, degree)
     return made
 
@@ -90,3 +90,57 @@ def test_polynomials_on_boxes_hold_what_the_closed_form_gives_there() -> None:
             told = np.einsum("jm,jk,mk->k", found.coefficients, orders, powers)
             assert (truth <= told + found.error).all()
             assert (told - found.error - found.kinks * 2 <= truth + 1e-9).all()
+
+
+@pytest.mark.parametrize("degree", [2, 3, 5])
+@pytest.mark.parametrize("name", ["relaxing", "filling"])
+def test_what_power_series_leave_of_entries_is_in_what_is_beyond(name: str, degree: int) -> None:
+    law = flow(degree, RELAXING if name == "relaxing" else FILLING)
+    shares = np.linspace(-1.0, 1.0, 31)
+    p = 0.05 + 0.25 * shares
+    moved, pushed, shaken = (
+        np.polynomial.Polynomial([float(part[0, 0].mid()) for part in one.parts])(shares) for one in law.over(0.0, 2.0)
+    )
+    gone = np.exp(-2.0 / (1.0 + p)) if name == "relaxing" else np.ones(31)
+    exact = [gone, 1.0 - gone if name == "relaxing" else 2.0 / (1.0 + p)]
+    for seen, true, begun, inputs in (
+        (moved, exact[0], [1.0], [0.0, 0.0]),
+        (pushed, exact[1], [0.0], [1.0, 0.0]),
+        (moved - 2.0 * pushed, exact[0] - 2.0 * exact[1], [1.0], [2.0, 0.0]),
+        *([] if name == "relaxing" else [(shaken, 2.0 * np.exp(p), [0.0], [0.0, 1.0])]),
+    ):
+        off, lost = float(np.abs(seen - true).max()), float(law.lost(np.array(begun), np.array(inputs))[0])
+        assert off <= lost * (1.0 + 1e-9) + 1e-14
+        assert lost <= 1e5 * off + 1e-14
+    if name == "relaxing":  # of a state that falls to exp(-2.5)
+        lost = float(law.lost(np.ones(1), np.zeros(2))[0])
+        rest = 1.0 / (1.0 + p) - sum((-0.25) ** n / 1.05 ** (n + 1) * shares**n for n in range(degree + 1))
+        law.__dict__["_off"] = tuple(0.0 * one for one in law._off)
+        assert lost - float(law.lost(np.ones(1), np.zeros(2))[0]) >= 2.0 * np.abs(rest).max() * np.exp(-2.5)
+
+
+ENTRIES = [
+    "exp(-p*t)", "1/(1+p)", "sin(p*t)*cos(p)", "sqrt(1+p*cos(t))", "log(2+p*t)", "tan(p*t/4)", "tanh(p+t)",
+    "(1+p)^1.5", "p^9*t", "exp(sin(p*t))/(2+p^2)", "(2+p)^(-2)", "(1+t)^p",
+    pytest.param("kepler(t+p+p^2, 0.3)", marks=pytest.mark.slow),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ENTRIES)
+def test_what_is_beyond_the_monomials_of_an_entry_is_bounded(text: str) -> None:
+    box = sr.Box([-0.3], [0.4])
+    system = sr.VaryingSystem.of([[text]], [["1"]], 2.0, [[1]], parameters=box, names=["p"])
+    shares, entry = np.linspace(-1.0, 1.0, 41), system.law.entry("A")
+    for degree in (1, 4, 7):
+        law = flow(degree, system)
+        (scale,), (middle,) = law.parts.scales, law.parts.middle
+        for start, stop in ((0.0, 0.1), (1.8, 2.0)):
+            left, off = law.beyond(system.law, start, stop), 0.0
+            assert (left[:, 1:] == 0.0).all()
+            for t in (start, (start + stop) / 2, stop):
+                found, _ = law.parts.coefficients(entry, np.float64(t), degree)
+                seen = sum(float(table[0, 0]) * shares ** len(key) for key, table in found.items())
+                exact = [float(entry(np.array([t, middle + scale * s], dtype=object))[0, 0]) for s in shares]
+                off = max(off, float(np.abs(seen - exact).max()))
+            assert off <= left[0, 0] * (1.0 + 1e-9) + 1e-14
+            assert left[0, 0] <= 1e3 * off + 1e-14
