@@ -20,6 +20,17 @@ KINDS: dict[str, tuple[dict[str, Any], str]] = {
     "initial states": (on(10, {**BEGUN, "disturbance": {"box": [0.02, 0.02]}}), "terminal"),
     "measurable": (on(10, {**SPRING, "disturbance": {"box": [0.03, 0.03]}, "disturbance_class": "measurable"}), "path"),
     "mixed": (on(6, {**HELD, "path": [{"mixed": {"H": [[1.0]], "G": [[0.3]], "h": [1.9]}, "from": 0.2}]}), "path"),
+    "integral": (
+        on(
+            10,
+            {
+                **BEGUN,
+                "disturbance": {"box": [0.02, 0.02]},
+                "integral": [{"H": [[1.0, 0.0]], "G": [[0.1]], "from": 0.3, "to": 1.9, "lower": [-1.0], "name": "sum"}],
+            },
+        ),
+        "sum",
+    ),
 }
 
 
@@ -28,7 +39,7 @@ def few_states(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(constraints, "FOLLOWED", 1)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k == "integral" else k for k in KINDS])
 def test_rows_hold_along_their_adjoints_and_not_for_another_control_or_wall(kind: str, tmp_path: Path) -> None:
     config, active = KINDS[kind]
     sr.run(copy.deepcopy(config), out=tmp_path / "run", quiet=True, figures=False)
@@ -38,6 +49,8 @@ def test_rows_hold_along_their_adjoints_and_not_for_another_control_or_wall(kind
     def change(files: Forgery) -> None:
         if kind == "mixed":
             files.problem["path"][0]["mixed"]["h"] = [1.0]
+        elif kind == "integral":
+            files.problem["integral"][0]["lower"] = [1.0]
         else:
             files.certificate["decision"] = [[0.999 * value for value in row] for row in files.decision]
 

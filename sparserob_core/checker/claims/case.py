@@ -21,7 +21,7 @@ from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
-from sparserob_core.checker.reach.integrals import integrating, spelt
+from sparserob_core.checker.reach.integrals import Running, integrating, spelt
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.measurable import Execution, Side
 from sparserob_core.checker.reach.superposition import parted
@@ -35,7 +35,7 @@ from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.problem.terms.integral import Accumulated
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.sets.sets import Box, ConvexSet, Product, product
@@ -494,9 +494,26 @@ class Case:
         return Price(self.problem, self.control, self.clock, None if changing is None else changing.at(nominal))
 
     @cached_property
+    def running(self) -> Running | None:
+        """What is integrated, where nothing else changes with time."""
+        system = self.problem.system
+        if not isinstance(system, SwitchedSystem) or self.measurable:
+            return None
+        found, d = Running.of(spelt(self.stated)), self.stated.system.states
+        return found if found is not None and all(found.is_beside(mode, d) for mode in system.modes) else None
+
+    @property
+    def still(self) -> LinearSystem | None:
+        """The one system that acts all along, beside what is integrated of it; ``None`` where others do."""
+        if self.running is not None:
+            return self.running.system
+        return self.problem.system if isinstance(self.problem.system, LinearSystem) else None
+
+    @cached_property
     def motion(self) -> Motion:
         """What rows of a known system have in common, the inputs of the control before those of the disturbance."""
-        parts = flows(self.problem.system, [])[0].parts
+        assert self.still is not None
+        parts = flows(self.still, [])[0].parts
         A, B, E = (parts[name][0] for name in ("A", "B", "E"))
         if self.problem.disturbance is not None:
             B = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)])

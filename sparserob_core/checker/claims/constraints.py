@@ -21,7 +21,7 @@ from sparserob_core.checker.claims.cells import Interval, Proven, Reached, Work,
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.adjoint import Adjoint, Worst
+from sparserob_core.checker.reach.adjoint import Adjoint, Stopped, Worst
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.loop_tube import LoopTube
@@ -34,7 +34,6 @@ from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, Enclosed
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.control.problem.names import joined, measured_in
-from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array
 
@@ -102,7 +101,7 @@ def follows(case: Case) -> bool:
     system = case.problem.system
     if case.answering or not case.alike or case.execution is not None or len(case.grid) > MOST_PIECES:
         return False
-    return isinstance(system, LinearSystem) and not system.parameter_count and system.states >= FOLLOWED
+    return case.still is not None and not system.parameter_count and system.states >= FOLLOWED
 
 
 def _along_rows(case: Case, window: Window) -> Proven:
@@ -123,19 +122,15 @@ def followed(case: Case, c: Array, driven: bool = True) -> Worst:
     """The worst of the row ``c (d,)`` of a known system, by its adjoint; one adjoint serves a row and its opposite. Not
     ``driven``: without the control that the certificate decides on, of which there is none where nothing is
     feasible."""
-    problem, made = case.problem, case.adjoints
-    c = c + 0.0  # no -0, of which the bytes of an opposite row would be others
-    opposite = (0.0 - c).tobytes()
+    problem = case.problem
     inputs = problem.system.controls + (problem.system.c is not None)
     table = Enclosed(*np.zeros((2, inputs, len(case.grid) - 1)))
     if driven:
         on_grid = [u.entries() for u in case.scene.control]
         table = Enclosed.of(stacked([list(row) for row in zip(*on_grid, strict=True)]))
     jumps = None if case.measurable else case.changes
-    if c.tobytes() not in made:
-        made[c.tobytes()] = made[opposite].reversed() if opposite in made else Adjoint.of(case.motion, c)
     return Worst(
-        made[c.tobytes()],
+        _adjoint(case, c),
         np.asarray(problem.initial_state, dtype=float),
         problem.initial_set,
         np.array(case.grid),
@@ -143,6 +138,23 @@ def followed(case: Case, c: Array, driven: bool = True) -> Worst:
         problem.disturbance,
         None if jumps is None else np.append(jumps, problem.horizon),
     )
+
+
+def _adjoint(case: Case, c: Array) -> Adjoint | Stopped:
+    """That of a row ``c (d,)``, of what is integrated in a window as of two that stop."""
+    if case.running is not None:
+        parts = case.running.parts(c)
+        if len(parts) > 1 or parts[0][1] < np.inf:
+            return Stopped([(_kept(case, row), until) for row, until in parts])
+    return _kept(case, c)
+
+
+def _kept(case: Case, c: Array) -> Adjoint:
+    made, c = case.adjoints, c + 0.0  # no -0, of which the bytes of an opposite row would be others
+    if c.tobytes() not in made:
+        opposite = made.get((0.0 - c).tobytes())
+        made[c.tobytes()] = Adjoint.of(case.motion, c) if opposite is None else opposite.reversed()
+    return made[c.tobytes()]
 
 
 def along(case: Case, window: Window, direction: Array, worst: Worst, limit: float) -> tuple[int, float]:

@@ -350,6 +350,36 @@ class Adjoint:
         return found[:, :d], found[:, d : d + q], found[:, d + q :]
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class Stopped:
+    """A sum of rows of which each stays what it was at a time of its own: at the earlier of ``t`` and that time. In the
+    place of an `Adjoint`, at single times, under disturbances that are constant on pieces."""
+
+    parts: Sequence[tuple[Adjoint, float]]
+
+    @property
+    def motion(self) -> Motion:
+        """What they share."""
+        return self.parts[0][0].motion
+
+    def at(self, times: Array) -> Enclosed:
+        """`Adjoint.at`."""
+        return _sum([row.at(np.minimum(times, until)) for row, until in self.parts])
+
+    def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
+        """`Adjoint.between`."""
+        return _sum([row.between(np.minimum(times, until), start, stop) for row, until in self.parts])
+
+
+def _sum(parts: Sequence[Enclosed]) -> Enclosed:
+    mid, rad = parts[0].mid, parts[0].rad
+    for part in parts[1:]:
+        mid = mid + part.mid
+        rad = rad + part.rad + HALF_ULP * np.abs(mid)
+    return Enclosed(mid, rad * OUTWARD)
+
+
 def _apart(times: Array, others: Array | float) -> tuple[Array, Array]:
     """Differences of times, and by how much they are rounded (Knuth 1997, section 4.2.2, theorem B)."""
     nearest = times - np.asarray(others, dtype=float)
@@ -378,13 +408,20 @@ class Worst:
     the last inputs of the ``adjoint``: constant between ``changes (M + 1,)``, or, where these are ``None``, measurable;
     the ``drives (q', L)`` between times ``grid (L + 1,)`` enter by the first."""
 
-    adjoint: Adjoint
+    adjoint: Adjoint | Stopped
     centre: Array
     begun: ConvexSet | None
     grid: Array
     drives: Enclosed
     pushed: ConvexSet | None
     changes: Array | None
+
+    @property
+    def _row(self) -> Adjoint:
+        """The one row that this is of, where it is known at all times."""
+        if isinstance(self.adjoint, Stopped):
+            raise Unchecked("a sum of rows that stop is known at single times alone")
+        return self.adjoint
 
     @property
     def _mine(self) -> slice:
@@ -485,16 +522,14 @@ class Worst:
     def _swept(self) -> tuple[Array, Array]:
         """What a measurable disturbance adds up to the end of every step, but for the middle of its set, and by how
         much it may be more, ``(N + 1,)`` each."""
-        steps = np.arange(self.adjoint.count)
+        steps = np.arange(self._row.count)
         value, more = self._part(steps, np.ones(steps.size))
-        more = more + rounding(self.adjoint.count) * np.abs(value)
+        more = more + rounding(self._row.count) * np.abs(value)
         return np.append(0.0, np.cumsum(value)), np.append(0.0, np.cumsum(more)) * OUTWARD
 
     def _part(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array]:
         """The integrals over the first ``shares (k,)`` of steps ``(k,)``, and by how much they may be more."""
-        polynomials, off = (
-            part[steps][:, :, self._mine] for part in (self.adjoint.driven.mid, self.adjoint.driven.rad)
-        )
+        polynomials, off = (part[steps][:, :, self._mine] for part in (self._row.driven.mid, self._row.driven.rad))
         moved = np.einsum("ij,kjw->kiw", CENTRED, polynomials)
         size = np.einsum("ij,kjw->kiw", np.abs(CENTRED), np.abs(polynomials)).sum(axis=1)
         lost = off.sum(axis=1) + rounding(2 * ORDER) * size
@@ -512,14 +547,14 @@ class Worst:
                 value + high,
                 more + np.maximum(over, less) + rounding(4 * ORDER) * 2.0 * np.abs(P).sum(axis=1).max(axis=1),
             )
-        half = self.adjoint.step / 2.0
+        half = self._row.step / 2.0
         return value * half, more * half * OUTWARD
 
     def _measurable(self, times: Array) -> tuple[Array, Array]:
         about, _ = self._sides
-        steps, shares = self.adjoint.placed(times)
+        steps, shares = self._row.placed(times)
         inside, more = self._part(steps, shares)
-        linear, rounded = self.adjoint.integrals(times)
+        linear, rounded = self._row.integrals(times)
         mid, off = linear.mid[:, self._mine], (linear.rad + rounded)[:, self._mine]
         top = self._swept[0][steps] + inside + mid @ about
         rad = self._swept[1][steps] + more + off @ np.abs(about)
@@ -529,7 +564,7 @@ class Worst:
     def _bent(self) -> Array:
         """On every step what, times an eighth of the square of a cell's width, the row is above its chord by,
         ``(N,)``."""
-        states, once, twice = self.adjoint.bends
+        states, once, twice = self._row.bends
         far = np.abs(self.centre) + (0.0 if self.begun is None else np.array(known(self.begun).radius))
         found = states @ far
         inputs = np.zeros(once.shape[1])
@@ -542,7 +577,7 @@ class Worst:
             else:
                 inputs[self._mine] = radius
         # of inputs on pieces, l'AF at the end of each less that at its beginning: how far it moves, and the last
-        total = self.adjoint.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
+        total = self._row.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
         return np.asarray((found + total) * OUTWARD)
 
     def over(self, start: Array, stop: Array, beside: Array | float = 0.0) -> Array:
@@ -552,16 +587,19 @@ class Worst:
         several = max(1, AT_ONCE // self.adjoint.motion.units.size)  # numbers of every state at every end are many
         parts = [self.most(ends[k : k + several])[0] for k in range(0, ends.size, several)]
         tops = np.concatenate(parts)[which]
-        left, right = (np.clip((t / self.adjoint.step).astype(int), 0, self.adjoint.count - 1) for t in (start, stop))
-        bent = np.maximum(self._bent[left], self._bent[right])
-        width = (stop - start) * OUTWARD
+        width, bent = (stop - start) * OUTWARD, np.zeros(start.size)
+        if width.any():
+            step, last = self._row.step, self._row.count - 1
+            bent = np.maximum(*(self._bent[np.clip((t / step).astype(int), 0, last)] for t in (start, stop)))
         both = tops.reshape(2, -1) + beside
         lost = 4.0 * HALF_ULP * (np.abs(both) + np.abs(beside)).max(axis=0)
         return np.asarray(both.max(axis=0) + (width**2 / 8.0 * bent + lost) * OUTWARD)
 
     def cuts(self, more: Sequence[float]) -> Array:
         """Times between which no input jumps, and ``more``; no two are farther apart than a step."""
-        parts = [np.arange(self.adjoint.count + 1) * self.adjoint.step, np.asarray(more, dtype=float)]
+        parts = [np.asarray(more, dtype=float)]
+        if isinstance(self.adjoint, Adjoint):
+            parts.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
         parts += [self.grid] if self.drives.mid.any() else []
         parts += [self.changes] if self.pushed is not None and self.changes is not None else []
         return np.unique(np.concatenate(parts))

@@ -89,27 +89,7 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The problem with a coordinate for every integral; it itself where there is none."""
     if not problem.integral:
         return problem
-    d, m = problem.system.states, problem.system.controls
-    coordinates, windows = list[Coordinate](), list[tuple[str, float, list[tuple[list[int], float, float]]]]()
-    for number, entry in enumerate(problem.integral):
-        H, G = np.reshape(np.asarray(entry.H), (-1, d)), np.reshape(np.asarray(entry.G), (-1, m))
-        late = problem.system.delay if G.any() else 0.0
-        assert entry.stop is not None
-        judged, sums = min(entry.stop + late, problem.horizon), []
-        called = entry.name or ("integral" if len(problem.integral) == 1 else f"integral[{number}]")
-        bounds = zip(np.asarray(entry.lower).tolist(), np.asarray(entry.upper).tolist(), strict=True)
-        for row, (h, g, (lower, upper)) in enumerate(zip(H, G, bounds, strict=True)):
-            name, unit = called + (f" {row + 1}" if len(H) > 1 else ""), _unit(problem.names, h, g)
-            made = [Coordinate(h, g, entry.start, entry.stop, name, unit)]
-            if g.any() and (late or problem.execution is not None):  # errors are no part of what is counted
-                both = [f"{name} of states", f"{name} of controls"] if h.any() else [name]
-                made = [Coordinate(0.0 * h, g, entry.start + late, judged, both[-1], unit)]
-                made = [Coordinate(h, 0.0 * g, entry.start, entry.stop, both[0], unit)] * (len(both) - 1) + made
-            sums.append(([d + len(coordinates) + i for i in range(len(made))], lower, upper))
-            coordinates += made
-        windows.append((called, judged, sums))
-    if not problem.system.switches and not any(one.begin > 0.0 for one in coordinates):
-        coordinates = [replace(one, end=problem.horizon) for one in coordinates]  # a system without pieces stays so
+    d, (coordinates, windows) = problem.system.states, _coordinates(problem)
     size = d + len(coordinates)
     measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
     return replace(
@@ -133,6 +113,75 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
         commanded=tuple(d + i for i, one in enumerate(coordinates) if one.g.any() and problem.execution is not None),
         measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, size - d)))),
     )
+
+
+def _coordinates(
+    problem: OptimalControlProblem,
+) -> tuple[list[Coordinate], list[tuple[str, float, list[tuple[list[int], float, float]]]]]:
+    """The coordinates of all integrals; and what each is called, when it is judged, and of every row which coordinates
+    are added up, between which bounds."""
+    d, m = problem.system.states, problem.system.controls
+    coordinates, windows = list[Coordinate](), list[tuple[str, float, list[tuple[list[int], float, float]]]]()
+    for number, entry in enumerate(problem.integral):
+        H, G = np.reshape(np.asarray(entry.H), (-1, d)), np.reshape(np.asarray(entry.G), (-1, m))
+        late = problem.system.delay if G.any() else 0.0
+        assert entry.stop is not None
+        judged, sums = min(entry.stop + late, problem.horizon), []
+        called = entry.name or ("integral" if len(problem.integral) == 1 else f"integral[{number}]")
+        bounds = zip(np.asarray(entry.lower).tolist(), np.asarray(entry.upper).tolist(), strict=True)
+        for row, (h, g, (lower, upper)) in enumerate(zip(H, G, bounds, strict=True)):
+            name, unit = called + (f" {row + 1}" if len(H) > 1 else ""), _unit(problem.names, h, g)
+            made = [Coordinate(h, g, entry.start, entry.stop, name, unit)]
+            if g.any() and (late or problem.execution is not None):  # errors are no part of what is counted
+                both = [f"{name} of states", f"{name} of controls"] if h.any() else [name]
+                made = [Coordinate(0.0 * h, g, entry.start + late, judged, both[-1], unit)]
+                made = [Coordinate(h, 0.0 * g, entry.start, entry.stop, both[0], unit)] * (len(both) - 1) + made
+            sums.append(([d + len(coordinates) + i for i in range(len(made))], lower, upper))
+            coordinates += made
+        windows.append((called, judged, sums))
+    if not problem.system.switches and not any(one.begin > 0.0 for one in coordinates):
+        coordinates = [replace(one, end=problem.horizon) for one in coordinates]  # a system without pieces stays so
+    return coordinates, windows
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Running:
+    """What a problem with integrals is of where nothing changes with time but what is integrated: the ``system`` whose
+    coordinates are integrated all along. What is integrated from ``begins (k,)`` to ``ends (k,)`` is what has been
+    until the end, less what had been at the beginning."""
+
+    system: LinearSystem
+    begins: Array
+    ends: Array
+
+    @staticmethod
+    def of(problem: OptimalControlProblem) -> Running | None:
+        """That of a problem as it is stated, of which one known system acts; ``None`` for others."""
+        system = problem.system
+        if not problem.integral or not isinstance(system, LinearSystem) or system.parameters is not None:
+            return None
+        coordinates, _ = _coordinates(problem)
+        whole = _with(system, [(one.h, one.g) for one in coordinates])
+        ends = np.array([[one.begin, one.end] for one in coordinates])
+        return Running(replace(whole, delay=system.delay), *ends.T)
+
+    def is_beside(self, mode: LinearSystem, d: int) -> bool:
+        """Whether a mode is the same of the first ``d`` states, whatever is integrated beside them."""
+        pairs = [(getattr(mode, name), getattr(self.system, name)) for name in ("A", "B", "E", "c")]
+        if mode.parameters is not None or any((one is None) != (other is None) for one, other in pairs):
+            return False
+        return all(one is None or np.array_equal(np.asarray(one)[:d], np.asarray(other)[:d]) for one, other in pairs)
+
+    def parts(self, c: Array) -> list[tuple[Array, float]]:
+        """Rows ``(d + k,)`` of that system, and until when each goes on, that are together a row ``c (d + k,)``."""
+        d = c.size - self.begins.size
+        found, ends = [(np.append(c[:d], np.zeros(self.begins.size)), np.inf)], np.stack([self.begins, self.ends])
+        for begin, end in np.unique(ends[:, c[d:] != 0.0], axis=1).T.tolist():
+            mine = (self.begins == begin) & (self.ends == end)
+            row = np.append(np.zeros(d), np.where(mine, c[d:], 0.0))
+            found += [(row, end)] + ([(-row, begin)] if begin > 0.0 else [])
+        return [(row, until) for row, until in found if row.any()] or found[:1]
 
 
 def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> System:

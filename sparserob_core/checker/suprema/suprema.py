@@ -23,7 +23,6 @@ from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.sides import Bounded, Sides
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.disturbances import columns_of
-from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array
 
@@ -164,7 +163,7 @@ def _followed(case: Case, asked: Asked) -> Worst | None:
     system = case.problem.system
     if case.problem.execution is not None and case.theta.any():
         return None
-    if not isinstance(system, LinearSystem) or system.parameter_count or not case.alike:
+    if case.still is None or system.parameter_count or not case.alike:
         return None
     return followed(case, asked.window.split(asked.direction)[0])
 

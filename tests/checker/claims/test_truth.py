@@ -19,6 +19,7 @@ from sparserob_core.checker.claims.duality import Duality, Row
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.flow import held
 from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.sets.sets import Box
 from tests.support.worst_cases import (
     BEFORE,
@@ -181,6 +182,32 @@ def test_a_violation_along_rows_is_the_one_of_the_tube(which: str, monkeypatch: 
                 found.append(over)
                 assert slack < 1e-7
             assert found[1] == pytest.approx(found[0], abs=1e-12)
+
+
+def test_an_integral_that_begins_later_is_the_one_of_pieces_where_rows_are_followed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of its worst case, of that from one state, and of what multipliers speak of."""
+    made = replace(kind("known"), begun=Box([-0.1, -0.05], [0.15, 0.1]))
+    rows = {"H": [[1.0, -0.5], [0.3, 0.0]], "G": [[0.2, -0.1], [0.0, 0.0]]}
+    entries = [IntegralConstraint(**rows, upper=[1.0, 2.0], lower=[-1.0, -np.inf], start=0.4, stop=1.3)]
+    case = made.case(path=[], integral=entries)
+    (window,), found = case.windows, list[list[float]]()
+    said = {"constraint": window.name, "time": window.start, "violation": 0.0}
+    c, begun = np.array([0.3, -0.1, 1.0, -2.0]), np.append(np.array(START) + np.array([0.1, -0.05]), [0.0, 0.0])
+    for followed in (100, 1):
+        monkeypatch.setattr(constraints, "FOLLOWED", followed)
+        assert constraints.follows(case) == (followed == 1)
+        numbers = [x for state in (None, begun) for x in replay.exceeded(case, said, state)[0]]
+        derive = multipliers._along_adjoint if followed == 1 else _by_duality
+        row = derive(case, c, window.start, arb(0.25))
+        found.append(numbers + [float(x.mid()) for part in ([row.constant], *row.slope) for x in part])
+    assert found[1] == pytest.approx(found[0], abs=1e-12)
+    assert len(set(np.round(found[0], 6))) > 6  # of other states, rows and pieces others
+
+
+def _by_duality(case: Any, c: np.ndarray, time: float, limit: Any) -> Any:
+    return case.duality.row(c, time, [], limit)
 
 
 @pytest.mark.parametrize("time", [0.0, 1e-3, 0.7, 30.0])
