@@ -111,7 +111,8 @@ class Discs:
         return found if power >= 0 else found.reciprocal()
 
     def __rpow__(self, other: object) -> Discs:
-        return (self * float(np.log(float(other)))).exp()  # type: ignore[arg-type]  # a number
+        found: Discs = (self * np.log(np.asarray(other, dtype=float))).exp()
+        return found
 
     __radd__, __rmul__ = __add__, __mul__
 
