@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.checker.reach.varying import spread as checked
 from sparserob_core.control.problem.expression import kepler
+from sparserob_core.control.response.varying import spread as parts
 from sparserob_core.control.studies.initial_states import InitialPlane
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
@@ -82,10 +84,22 @@ INSIDE["problem"] = {
     "terminal": [{"box": [0.35]}],
 }
 INSIDE["dictionaries"]["control"]["pieces"] = 5
+TWO: Config = copy.deepcopy(DECAY)  # parameters in A
+TWO["problem"]["system"] = {
+    "A": [["-0.5 - p*sin(2*t) - q*t + p*q"]],
+    "B": [["1 + p^2"]],
+    "E": [[1]],
+    "parameters": {"p": [-0.05, 0.08], "q": [-0.02, 0.02]},
+}
+TWO["problem"]["path"], TWO["problem"]["terminal"] = [{"box": [0.45], "from": 1.2}], [{"box": [0.15]}]
 """A state at one parameter is ``x(t) = int exp(a(t) - a(s)) (...) ds``: what of that each of the two has."""
-CLOSED: dict[str, tuple[Callable[[np.ndarray, float], np.ndarray], Callable[[float], float]]] = {
+CLOSED: dict[str, tuple[Callable[..., np.ndarray], Callable[..., float]]] = {
     "decay": (lambda t, p: -t / 2 - p * (1 - np.cos(2 * t)) / 2, lambda p: 1 + p * p),
     "inside": (lambda t, p: 0.3 * t - 2 * p * p * t + 0.2 * (1 - np.cos(t)), lambda p: 1 + p),
+    "two": (
+        lambda t, p, q: -t / 2 - p * (1 - np.cos(2 * t)) / 2 - q * t**2 / 2 + p * q * t,
+        lambda p, q: 1 + p * p,
+    ),
 }
 
 
@@ -98,8 +112,9 @@ def least(config: Config, closed: str, places: int = 61) -> float:
     marks = np.linspace(0.0, horizon, N * fine + 1)
     middles, width = (marks[:-1] + marks[1:]) / 2, horizon / (N * fine)
     rows, limits = [], []
-    for p in np.linspace(*problem["system"]["parameters"]["p"], places).tolist():
-        a, inside = (rate(one, p) for one in (marks, middles))
+    intervals = problem["system"]["parameters"].values()
+    for at in product(*(np.linspace(*ends, places).tolist() for ends in intervals)):
+        a, inside = (rate(one, *at) for one in (marks, middles))
         for k, t in enumerate(marks.tolist()):
             if t < most.get("from", 0.0) - 1e-9 or (k % 10 and k < marks.size - 1):
                 continue
@@ -107,7 +122,7 @@ def least(config: Config, closed: str, places: int = 61) -> float:
             limit = (held if k == marks.size - 1 else most)["box"][0]
             begun = problem["initial_state"][0] * float(np.exp(a[k]))
             for sign in (1.0, -1.0):
-                rows.append(sign * gain(p) * gains)
+                rows.append(sign * gain(*at) * gains)
                 limits.append(limit - noise * gains.sum() - sign * begun)
     G = np.array(rows)
     bound = problem["control"]["box"]
@@ -134,6 +149,17 @@ def test_a_parameter_that_is_worst_inside_its_interval_is_found(tmp_path: Path) 
     assert outcome.result.status == "certified"
     assert outcome.result.cost == pytest.approx(least(INSIDE, "inside"), rel=1e-4)
     assert least(INSIDE, "inside", 2) < 0.999 * outcome.result.cost  # than at the ends of its interval
+
+
+@pytest.mark.slow
+def test_two_parameters_in_the_plant_cost_what_their_closed_form_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for one in (parts, checked):  # so few numbers that their box is in parts, for the method and for the checker
+        monkeypatch.setattr(one, "LEFT", ((1e-12, 55),))
+    outcome = solved(TWO, tmp_path / "run")
+    assert outcome.result.status == "certified"
+    assert outcome.result.cost == pytest.approx(least(TWO, "two", 5), rel=1e-4)
 
 
 SPRING: Config = {
@@ -361,7 +387,7 @@ def test_what_is_not_built_beside_them_is_refused_by_name(problem: Config, said:
 
 
 def test_a_box_over_which_no_expansion_reaches_is_refused() -> None:
-    system = {"A": [["-0.5 - p*sin(2*t) + q"]], "B": [[1]], "parameters": {"p": [-30, 60], "q": [-1, 1]}}
+    system = {"A": [["-0.5 - p*sin(2*t) + q"]], "B": [[1]], "parameters": {"p": [-3000, 6000], "q": [-1, 1]}}
     with pytest.raises(sr.InputError, match=r"system\.parameters: .*expansion"):
         assemble(load_config(changed(system=system, disturbance=None)))
 

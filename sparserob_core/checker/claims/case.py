@@ -30,6 +30,7 @@ from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates
 from sparserob_core.checker.reach.varying.turns import in_turns
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -284,11 +285,27 @@ class Case:
         """`varying`; ``None`` where the system does not change with time."""
         return self.varying if isinstance(self.problem.system, VaryingSystem) else None
 
+    def parts_of(self, box: Corners) -> list[tuple[Corners, list[float]]]:
+        """A box of parameters in parts over each of which the state is followed as a whole, and when the system becomes
+        another polynomial of the time there."""
+        if isinstance(self.changing, SpreadFlow):
+            return [(part, flow.ends[:-1]) for part, flow in self.changing.parted(box)]
+        return [(box, [] if self.changing is None else self.changing.ends[:-1])]
+
+    def spread(self, box: Corners) -> SpreadStates:
+        """All coefficients of the states over the part that holds a box of the parameters of a system that changes with
+        time."""
+        assert isinstance(self.changing, SpreadFlow)
+        for part, flow in self.changing.parted(box):
+            if part == box:
+                if flow not in self._spread:
+                    self._spread[flow] = SpreadStates(flow, self.scene)
+                return self._spread[flow]
+        raise Unchecked("a box of parameters lies in two parts")
+
     @cached_property
-    def spread(self) -> SpreadStates:
-        """All coefficients of the states over the parameters of a system that changes with time."""
-        assert isinstance(self.varying, SpreadFlow)
-        return SpreadStates(self.varying, self.scene)
+    def _spread(self) -> dict[SpreadFlow, SpreadStates]:
+        return {}
 
     @cached_property
     def acting(self) -> list[float]:

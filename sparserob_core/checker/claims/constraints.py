@@ -301,9 +301,6 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
     those with the same parameters and directions together, their times cut wherever anything turns or jumps."""
     nu, units = case.problem.system.parameter_count, case.units(window)
     basis, gains, flat = _facets(window, units)
-    ends = [] if case.changing is None else case.changing.ends[:-1]
-    cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist()), *ends})
-    grid, every = np.array(case.grid), np.array(cuts)
     curved = None if flat is not None else Curved(window.seen, normals, units.sums)
     pairs = case.clock.each(zip(lower, upper, strict=True))
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in pairs]
@@ -313,10 +310,22 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
         case.clock.check()
         sides = Sides.cell(curved, np.array(a[nu:]), np.array(b[nu:])) if curved is not None else flat
         assert sides is not None
-        parts = (cut(grid, every, float(lower[i, 0]), float(upper[i, 0])) for i in case.clock.each(members))
-        intervals = [part for found in parts for part in found]
-        work.append(((a[:nu], b[:nu]), sides, intervals))
+        times = [(float(lower[i, 0]), float(upper[i, 0])) for i in case.clock.each(members)]
+        work += [(box, sides, intervals) for box, intervals in divided(case, window, (a[:nu], b[:nu]), times)]
     return normals if curved is not None else basis, gains, work
+
+
+def divided(
+    case: Case, window: Window, box: Corners, times: Sequence[tuple[float, float]]
+) -> list[tuple[Corners, list[Interval]]]:
+    """A box of parameters in the parts over which the state is followed, and for each the ``times``, cut wherever
+    anything turns or jumps."""
+    found, always = list[tuple[Corners, list[Interval]]](), window.cuts(case.control.breakpoints.tolist())
+    for part, ends in case.parts_of(box):
+        every = np.array(sorted({*case.grid, *always, *ends}))
+        parts = (cut(np.array(case.grid), every, start, stop) for start, stop in times)
+        found.append((part, [one for several in parts for one in several]))
+    return found
 
 
 def _facets(window: Window, units: RowUnits) -> tuple[Array, Array, Sides | None]:
@@ -346,8 +355,7 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
         loop_tube = LoopTube(answers_of(case).loop, basis, gains)
         return lambda _: loop_tube
     if isinstance(case.changing, SpreadFlow):
-        states = case.spread
-        return lru_cache(maxsize=TUBES_KEPT)(lambda box: SpreadTube(states, basis, box))
+        return lru_cache(maxsize=TUBES_KEPT)(lambda box: SpreadTube(case.spread(box), basis, box))
     if case.changing is not None:
         known_tube = VaryingTube(case.changing, case.scene, basis)
         return lambda _: known_tube

@@ -13,7 +13,7 @@ from sparserob_core.checker.arithmetic.balls import above, balls, below
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.cells import Work, prove
 from sparserob_core.checker.claims.claims import judged, precision_of
-from sparserob_core.checker.claims.constraints import along, beside, covered, cut, followed, parameters_of, tubes
+from sparserob_core.checker.claims.constraints import along, beside, covered, divided, followed, parameters_of, tubes
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
@@ -254,10 +254,9 @@ def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
     ends = ([], []) if box is None else (box.lower.tolist(), box.upper.tolist())
     lower, upper = (np.array([[t, *p]]) for t, p in zip((window.start, window.stop), ends, strict=True))
     covered(case, alone, lower, upper)
-    segments = [] if case.changing is None else case.changing.ends[:-1]
-    cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist()), *segments})
-    times = cut(np.array(case.grid), np.array(cuts), window.start, window.stop)
-    work: Sequence[Work] = [((tuple(ends[0]), tuple(ends[1])), Sides([bounded]), times)]
+    whole = tuple(ends[0]), tuple(ends[1])
+    parts = divided(case, window, whole, [(window.start, window.stop)])
+    work: Sequence[Work] = [(part, Sides([bounded]), times) for part, times in parts]
     shown = prove(
         tubes(case, basis, gains, lower, upper), parameters_of(case), work, case.clock, case.beside(alone, basis, gains)
     )

@@ -377,15 +377,14 @@ class FlatConstraint(StateConstraint):
     @property
     @shaped
     def cells(self) -> tuple[Float[Array, "k j"], Float[Array, "k j"]]:
-        """The window cut wherever anything turns or jumps, times the whole box of parameters: ``(lower, upper)``,
-        ``(k, 1 + nu)`` each."""
+        """The window cut wherever anything turns or jumps, times the box of parameters, or each of its parts: ``(lower,
+        upper)``, ``(k, 1 + nu)`` each."""
         points = self.samples.apart(np.concatenate([[self.start], self.samples.cuts, [self.stop]]))
         starts, stops = (points[:-1], points[1:]) if points.size > 1 else (points, points)
-        box = self.index_set
-        return (
-            np.hstack([starts[:, None], np.tile(box.lower[1:], (starts.size, 1))]),
-            np.hstack([stops[:, None], np.tile(box.upper[1:], (starts.size, 1))]),
-        )
+        box, parts = self.index_set, self.functionals.response.propagator.parts
+        lower = np.hstack([starts[:, None], np.tile(box.lower[1:], (starts.size, 1))])
+        upper = np.hstack([stops[:, None], np.tile(box.upper[1:], (starts.size, 1))])
+        return (lower, upper) if parts is None else parts.cut(lower, upper)
 
     @shaped
     def enclosure(self, x: Float[Array, " n"], lower: Float[Array, "k j"], upper: Float[Array, "k j"]) -> Enclosure:

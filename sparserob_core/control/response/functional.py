@@ -467,9 +467,12 @@ class WorstCase:
         if key not in self._legs:
             cell = (low + high) / 2, (high - low) / 2
             legs: tuple[Leg, ...]
-            if self._truncation is not None:
-                spread, motion = self._truncation.spread, self._truncation.motion
-                legs = (SpreadMotion(motion, spread, self._truncation, low, high),)
+            if response.propagator.parts is not None:
+                part = response.propagator.parts.holding(low, high)
+                if part is None:
+                    raise NotEnclosable("a cell of parameters lies in two parts of their box")
+                truncation = self._truncations[part]
+                legs = (SpreadMotion(truncation.motion, truncation.spread, truncation, low, high),)
             elif response.grid.varying:
                 legs = (VaryingMotion(response.propagator, response.initial_state),)
             else:
@@ -478,18 +481,18 @@ class WorstCase:
         return self._legs[key]
 
     @cached_property
-    def _truncation(self) -> Truncation | None:
-        """What an expansion in the parameters leaves out, where there is one."""
-        if self.response.propagator.spread is None:
-            return None
-        spread, every = self.response.propagator.spread
-        begun = np.append(self.response.initial_state, np.zeros(spread.states - spread.d))
-        return Truncation(VaryingMotion(every, begun), spread)
+    def _truncations(self) -> tuple[Truncation, ...]:
+        """What an expansion in the parameters leaves out, on each of their parts."""
+        found = []
+        for spread, every in self.response.propagator.spread:
+            begun = np.append(self.response.initial_state, np.zeros(spread.states - spread.d))
+            found.append(Truncation(VaryingMotion(every, begun), spread))
+        return tuple(found)
 
     def beyond(self, far: Array) -> Array:
         """What an expansion in the parameters leaves out of any state, ``(d,)``, of a control that goes as ``far (m,)``
         as it may; nothing where there is none."""
-        if self._truncation is None:
+        if not self._truncations:
             return np.zeros(self.response.initial_state.size)
         axes, model, begun = (
             np.eye(self.response.initial_state.size),
@@ -503,7 +506,8 @@ class WorstCase:
             pushed = model.bound.reach(np.eye(model.channels))
         known = np.abs(self.known).max(axis=1)
         acting = np.concatenate([np.maximum(far, known[: far.size]), known[far.size :]])
-        return self._truncation.at_most(begun, np.concatenate([acting, pushed]))
+        inputs = np.concatenate([acting, pushed])
+        return np.asarray(np.max([one.at_most(begun, inputs) for one in self._truncations], axis=0))
 
     @cached_property
     def _frozen(self) -> dict[bytes, LiftedSystem]:

@@ -22,7 +22,7 @@ from sparserob_core.control.enclosures.flows import FEW_STATES, Exponentials, Le
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transitions
 from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
-from sparserob_core.control.response.varying.spread import expanded
+from sparserob_core.control.response.varying.spread import Parts, expanded
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -197,6 +197,12 @@ def merge_grids(
     acting, pushing = np.searchsorted(begin, middles) - 1, np.searchsorted(disturbance, middles) - 1
     mode = np.searchsorted(switches, middles) if switches else np.arange(middles.size) if varying else None
     return TimeGrid(points, acting, pushing, before if delay > 0.0 else None, constants, mode, varying=varying)
+
+
+def _joined_parts(found: Sequence[tuple[np.ndarray, Sequence[Array]]]) -> list[Array]:
+    """Tables that were made of some of all indices each, ``(numbers (k,), tables)``, as those of all of them."""
+    order = np.argsort(np.concatenate([numbers for numbers, _ in found]))
+    return [np.concatenate(one)[order] for one in zip(*(tables for _, tables in found), strict=True)]
 
 
 def _joined(points: Array, others: Array) -> Array:
@@ -394,20 +400,33 @@ class Propagator:
         return modes
 
     @cached_property
-    def spread(self) -> tuple[Spread, Propagator] | None:
-        """Of a system that changes with time and whose state is no affine function of its parameters, how it is
-        expanded in them, and what all coefficients do."""
+    def parts(self) -> Parts | None:
+        """Of a system that changes with time and whose state is no affine function of its parameters, the parts of
+        their box, on each of which it is expanded."""
         if not isinstance(self.system, VaryingSystem) or self.system.powers is None:
             return None
-        how, every = expanded(self.system)
-        return how, Propagator(every, self.grid)
+        return expanded(self.system)
+
+    @cached_property
+    def spread(self) -> tuple[tuple[Spread, Propagator], ...]:
+        """How the state is expanded on each of the `parts`, and what all coefficients do; nothing where there are
+        none."""
+        every = () if self.parts is None else self.parts.every
+        return tuple((how, Propagator(system, self.grid)) for how, system in every)
+
+    def by_part(self, parameters: Array) -> list[tuple[np.ndarray, Spread, Propagator]]:
+        """Of parameters ``(k, nu)`` the numbers of those in every part, how it is expanded, and what all coefficients
+        do; parts that have none are left out."""
+        assert self.parts is not None
+        which = self.parts.of(parameters)
+        return [(np.flatnonzero(which == part), *self.spread[part]) for part in np.unique(which).tolist()]
 
     @shaped
     def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
-        """Matrices and whole-piece transitions at parameters ``(v, nu)``, of all coefficients where there is a
-        `spread`; remembered for the last few calls."""
-        if self.spread is not None:
-            return self.spread[1].steps(np.zeros((1, 0)))
+        """Matrices and whole-piece transitions at parameters ``(v, nu)``, of all coefficients on the first of the
+        `parts` where there are any; remembered for the last few calls."""
+        if self.spread:
+            return self.spread[0][1].steps(np.zeros((1, 0)))
         # no parameters: any number of rows has the same bytes
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
         if key not in self._steps and self.expansion is not None:
@@ -487,17 +506,25 @@ class Propagator:
         these that is a breakpoint but for rounding counts as that, unless another law takes over there: then what
         moves the state jumps, however near a breakpoint is."""
         breaks = self.grid.breakpoints
+        if self.spread:
+            return np.unique(np.concatenate([every.marks for _, every in self.spread]))
         if self.expansion is None:
             return breaks
         return np.union1d(_joined(breaks, self.expansion.ends[1:-1]), self.expansion.ends[list(self.expansion.turns)])
 
     @cached_property
     def expansion(self) -> Expansion | None:
-        """The system as polynomials in time, where it changes with time; that of all coefficients where there is a
-        `spread`."""
-        if self.spread is not None:
-            return self.spread[1].expansion
+        """The system as polynomials in time, where it changes with time; that of all coefficients on the first of the
+        `parts` where there are any."""
+        if self.spread:
+            return self.spread[0][1].expansion
         return Expansion.of(self.system) if isinstance(self.system, VaryingSystem) else None
+
+    @property
+    def slack(self) -> float:
+        """`Expansion.slack` of a system that changes with time, the largest one of all parts."""
+        every = [one.expansion for _, one in self.spread] or [self.expansion]
+        return max(0.0 if one is None else one.slack for one in every)
 
     def _varying_steps(self, expansion: Expansion) -> Steps:
         """Steps of a system that changes with time, whose pieces are modes: ``Gamma`` is the length of a piece, and
@@ -538,12 +565,16 @@ class Propagator:
 
         ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)`` give ``free (k, d) = e^{A't} c``,
         ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, J m)``,
-        ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`). Where there is a
-        `spread` they are on all coefficients.
+        ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`). Where there are
+        `parts` they are on all coefficients.
         """
-        if self.spread is not None:
-            how, every = self.spread
-            return every.adjoint(times, how.directions(directions, parameters), np.zeros((times.size, 0)))
+        if self.spread:
+            none, found = np.zeros((times.size, 0)), []
+            for here, how, every in self.by_part(parameters):
+                rows = how.directions(directions[here], parameters[here])
+                found.append((here, every.adjoint(times[here], rows, none[here])))
+            free, gains, B, E = _joined_parts(found)
+            return free, gains, B, E
         if self.expansion is not None:
             return self._varying_adjoint(self.expansion, times, directions)
         if self.aged(parameters.shape[1]):
@@ -559,10 +590,13 @@ class Propagator:
     ) -> Weights:
         """The functional ``c'x(t)`` of each index as weights on what is given and on inputs: `adjoint` and
         `TimeGrid.through`, without ``(k, L, d)`` numbers."""
-        if self.spread is not None:
-            how, every = self.spread
-            found = every.weights(times, how.directions(directions, parameters), np.zeros((times.size, 0)))
-            return found._replace(free=found.free[:, : how.d])  # at the beginning nothing depends on parameters
+        if self.spread:
+            none, found = np.zeros((times.size, 0)), []
+            for here, how, every in self.by_part(parameters):
+                one = every.weights(times[here], how.directions(directions[here], parameters[here]), none[here])
+                # at the beginning nothing depends on parameters
+                found.append((here, one._replace(free=one.free[:, : how.d])))
+            return Weights(*_joined_parts(found))
         if self.expansion is not None:
             return self._varying_weights(self.expansion, times, directions)
         if self.aged(parameters.shape[1]):
@@ -841,9 +875,9 @@ class Outputs:
 
     def at(self, response: Response, control: Array) -> Array:
         """``(v, r, T)`` from the initial state of a response, under a control ``(m, K)`` on its own pieces."""
-        steps, grid = self.propagator.steps(self.points), self.propagator.grid
-        if self.propagator.spread is not None:
+        if self.propagator.spread:
             return self._spread(response, control)
+        steps, grid = self.propagator.steps(self.points), self.propagator.grid
         if self.propagator.aged(self.points.shape[1]) and self.propagator.block(steps) > 1:
             return self._in_blocks(response.initial_state, grid.inputs(control))[None]
         if self._over_pieces is not None:
@@ -862,15 +896,16 @@ class Outputs:
 
     def _spread(self, response: Response, control: Array) -> Array:
         """`at` of a system whose state is a polynomial in its parameters: of all coefficients, which are seen then."""
-        assert self.propagator.spread is not None
-        how, every = self.propagator.spread
-        axes, none = np.eye(how.states), np.zeros((1, 0))
-        if not self._axes:
-            self._axes.append(Outputs(every, axes, self.times, none))
-        begun = np.append(response.initial_state, np.zeros(how.states - how.d))
-        states = self._axes[0].at(Response(every.system, every.grid, begun, shared=every), control)[0].T
-        at = how.seen(np.broadcast_to(states, (len(self.points), *states.shape)), self.points)
-        return np.asarray(np.einsum("ri,vti->vrt", self.H, at))
+        found = np.empty((len(self.points), self.H.shape[0], self.times.size))
+        for number, (here, how, every) in enumerate(self.propagator.by_part(self.points)):
+            if len(self._axes) <= number:
+                self._axes.append(Outputs(every, np.eye(how.states), self.times, np.zeros((1, 0))))
+            begun = np.append(response.initial_state, np.zeros(how.states - how.d))
+            whole = Response(every.system, every.grid, begun, shared=every)
+            states = self._axes[number].at(whole, control)[0].T
+            at = how.seen(np.broadcast_to(states, (here.size, *states.shape)), self.points[here])
+            found[here] = np.einsum("ri,vti->vrt", self.H, at)
+        return found
 
     def _in_blocks(self, initial_state: Array, inputs: Array) -> Array:
         """``(r, T)`` from inputs ``(m, L)``."""
@@ -979,8 +1014,8 @@ class Response:
     def numbers(self, parameters: int) -> int:
         """How many numbers `weights` of one index make at once, with so many ``parameters``."""
         system, grid = self.system, self.grid
-        if self.propagator.spread is not None:
-            return int(grid.pieces * self.propagator.spread[0].states)
+        if self.propagator.spread:
+            return int(grid.pieces * self.propagator.spread[0][0].states)
         width = system.states if parameters else system.controls + system.disturbances
         return int(grid.pieces * width)
 
@@ -1026,7 +1061,7 @@ class Response:
         disturbances), ``disturbance (v, mw, M)`` on the disturbance's pieces or ``None``, ``deviations (v, d)`` of the
         initial state.
         """
-        if self.propagator.spread is not None:
+        if self.propagator.spread:
             return self._spread_states(control, parameters, disturbance, deviations)
         steps = self.steps(parameters)
         count = max(part.shape[0] for part in (parameters, disturbance, deviations) if part is not None)
@@ -1061,15 +1096,17 @@ class Response:
         self, control: Array, parameters: Array, disturbance: Array | None, deviations: Array | None
     ) -> Array:
         """`states` of a system whose state is a polynomial in its parameters."""
-        assert self.propagator.spread is not None
-        how, every = self.propagator.spread
-        more = np.zeros(how.states - how.d)
-        begun = Response(every.system, every.grid, np.append(self.initial_state, more), shared=every)
-        off = None if deviations is None else np.hstack([deviations, np.zeros((len(deviations), more.size))])
-        found = begun.states(control, np.zeros((1, 0)), disturbance, off)
-        count = max(len(found), len(parameters))
-        each = np.broadcast_to(parameters, (count, parameters.shape[1]))
-        return how.seen(np.broadcast_to(found, (count, *found.shape[1:])), each)
+        count = max(part.shape[0] for part in (parameters, disturbance, deviations) if part is not None)
+        each, states = np.broadcast_to(parameters, (count, parameters.shape[1])), []
+        for here, how, every in self.propagator.by_part(each):
+            more = np.zeros(how.states - how.d)
+            begun = Response(every.system, every.grid, np.append(self.initial_state, more), shared=every)
+            given = (None if one is None else one if len(one) == 1 else one[here] for one in (disturbance, deviations))
+            pushed, off = given
+            off = None if off is None else np.hstack([off, np.zeros((len(off), more.size))])
+            found = begun.states(control, np.zeros((1, 0)), pushed, off)
+            states.append((here, (how.seen(np.broadcast_to(found, (here.size, *found.shape[1:])), each[here]),)))
+        return _joined_parts(states)[0]
 
     def nodes(self, control: Array, parameters: Array) -> Array:
         """`states` without a disturbance, remembered for the last control, since all constraints ask for them."""

@@ -93,7 +93,7 @@ def walk(
 def _motion(response: Response, parameters: Array) -> Motion:
     """The way to follow a system that takes the least: ``parameters (n, nu)`` are those of the trajectories."""
     grid, system = response.grid, response.system
-    if response.propagator.spread is not None:
+    if response.propagator.spread:
         return _InParameters(response, parameters)
     if grid.varying:
         return _InTime(response)
@@ -177,23 +177,32 @@ class _InTime:
 
 
 class _InParameters:
-    """A system that changes with time and whose state is a polynomial in its parameters: all coefficients."""
+    """A system that changes with time and whose state is a polynomial in its parameters, on parts of their box: all
+    coefficients, of each trajectory those of its part."""
 
     def __init__(self, response: Response, parameters: Array) -> None:
-        assert response.propagator.spread is not None
-        self.spread, every = response.propagator.spread
-        self.parameters, begun = parameters, np.zeros(self.spread.states)
-        self.motion = _InTime(Response(every.system, every.grid, begun, shared=every))
+        self.parameters, self.parts = parameters, response.propagator.by_part(parameters)
+        self.motions = [
+            _InTime(Response(every.system, every.grid, np.zeros(how.states), shared=every))
+            for _, how, every in self.parts
+        ]
+        self.more = self.parts[0][1].states - self.parts[0][1].d
 
     def enter(self, states: Array) -> Array:
-        more = np.zeros((self.spread.states - self.spread.d, len(states)))
-        return np.vstack([states.T, more])
+        return np.vstack([states.T, np.zeros((self.more, len(states)))])
 
     def leave(self, state: Array) -> Array:
-        return self.spread.seen(state.T, self.parameters).T
+        found = np.empty((state.shape[0] - self.more, state.shape[1]))
+        for here, how, _ in self.parts:
+            found[:, here] = how.seen(state[:, here].T, self.parameters[here]).T
+        return found
 
     def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
-        return self.motion.step(piece, state, control, disturbance)
+        found = np.empty(state.shape)
+        for (here, _, _), motion in zip(self.parts, self.motions, strict=True):
+            mine = (one if one.shape[1] == 1 else one[:, here] for one in (control, disturbance))
+            found[:, here] = motion.step(piece, state[:, here], *mine)
+        return found
 
 
 def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:

@@ -53,9 +53,8 @@ def _moving(model: Transcription) -> float:
     else a rounding for every time in which the system moves by its size, since those over a long time are squares of
     those over a short one (Moler and Van Loan 2003, method 3). Those of a known one are rounded once, but what rows go
     through after may cancel as much."""
-    expansion = model.response.propagator.expansion
-    if expansion is not None:
-        return expansion.slack
+    if model.response.propagator.expansion is not None:
+        return model.response.propagator.slack
     middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
     fastest = max(pace(mode.matrices(middle[None])[0][0]) for mode in model.response.system.modes)
     return EPSILON * fastest * model.problem.horizon

@@ -13,8 +13,8 @@ import sparserob_core as sr
 from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.response.response import Propagator, merge_grids
+from sparserob_core.control.response.varying import spread as expansions
 from sparserob_core.control.response.varying.discs import cauchy
-from sparserob_core.control.response.varying.spread import tails
 from sparserob_core.control.response.varying_motion import Truncation, VaryingMotion
 from sparserob_core.control.transcription.transcribe import prepare
 
@@ -44,9 +44,14 @@ def test_what_is_beyond_a_degree_is_bounded_and_not_by_far_more_than_it_is(degre
 
 
 @pytest.mark.slow
-def test_bounds_on_cells_hold_what_the_closed_form_gives_there() -> None:
+@pytest.mark.parametrize("most", [64, 9])
+def test_bounds_on_cells_hold_what_the_closed_form_gives_there(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    system = SYSTEM
+    if most < 64:  # so few numbers that the box is in parts
+        system = replace(SYSTEM)
+        monkeypatch.setattr(expansions, "LEFT", ((1e-10, most),))
     problem = sr.OptimalControlProblem(
-        system=SYSTEM, horizon=3.0, initial_state=[1.0], control=sr.Box([-1.0], [1.0]), path=[sr.Box([-0.5], [0.5])]
+        system=system, horizon=3.0, initial_state=[1.0], control=sr.Box([-1.0], [1.0]), path=[sr.Box([-0.5], [0.5])]
     )
     pieces = sr.Dictionary.indicators(np.linspace(0.0, 3.0, 7))
     (constraint,) = prepare(problem, pieces, pieces).constraints
@@ -57,17 +62,59 @@ def test_bounds_on_cells_hold_what_the_closed_form_gives_there() -> None:
     begun = starts + rng.uniform(0.0, 0.9, 40) * (stops - starts)
     ended = begun + rng.uniform(0.0, 1.0, 40) * (stops - begun)
     low = rng.uniform(-0.3, 0.6, 40)
-    high = low + rng.uniform(0.0, 1.0, 40) * (0.6 - low)
+    parts = expansions.expanded(system)
+    assert len(parts.every) == (1 if most == 64 else 4)
+    ends = np.array([parts.ends(part)[1][0] for part in parts.of(low[:, None])])
+    high = low + rng.uniform(0.0, 1.0, 40) * (ends - low)
     found = constraint.enclosure(nothing, np.stack([begun, low], axis=1), np.stack([ended, high], axis=1)).bounds
     t, p = (a + rng.uniform(0.0, 1.0, (200, 40)) * (b - a) for a, b in ((begun, ended), (low, high)))
     t[0], p[0], p[1] = begun, low, high
     truth = np.maximum(decay(t, p), -decay(t, p)).max(axis=0) - 0.5
     assert (truth <= found + 1e-14).all()
     assert np.median(found - truth) < 0.05
+    response, which = constraint.functionals.response, rng.permutation(np.linspace(-0.3, 0.6, 37))
+    states = response.states(np.zeros((1, 6)), which[:, None])[:, :, 0]
+    exact = decay(response.grid.breakpoints, which[:, None])
+    assert states == pytest.approx(exact, rel=1e-8)
+    times, directions = np.repeat(3.0, 37), np.ones((37, 1))
+    assert response.weights(times, directions, which[:, None]).free[:, 0] == pytest.approx(exact[:, -1], rel=1e-8)
+    lower, upper = constraint.cells
+    assert len(lower) == (cuts.size - 1) * len(parts.every)
+    assert (upper - lower).prod(axis=1).sum() == pytest.approx(3.0 * 0.9)
+
+
+@pytest.mark.slow
+def test_cells_of_time_end_where_a_segment_of_any_part_does() -> None:
+    system = sr.VaryingSystem.of([["-1 - p*sin(2*t)"]], [[1]], 3.0, parameters=sr.Box([0.0], [24.0]), names=["p"])
+    breaks = np.linspace(0.0, 3.0, 3)
+    propagator = Propagator(system, merge_grids(breaks, breaks, varying=True))
+    every = [one.marks for _, one in propagator.spread]
+    assert len({one.size for one in every}) > 1
+    assert all(np.isin(one, propagator.marks).all() for one in every)
+
+
+PARTS = expansions.Parts((np.array([0.0, 1.0, 3.0]), np.array([-1.0, 0.0])), ((None, None),) * 2)  # type: ignore[arg-type]
+
+
+def test_every_parameter_and_every_cell_within_one_has_its_part() -> None:
+    assert PARTS.of(np.array([[0.0, -1.0], [0.9, 0.0], [1.1, -0.5], [3.0, 0.0]])).tolist() == [0, 0, 1, 1]
+    assert PARTS.holding(np.array([0.2, -1.0]), np.array([1.0, -0.5])) == 0
+    assert PARTS.holding(np.array([1.0, -1.0]), np.array([3.0, 0.0])) == 1
+    assert PARTS.holding(np.array([0.99, -1.0]), np.array([3.0, 0.0])) is None
+    assert PARTS.holding(np.array([0.0, -1.0]), np.array([1.01, 0.0])) is None
+    assert PARTS.holding(np.array([0.0, -1.01]), np.array([1.0, 0.0])) is None
+
+
+def test_cells_are_cut_where_parts_end() -> None:
+    lower, upper = PARTS.cut(np.array([[2.0, 0.0, -1.0]]), np.array([[2.0, 3.0, 0.0]]))  # one time
+    assert lower.tolist() == [[2.0, 0.0, -1.0], [2.0, 1.0, -1.0]]
+    assert upper.tolist() == [[2.0, 1.0, 0.0], [2.0, 3.0, 0.0]]
+    lower, upper = PARTS.cut(np.array([[0.0, 1.0, -1.0]]), np.array([[2.0, 3.0, 0.0]]))  # of one part
+    assert (lower.tolist(), upper.tolist()) == ([[0.0, 1.0, -1.0]], [[2.0, 3.0, 0.0]])
 
 
 def test_what_is_about_beyond_a_degree_is_the_rest_of_an_exponential() -> None:
-    found = tails(np.array([0.3, 0.5]), 4, 40)
+    found = expansions.tails(np.array([0.3, 0.5]), 4, 40)
     assert found[0] == pytest.approx(np.exp(0.8) - 1)
     assert found[2] == pytest.approx(np.exp(0.8) - 1 - 0.3 - 0.3**2 / 2 - 0.5)
 

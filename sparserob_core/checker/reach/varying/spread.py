@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from math import comb
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from sparserob_core.checker.reach.varying.flow import (
 )
 from sparserob_core.checker.reach.varying.tube import ORDER as IN_TIME
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box
@@ -52,12 +53,12 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat, arb_poly
 
-    from sparserob_core.checker.sets.parameters import Corners
-
-LEFT = ((1e-16, 160), (1e-13, 160), (1e-11, 160))
+LEFT = ((1e-16, 160), (1e-13, 160))
 """Of the state, what is to be beyond the degree, and with how many coefficients times states at most: the first that is
-reached. Norms of transitions multiply it by 1e3 and more, and walls are ridden to 1e-9. Twice as many numbers take four
-times as long."""
+reached; where none is, the box of parameters is halved. Norms of transitions multiply it by 1e3 and more, and walls are
+ridden to 1e-9. Twice as many numbers take four times as long."""
+FAR = 600.0  # exponents of what is too far in any case, whose exponential is a number
+MOST_PARTS = 64  # of a box of parameters, each with an expansion of its own
 MOST_DEGREE = 60  # of the expansion, which is that of a few states and one parameter
 MOST_TERMS = 30  # of power series of entries that are no polynomials; with q^n of them 40 take twice the time
 FURTHER = 40  # degrees beyond one, whose sum is about what is beyond: of norms of a few the rest is far less
@@ -105,6 +106,21 @@ class Segment:
     beyond: Array
 
 
+class Looks(NamedTuple):
+    """How large the numbers of a system are at some times, by which nothing is proven: ``units (d,)`` of the states, by
+    the entries of ``A`` in the middle of the box; the largest ``degree`` of an entry that is a polynomial; about the
+    integrals of the norms of all coefficients of ``A`` of the degrees from 1 on, ``paces``; what power series of inputs
+    leave beyond every degree, ``rest``; ``drives (m + mw,)``, how large inputs are; and what of these norms every
+    parameter is in, ``moved (nu,)``."""
+
+    units: Array
+    degree: int
+    paces: Array
+    rest: Array
+    drives: Array
+    moved: Array
+
+
 @final
 @dataclass(eq=False)
 class SpreadFlow:
@@ -137,10 +153,8 @@ class SpreadFlow:
         return Parts(self.system, tuple(self.system.parameters.interior_point().tolist()))
 
     @cached_property
-    def _looks(self) -> tuple[Array, int, Array, Array, Array]:
-        """Units of the states, by the entries of ``A`` in the middle of the box, ``(d,)``; the largest degree of an
-        entry that is a polynomial; about the integral of the norms of all coefficients of ``A`` of every degree from 1
-        on; what power series of inputs leave beyond every degree; and how large inputs are, ``(m + mw,)``."""
+    def _looks(self) -> Looks:
+        """How large the numbers of the system are."""
         d, horizon = self.system.states, self.system.horizon
         most = self.degrees[-1] + AHEAD if self._bent.any() else MOST_FACTORS
         every, drives, degree = np.zeros((d, d)), np.zeros(1), 0
@@ -154,19 +168,23 @@ class SpreadFlow:
                 degree = max(degree, *(len(key) for key, table in sizes.items() if table[~self._bent].any() or not key))
                 tables.append(((until - begin) / LOOKS, sizes))
         u = np.array(balanced(every, horizon, np.ones(d) / horizon))
-        paces, rates = np.zeros(most + 1), np.zeros(most + 1)
+        paces, rates, moved = np.zeros(most + 1), np.zeros(most + 1), np.zeros(len(self.parts.middle))
         inputs = np.where(drives > 0.0, drives, 1.0)
         for width, sizes in tables:
             for key, table in sizes.items():
-                paces[len(key)] += width * float((table[:, :d] * u / u[:, None]).sum(axis=1).max())
-                rates[len(key)] += width / horizon * float((table[:, d:] / inputs).max(initial=0.0))
+                size = width * float((table[:, :d] * u / u[:, None]).sum(axis=1).max())
+                pushed = width / horizon * float((table[:, d:] / inputs).max(initial=0.0)) * bool(self._bent.any())
+                paces[len(key)] += size
+                rates[len(key)] += pushed
+                for j in key:
+                    moved[j] += size + pushed
         rest = 2.0 * np.append(rates[::-1].cumsum()[::-1][1:], 0.0)
-        return u, degree, paces[1:], rest, drives
+        return Looks(u, degree, paces[1:], rest, drives, moved)
 
     @property
     def units(self) -> Array:
         """Units of the states, powers of two; any would be right."""
-        return self._looks[0]
+        return self._looks.units
 
     @cached_property
     def _bent(self) -> np.ndarray:
@@ -183,14 +201,55 @@ class SpreadFlow:
     @cached_property
     def monomials(self) -> Monomials:
         """Those of the shares; raises `Unchecked` where too many were needed."""
-        nu, (_, powers, paces, rest, _) = len(self.parts.middle), self._looks
-        beyond = self._beyond_degrees(paces)
+        found = self._few_monomials()
+        if found is None:
+            raise Unchecked("the parameters beside the time move the state further than an expansion reaches")
+        return found
+
+    def _few_monomials(self) -> Monomials | None:
+        """Those of the shares up to a degree beyond which little is; ``None`` where they are too many. What is beyond
+        grows as states do and meets states that grew, by the exponential of the norms each."""
+        nu, powers, paces, rest = len(self.parts.middle), self._looks.degree, self._looks.paces, self._looks.rest
+        beyond = self._beyond_degrees(paces) * float(np.exp(min(2.0 * paces.sum(), FAR)))
         for left, most in LEFT:
             for degree in self.degrees[max(1, powers) :]:
                 small = beyond[degree] <= left and (not self._bent.any() or (degree + 1) * rest[degree] <= left)
                 if small and self.system.states * comb(nu + degree, nu) <= most:
                     return Monomials(nu, degree)
-        raise Unchecked("the parameters beside the time move the state further than an expansion reaches")
+        return None
+
+    @cached_property
+    def divided(self) -> list[tuple[Corners, SpreadFlow]]:
+        """Parts of the box of parameters, and the flow over each: itself where its expansion reaches, else halves of
+        halves along the parameter that moves the state most."""
+        assert self.system.parameters is not None
+        box = self.system.parameters.bounding_box()
+        todo: list[tuple[Corners, SpreadFlow]] = [((tuple(box.lower.tolist()), tuple(box.upper.tolist())), self)]
+        found = list[tuple[Corners, SpreadFlow]]()
+        while todo:
+            (low, high), flow = todo.pop()
+            if flow._few_monomials() is not None:
+                found.append(((low, high), flow))
+                continue
+            axis = int(np.argmax(flow._looks.moved))
+            middle = (low[axis] + high[axis]) / 2
+            if len(todo) + len(found) + 2 > MOST_PARTS or not low[axis] < middle < high[axis]:
+                raise Unchecked("the parameters beside the time move the state further than expansions reach")
+            for one, other in ((middle, high[axis]), (low[axis], middle)):
+                ends = (*low[:axis], one, *low[axis + 1 :]), (*high[:axis], other, *high[axis + 1 :])
+                system = self.system.with_parameters(Box(np.array(ends[0]), np.array(ends[1])))
+                todo.append((ends, SpreadFlow(system, self.until, self._at)))
+        return found
+
+    def parted(self, box: Corners) -> list[tuple[Corners, SpreadFlow]]:
+        """A box of parameters cut where the parts end, and the flow over the part that each lies in."""
+        found = list[tuple[Corners, SpreadFlow]]()
+        for (low, high), flow in self.divided:
+            a, b = (tuple(map(of, *ends)) for of, ends in ((max, (box[0], low)), (min, (box[1], high))))
+            flat = [x == y for x, y in zip(*box, strict=True)]
+            if all(x < y or (x == y and thin) for x, y, thin in zip(a, b, flat, strict=True)):
+                found.append(((a, b), flow))
+        return found
 
     @staticmethod
     def _beyond_degrees(paces: Array) -> Array:
@@ -286,7 +345,7 @@ class SpreadFlow:
             wide = self._table(law, arb(start).union(arb(stop)), ORDER + 2)
         except Unchecked:
             return None
-        d, u, drives = self.system.states, self.units.tolist(), self._looks[4]
+        d, u, drives = self.system.states, self.units.tolist(), self._looks.drives
         size, lost = arb(0), arb(0)
         for i in range(d):
             sums, over = arb(0), arb(0)

@@ -13,6 +13,7 @@ from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.varying import spread as expansions
 from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates, SpreadTube
 from tests.control.response.test_spread_motion import FILLING, RELAXING, SYSTEM, decay
 
@@ -73,13 +74,17 @@ def test_what_is_about_beyond_a_degree_is_the_rest_of_an_exponential() -> None:
 
 
 @pytest.mark.slow
-def test_polynomials_on_boxes_hold_what_the_closed_form_gives_there() -> None:
-    law = SpreadFlow(SYSTEM, 3.0)
+@pytest.mark.parametrize("most", [160, 12])
+def test_polynomials_on_boxes_hold_what_the_closed_form_gives_there(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(expansions, "LEFT", ((1e-14, most),))
+    whole = SpreadFlow(SYSTEM, 3.0)
+    assert len(whole.divided) == (1 if most == 160 else 4)
     grid, none = [0.0, 1.5, 3.0], stacked([[flint.arb(0)]])
     scene = Scene(grid, [none, none], [1.0], None, [], sr.Box([-0.1], [0.2]), ())
-    states, rng = SpreadStates(law, scene), np.random.default_rng(30)
-    cuts = sorted({*grid, *law.ends})
-    for low, high in ((-0.3, 0.6), (0.1, 0.2), (-0.3, -0.3)):
+    rng = np.random.default_rng(30)
+    asked = [((-0.3,), (0.6,)), ((0.1,), (0.2,)), ((-0.3,), (-0.3,))]
+    for ((low,), (high,)), law in [found for box in asked for found in whole.parted(box)]:
+        states, cuts = SpreadStates(law, scene), sorted({*grid, *law.ends})
         tube = SpreadTube(states, np.ones((1, 1)), ((low,), (high,)))
         for start, stop in ((cuts[2], cuts[3]), (cuts[-2], (cuts[-2] + 2 * cuts[-1]) / 3)):
             (found,) = tube.cells(int(start >= 1.5), start, stop, np.ones((1, 1)))
@@ -144,3 +149,25 @@ def test_what_is_beyond_the_monomials_of_an_entry_is_bounded(text: str) -> None:
                 off = max(off, float(np.abs(seen - exact).max()))
             assert off <= left[0, 0] * (1.0 + 1e-9) + 1e-14
             assert left[0, 0] <= 1e3 * off + 1e-14
+
+
+def test_boxes_are_cut_where_parts_of_the_parameters_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(expansions, "LEFT", ((1e-8, 84),))
+    box = sr.Box([-0.3, 0.0, 1.0], [0.6, 0.5, 1.0])
+    system = sr.VaryingSystem.of([["-q*r - p*sin(2*t)"]], [[1]], 3.0, [[1]], parameters=box, names=["p", "q", "r"])
+    flow = SpreadFlow(system, 3.0)
+    assert len(flow.divided) > 2
+    for (a, b), part in flow.divided:
+        assert part.system.parameters is not None
+        within = part.system.parameters.bounding_box()
+        assert (within.lower.tolist(), within.upper.tolist()) == (list(a), list(b))
+    low, high = (-0.2, 0.1, 1.0), (0.4, 0.5, 1.0)
+    pieces = [box for box, _ in flow.parted((low, high))]
+    sizes = [np.prod(np.subtract(b, a)[:2]) for a, b in pieces]
+    assert sum(sizes) == pytest.approx(0.6 * 0.4)
+    for p in np.random.default_rng(30).uniform(low, high, (200, 3)):
+        assert any((np.array(a) <= p).all() and (p <= np.array(b)).all() for a, b in pieces)
+    for (a, b), part in flow.parted((low, high)):
+        assert part.system.parameters is not None
+        whole = part.system.parameters.bounding_box()
+        assert (whole.lower <= a).all() and (np.array(b) <= whole.upper).all()
