@@ -324,13 +324,23 @@ def test_the_gain_of_an_engine_is_unknown_and_it_is_missed_too(
 @pytest.mark.parametrize(
     "system",
     [
-        {"A": [["p"]], "B": [[1]], "parameters": {"p": [-0.1, 0.1]}},
-        {"A": [[0]], "B": [["(1 + p) * (1 + q)"]], "parameters": {"p": [-0.1, 0.1], "q": [-0.1, 0.1]}},
+        {"A": [["exp(p)"]], "B": [[1]], "parameters": {"p": [-0.1, 0.1]}},
+        {"A": [[0]], "B": [["1 / (1 + p)"]], "parameters": {"p": [-0.1, 0.1]}},
         {"A": [[0]], "B": [["1 + p"]], "parameters": {"names": ["p"], "ellipsoid": {"centre": [0], "shape": [[0.1]]}}},
     ],
 )
-def test_parameters_that_the_state_is_no_affine_function_of_are_refused(system: dict[str, Any]) -> None:
+def test_parameters_in_other_sets_and_in_no_polynomials_are_refused(system: dict[str, Any]) -> None:
     problem = {"name": "linear", "system": system, "horizon": 2.0, "initial_state": [-1], "control": {"box": 1.0}}
     config = {"problem": {**problem, "execution": 0.05}, "dictionaries": {"control": pieces(2)}, "observers": []}
-    with pytest.raises(sr.InputError, match=r"execution.*affinely"):
+    with pytest.raises(sr.InputError, match=r"execution.*polynomials"):
         sr.run(config, figures=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pieces", "delay from another control"])
+def test_scenarios_have_the_worst_errors_in_them(name: str, tmp_path: Path) -> None:
+    problem = {**PROBLEM, **CASES[name]}
+    config = {"problem": problem, "dictionaries": {"control": pieces(PIECES)}, "observers": []}
+    found = sr.run({**config, "method": {"name": "scenario", "scenarios": 3}}, out=tmp_path / "run", figures=False)
+    assert found.result.status == "certified"  # nothing is left to be drawn
+    assert found.result.cost == pytest.approx(least_cost(problem), rel=1e-4)

@@ -378,7 +378,6 @@ def changed(**problem: Any) -> Config:
     [
         ({"terminal": [{"equals": [0.0]}]}, "fixed final values"),
         ({"disturbance_class": "measurable"}, "measurable disturbances"),
-        ({"execution": [0.01]}, "errors of execution"),
     ],
 )
 def test_what_is_not_built_beside_them_is_refused_by_name(problem: Config, said: str) -> None:

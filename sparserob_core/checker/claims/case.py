@@ -25,7 +25,7 @@ from sparserob_core.checker.reach.integrals import Running, integrating, spelt
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.measurable import Execution, Side
 from sparserob_core.checker.reach.superposition import parted
-from sparserob_core.checker.reach.varying.execution import VaryingExecution
+from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates
 from sparserob_core.checker.reach.varying.turns import in_turns
@@ -373,9 +373,13 @@ class Case:
             self.lasting,
         )
 
-    def beside(self, window: Window, basis: Array, gains: Array) -> Beside | None:
-        """What stands beside the state in the rows of a constraint; ``None``: nothing."""
-        delivered = tuple(one for one in (self.execution, self.strayed) if one is not None)
+    def beside(
+        self, window: Window, basis: Array, gains: Array, parameter: Sequence[float] | None = None
+    ) -> Beside | None:
+        """What stands beside the state in the rows of a constraint, at one parameter where it is given; ``None``:
+        nothing."""
+        executed = self.execution if parameter is None else self.delivered_at(parameter)
+        delivered = tuple(one for one in (executed, self.strayed) if one is not None)
         if window.reference is None and not window.is_mixed and not delivered:
             return None
         ends = self.control.breakpoints.tolist()
@@ -431,34 +435,39 @@ class Case:
         )
 
     @cached_property
-    def execution(self) -> Execution | VaryingExecution | None:
+    def execution(self) -> Execution | VaryingExecution | SpreadExecution | None:
         """How exactly the control is delivered, ``None`` where that is as it is commanded; of no control where the
         certificate has none."""
         shares = self.problem.execution
         if shares is None:
             return None
-        system = self.problem.system
-        if system.parameter_count or self.answering:
+        system, shares = self.problem.system, np.asarray(shares, dtype=float)
+        if self.answering or (system.parameter_count and self.changing is None):
             raise Unchecked("the checker knows errors of execution of known systems, without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
-        if isinstance(self.changing, VaryingFlow):
-            acts = self.control.breakpoints
-            if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
-                begins = acts[:-1] + system.delay
-                acts = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
-                pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][
-                    : acts.size - 1 if pieces else 0
-                ]
-            numb = self.problem.commanded
-            return VaryingExecution(self.changing, np.asarray(shares, dtype=float), acts, pieces, numb=numb)
-        return Execution(self.problem, np.asarray(shares, dtype=float), self.control.breakpoints, pieces)
+        if self.changing is None:
+            return Execution(self.problem, shares, self.control.breakpoints, pieces)
+        acts = self.control.breakpoints
+        if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
+            begins = acts[:-1] + system.delay
+            acts = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
+            pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][: acts.size - 1 if pieces else 0]
+        if isinstance(self.changing, SpreadFlow):
+            return SpreadExecution(self.changing, shares, acts, pieces, self.problem.commanded)
+        return VaryingExecution(self.changing, shares, acts, pieces, numb=self.problem.commanded)
 
-    def erring(self, c: Array, time: float) -> tuple[Array | None, arb]:
-        """What errors of execution add to ``c'x(t)`` at least: of a command of size 1 on every piece, ``(K, m)``,
-        ``None`` where there are none; and of what was commanded before."""
+    def delivered_at(self, parameter: Sequence[float]) -> Execution | VaryingExecution | None:
+        """`execution` at one parameter."""
+        found = self.execution
+        return found.at(parameter) if isinstance(found, SpreadExecution) else found
+
+    def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
+        """What errors of execution add to ``c'x(t)`` at least, at a parameter: of a command of size 1 on every piece,
+        ``(K, m)``, ``None`` where there are none; and of what was commanded before."""
         from flint import arb
 
-        found, none = None if self.execution is None else self.execution.least(c, time), arb(0)
+        delivered = self.delivered_at(parameter)
+        found, none = None if delivered is None else delivered.least(c, time), arb(0)
         if found is None or not self.problem.system.delay > 0.0:
             return found, none
         sizes = np.zeros((self.control.pieces, found.shape[1]))

@@ -107,7 +107,9 @@ class Place:
     def cells(self, interval: Interval, z: Array, sharp: bool) -> list[Polynomial]:
         """The polynomials of all rows on an interval, `Tube.cells` of them."""
         found = self.tube.cells(*interval, z, sharp)
-        return found if self.beside is None else self.beside.added(found, *interval[1:], z)
+        if self.beside is None:
+            return found
+        return self.beside.added(found, *interval[1:], z, within=(self.box, self.tube.flow))
 
 
 @final
@@ -263,6 +265,8 @@ def _influence(tube: Reached, poly: Polynomial) -> Array:
     expansion = poly.expansion > BLAME * poly.error
     sizes = tube.flow.sizes if expansion else np.abs(poly.coefficients).sum(axis=0)
     answer: Array = np.array(tube.flow.monomials.exponents, dtype=float).T @ sizes
+    if poly.bent is not None and poly.turning > BLAME * poly.error:
+        return poly.bent
     return answer
 
 

@@ -159,7 +159,7 @@ def _undisturbed(
             row = replace(row, constant=answers_of(case).disturbed(c, time, limit))
     if case.strayed is not None:
         row = replace(row, constant=row.constant + balls([case.strayed.added(c, time)[0]])[0])
-    sizes, given = case.erring(c, time)
+    sizes, given = case.erring(c, time, parameter.tolist())
     row = replace(row, constant=row.constant + given, sizes=sizes)
     if window is not None and window.is_mixed:
         piece = piece_of(case, window, entry, time)

@@ -127,8 +127,9 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
             state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
             state += [] if piece is None else case.pieces[piece].entries()
             value = _along(direction, None, [[x] for x in state])
-        if case.execution is not None:
-            low, high = case.execution.added(window.split(direction)[0], time)
+        delivered = case.delivered_at(parameter.tolist())
+        if delivered is not None:
+            low, high = delivered.added(window.split(direction)[0], time)
             value = value + balls([low])[0].union(balls([high])[0])
     return value - limit, slack
 
@@ -179,7 +180,8 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         over, slack = _along_rows(case, window, time, begun, pieces)
         return over, slack + ROUNDED * case.problem.system.states * float(case.units(window).rows.max(initial=0.0))
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
-    tube, beside = _tube(case, parameter, begun, basis, gains), case.beside(window, basis, gains)
+    tube = _tube(case, parameter, begun, basis, gains)
+    beside = case.beside(window, basis, gains, parameter.tolist())
     polynomials = list[Polynomial]()
     for piece, k in pieces:
         cells = tube.cells(piece, time, time, z)

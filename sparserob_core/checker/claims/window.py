@@ -14,7 +14,7 @@ from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.tube import Polynomial
-from sparserob_core.checker.reach.varying.execution import VaryingExecution
+from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.shape import Shape
@@ -23,6 +23,10 @@ from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
+
+    from sparserob_core.checker.reach.flow import Flow
+    from sparserob_core.checker.reach.tube import Known
+    from sparserob_core.checker.sets.parameters import Corners
 
 
 @final
@@ -101,13 +105,20 @@ class Beside:
     scene: Scene
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
-    delivered: Sequence[Execution | VaryingExecution] = ()
+    delivered: Sequence[Execution | VaryingExecution | SpreadExecution] = ()
 
     def added(
-        self, found: Sequence[Polynomial], start: float, stop: float, z: Array, piece: int | None = None
+        self,
+        found: Sequence[Polynomial],
+        start: float,
+        stop: float,
+        z: Array,
+        piece: int | None = None,
+        within: tuple[Corners, Known | Flow] | None = None,
     ) -> list[Polynomial]:
         """The polynomials of ``c'x``, one for every ``z (k, b)``, with what stands beside it on ``[start, stop]``; with
-        the control of a ``piece``, that of the interval unless given."""
+        the control of a ``piece``, that of the interval unless given. ``within``: the box of parameters, where they are
+        over one, and the monomials on it."""
         offset, slope = self.window.moved(start, stop)
         basis = stacked([[_exact(v) for v in row] for row in self.basis])
         level = -basis * stacked([[r] for r in offset])
@@ -125,8 +136,37 @@ class Beside:
         found = [_plus(poly, mid[:, i], float(lost[:, i].sum())) for i, poly in enumerate(found)]
         for one in self.delivered:
             rows = zip(found, z @ self.basis, strict=True)
-            found = [_plus(poly, *self._erring(one, c, start, stop)) for poly, c in rows]
+            if isinstance(one, SpreadExecution):
+                assert within is not None
+                found = [self._spreading(poly, one, c, start, stop, within) for poly, c in rows]
+            else:
+                found = [_plus(poly, *self._erring(one, c, start, stop)) for poly, c in rows]
         return list(found)
+
+    def _spreading(
+        self,
+        poly: Polynomial,
+        delivered: SpreadExecution,
+        c: Array,
+        start: float,
+        stop: float,
+        within: tuple[Corners, Known | Flow],
+    ) -> Polynomial:
+        """A polynomial with what errors of execution add to ``c'x`` on ``[start, stop]`` over a box of parameters."""
+        found = delivered.over(c, [start] if start == stop else [start, stop], *within)
+        terms, off = found.ends[:1], found.off
+        if len(found.ends) > 1:
+            rise = (found.ends[1] - found.ends[0]) * self._stretch(start, stop)
+            terms = np.stack([found.ends[0], rise])
+            off += rounding(8) * float(np.abs(found.ends).sum() + np.abs(rise).sum())
+        added = _plus(poly, terms, off)
+        turning = added.turning + float(found.wide.sum())
+        return replace(added, kinks=added.kinks + found.over, turning=turning, bent=found.wide)
+
+    def _stretch(self, start: float, stop: float) -> float:
+        """About how long an interval is on the clock of the scene, in times of its length."""
+        length = self.scene.duration(self.scene.ticks(start, stop)) / (_exact(stop) - _exact(start))
+        return float(length.mid())
 
     def _erring(
         self, delivered: Execution | VaryingExecution, c: Array, start: float, stop: float
@@ -137,19 +177,20 @@ class Beside:
         level, off = ends[0][0] + (ends[0][1] - ends[0][0]) / 2.0, max(high - low for low, high in ends)
         if len(ends) == 1:
             return np.array([level]), off
-        length = self.scene.duration(self.scene.ticks(start, stop)) / (_exact(stop) - _exact(start))
         rise = (ends[1][0] + ends[1][1] - ends[0][0] - ends[0][1]) / 2.0
-        slope = rise * float(length.mid())
+        slope = rise * self._stretch(start, stop)
         off += delivered.bent(c, start, stop) + rounding(8) * (abs(slope) + abs(ends[0][1]) + abs(ends[1][1]))
         return np.array([level, slope]), off
 
 
 def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
-    """A polynomial plus one in the time alone, with coefficients ``terms`` that are off by ``lost`` together."""
-    missing = max(0, terms.size - poly.coefficients.shape[0])
+    """A polynomial plus one with coefficients ``terms (J, M)``, or ``(J,)`` where it is one in the time alone, that are
+    off by ``lost`` together."""
+    missing = max(0, len(terms) - poly.coefficients.shape[0])
     coefficients = np.pad(poly.coefficients, ((0, missing), (0, 0)))
-    coefficients[: terms.size, 0] += terms
-    lost += 2.0 * HALF_ULP * float(np.abs(coefficients[: terms.size, 0]).sum())
+    changed = coefficients[: len(terms), : 1 if terms.ndim == 1 else None]
+    changed += terms.reshape(len(terms), -1)
+    lost += 2.0 * HALF_ULP * float(np.abs(changed).sum())
     return replace(poly, coefficients=coefficients, error=(poly.error + lost) * OUTWARD)
 
 

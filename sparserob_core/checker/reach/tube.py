@@ -47,6 +47,7 @@ class Polynomial:
     the truth exceeds it by at most ``error``, of which ``expansion`` is due to the size of the box of parameters, or of
     the cell of time where it is a chord; both together exceed the truth by at most twice the ``error`` and ``kinks``,
     which is due to disturbances about to switch, about ``turning`` of it because the box of parameters is so large.
+    ``bent``: what of the error each parameter makes beside those, ``None`` where none does.
     """
 
     coefficients: Array
@@ -54,6 +55,7 @@ class Polynomial:
     expansion: float
     kinks: float
     turning: float = 0.0
+    bent: Array | None = None
 
 
 class Known(NamedTuple):

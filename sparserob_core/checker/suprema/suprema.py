@@ -186,8 +186,9 @@ def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Wor
         raise Broken("the deviation of the initial state is not shown to be in its set")
     changes, signal = _signal(case, entry)
     low, high = beside(case, window, asked.direction, time, time)
-    if case.execution is not None:  # the worst errors are enclosed, whatever they are
-        errors = case.execution.added(window.split(asked.direction)[0], time)
+    delivered = case.delivered_at(parameter.tolist())
+    if delivered is not None:  # the worst errors are enclosed, whatever they are
+        errors = delivered.added(window.split(asked.direction)[0], time)
         slack = 2.0 * HALF_ULP * (abs(low) + abs(high) + abs(errors[1]))
         low, high = low + errors[0] - slack, high + errors[1] + slack
     if followed is not None:

@@ -29,7 +29,6 @@ from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Direct, Moving, Reference
 from sparserob_core.control.response.response import Outputs, Response, distinct_times
-from sparserob_core.control.response.varying_motion import SpreadMotion
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Separation
@@ -407,7 +406,6 @@ class FlatConstraint(StateConstraint):
             known = self.samples.support_over(legs, low, high)
             if self.functionals.execution is not None:  # of a known system, which has one leg
                 (leg,) = legs
-                assert not isinstance(leg, SpreadMotion)  # beside which there are no such errors
                 errors = self.functionals.execution.over(control, H, leg)
                 known = [Supports((*(() if known[0] is None else known[0].parts), errors))]
             supports = iter(known)
@@ -454,11 +452,13 @@ class FlatConstraint(StateConstraint):
         return answer + self.beside(x, self.times).T if beside else answer
 
     def _executed(self, execution: Execution, x: Array) -> Array:
-        """What errors of execution add to all rows at every sampled time, ``(r, times)``."""
+        """What errors of execution add to all rows at every lattice point and sampled time, ``(v, r, times)``."""
         rows, copies = self.H[: self.samples.proven], self.h.size // max(1, self.samples.proven)
-        k, r = self.times.size, rows.shape[0]
-        added = execution.sampled(self.functionals.control(x), np.repeat(self.times, r), np.tile(rows, (k, 1)))
-        return np.tile(added.reshape(k, r).T, (copies, 1))
+        (points, _), k, r = self.lattice, self.times.size, rows.shape[0]
+        v = len(points)
+        along = execution.seen(np.tile(rows, (v * k, 1)), np.repeat(points, k * r, axis=0))
+        added = execution.sampled(self.functionals.control(x), np.tile(np.repeat(self.times, r), v), along)
+        return np.tile(added.reshape(v, k, r).swapaxes(1, 2), (1, copies, 1))
 
     @shaped
     def _refined(

@@ -25,7 +25,8 @@ class ScenarioConstraint:
     state; the index is ``(t, sample number)``.
 
     ``H (r, d)``, ``h (r,)`` are the sides of the constraint ``base``; ``disturbances (S, mw, L)`` on the pieces of the
-    merged grid or ``None``; ``parameters (S, nu)``; ``deviations (S, d)`` of the initial state or ``None``.
+    merged grid or ``None``; ``parameters (S, nu)``; ``deviations (S, d)`` of the initial state or ``None``. Errors of
+    execution are the worst ones in every sample.
     """
 
     base: StateConstraint
@@ -86,9 +87,22 @@ class ScenarioConstraint:
         if self.parameters.shape[1] == 0:
             margins, sample = self._known
             undisturbed = self._states(x, slice(0, 1), None, None)[0]
-            return self.H @ undisturbed.T - margins + beside, sample
-        values, sample = self._maximum(lambda part: self._states(x, part, self.disturbances, self.deviations))
+            return self.H @ undisturbed.T - margins + beside + self._missed(x, slice(0, 1))[0], sample
+        values, sample = self._maximum(
+            lambda part: self._states(x, part, self.disturbances, self.deviations), lambda part: self._missed(x, part)
+        )
         return values + beside, sample
+
+    def _missed(self, x: Array, part: slice) -> Array:
+        """What errors of execution add in some samples, ``(s, r, times)``: their worst is known, and none are drawn."""
+        functionals, parameters = self.base.functionals, self.parameters[part]
+        samples, r, times = len(parameters), self.h.size, self._times.size
+        if functionals.execution is None:
+            return np.zeros((samples, r, times))
+        rows, at = np.tile(self.H, (samples * times, 1)), np.tile(np.repeat(self._times, r), samples)
+        along = functionals.execution.seen(rows, np.repeat(parameters, times * r, axis=0))
+        added = functionals.execution.added(functionals.control(x), at, along)
+        return np.asarray(added.reshape(samples, times, r).swapaxes(1, 2))
 
     @cached_property
     def _known(self) -> tuple[Array, np.ndarray]:
@@ -103,13 +117,18 @@ class ScenarioConstraint:
         worst, sample = self._maximum(lambda part: self._states(still, part, self.disturbances, self.deviations) - rest)
         return -worst, sample
 
-    def _maximum(self, states: Callable[[slice], Array]) -> tuple[Array, np.ndarray]:
-        """``max_s H x_s(t) - h`` over the samples, block by block, and where it is attained."""
+    def _maximum(
+        self, states: Callable[[slice], Array], more: Callable[[slice], Array] | None = None
+    ) -> tuple[Array, np.ndarray]:
+        """``max_s H x_s(t) - h`` over the samples, with what is ``more`` of it, block by block, and where it is
+        attained."""
         samples, r, times = self.parameters.shape[0], self.h.size, self._times.size
         best, where = np.full((r, times), -np.inf), np.zeros((r, times), dtype=int)
         size = max(1, BLOCK // (r * times))
         for start in range(0, samples, size):
-            values = np.einsum("ri,sti->srt", self.H, states(slice(start, start + size))) - self.h[:, None]
+            part = slice(start, start + size)
+            values = np.einsum("ri,sti->srt", self.H, states(part)) - self.h[:, None]
+            values = values if more is None else values + more(part)
             top = values.argmax(axis=0)
             height = np.take_along_axis(values, top[None], axis=0)[0]
             where = np.where(height > best, start + top, where)

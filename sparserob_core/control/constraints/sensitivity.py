@@ -156,7 +156,15 @@ class Sensitivity:
         execution = self.constraint.functionals.execution
         if execution is not None:
             control = self.constraint.functionals.control(x)
-            in_time = in_time + execution.slope(control, times[:, 0], at.direction)[:, None]
+            along = execution.seen(at.direction, parameters)
+            in_time = in_time + execution.slope(control, times[:, 0], along)[:, None]
+            if self._nu:
+                box = self.constraint.parameters.box
+
+                def added(p: Array, of: np.ndarray) -> Array:
+                    return execution.added(control, times[of, 0], execution.seen(at.direction[of], p))
+
+                in_parameters = in_parameters + differences(added, parameters, box.lower, box.upper)
         reference = self.constraint.reference
         if reference.moves:
             in_time = (

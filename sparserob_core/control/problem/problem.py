@@ -277,7 +277,6 @@ class OptimalControlProblem(Term):
         refused = {
             "fixed final values": bool(self.terminal_equalities),
             "measurable disturbances": self.measurable is not None,
-            "errors of execution": self.execution is not None and bool(np.any(np.asarray(self.execution, dtype=float))),
         }
         for beside, given in refused.items():
             if given:
@@ -306,7 +305,9 @@ class OptimalControlProblem(Term):
             "fixed final values, which an error of execution misses: a terminal set such as box": bool(
                 self.terminal_equalities
             ),
-            "parameters, but for those in a box that the state depends on affinely": not self._is_affine(),
+            "parameters in another set than a box": not self._is_boxed(),
+            "measurable disturbances with parameters that the state does not depend on affinely": self._is_expanded()
+            and self.measurable is not None,
             "measurable disturbances in a curved set where the system has pieces, a delay or parameters": any(
                 one.halfspaces() is None for one in filter(None, [self.measurable])
             )
@@ -318,14 +319,21 @@ class OptimalControlProblem(Term):
                 raise InputError(path="execution", expected=f"none beside {beside}", got=f"{shares.tolist()}")
         return shares
 
-    def _is_affine(self) -> bool:
-        """Whether the state is an affine function of parameters in a box, or there are none."""
+    def _is_boxed(self) -> bool:
+        """Whether parameters are in a box, or there are none."""
         if isinstance(self.system, VaryingSystem) or not self.system.parameter_count:
             return True
         try:
-            return VaryingSystem.made_of(self.system, self.horizon).dependence is not None
+            _ = VaryingSystem.made_of(self.system, self.horizon).dependence
         except InputError:
             return False
+        return True
+
+    def _is_expanded(self) -> bool:
+        """Whether there are such of which the state is no affine function."""
+        if isinstance(self.system, VaryingSystem) or not self.system.parameter_count or not self._is_boxed():
+            return False
+        return VaryingSystem.made_of(self.system, self.horizon).dependence is None
 
     def _state(self) -> Array:
         d = self.system.states

@@ -724,7 +724,7 @@ class VaryingSystem:
     @staticmethod
     def made_of(system: LinearSystem | SwitchedSystem, horizon: float) -> VaryingSystem:
         """A system that does not change, or takes turns, as one whose law is constant in every turn. Raises
-        `InputError` where its state is not an affine function of its parameters."""
+        `InputError` where its parameters are in no box."""
         begins, modes = [0.0, *system.switches], system.modes
         ends, box = [*begins[1:], horizon], None if system.parameters is None else boxed(system.parameters)
         laws = [

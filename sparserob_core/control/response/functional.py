@@ -228,10 +228,11 @@ class WorstCase:
             known = self.response.weights(times[part], directions[part], parameters[part])
             G[part, : self.coefficients] = self.on_decision(known.control)
             if self.execution is not None:
-                G[part, self.coefficients :] = self.execution.lengths(times[part], directions[part])
+                along = self.execution.seen(directions[part], parameters[part])
+                G[part, self.coefficients :] = self.execution.lengths(times[part], along)
             offset[part] = known.free @ self.response.initial_state + self.given(known.control) + pushed(part, known)
             if self.execution is not None:
-                offset[part] += self.execution.given(times[part], directions[part])
+                offset[part] += self.execution.given(times[part], along)
         return G, offset
 
     @shaped
@@ -260,7 +261,8 @@ class WorstCase:
             support = self._support(known, times[part], directions[part], parameters[part])
             result[part] = known.free @ self.response.initial_state + driven + support
             if self.execution is not None:
-                result[part] += self.execution.added(self.control(theta), times[part], directions[part])
+                along = self.execution.seen(directions[part], parameters[part])
+                result[part] += self.execution.added(self.control(theta), times[part], along)
         return result
 
     def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
@@ -505,8 +507,10 @@ class WorstCase:
         if model is not None:
             pushed = model.bound.reach(np.eye(model.channels))
         known = np.abs(self.known).max(axis=1)
-        acting = np.concatenate([np.maximum(far, known[: far.size]), known[far.size :]])
-        inputs = np.concatenate([acting, pushed])
+        delivered = np.maximum(far, known[: far.size])
+        if self.execution is not None:  # of what is missed as much is left out as of what is commanded
+            delivered = (1.0 + self.execution.shares) * delivered
+        inputs = np.concatenate([delivered, known[far.size :], pushed])
         return np.asarray(np.max([one.at_most(begun, inputs) for one in self._truncations], axis=0))
 
     @cached_property

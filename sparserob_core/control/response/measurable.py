@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from itertools import product as every_choice
 from math import comb
 from typing import final
 
@@ -26,8 +27,10 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
+from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.flows import Leaps, products
 from sparserob_core.control.enclosures.matrix_exponential import rounding
+from sparserob_core.control.enclosures.polynomial import distinct_patterns
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import Carried, carried
@@ -35,7 +38,7 @@ from sparserob_core.control.response.initial_support import InitialSupport, Supp
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
-from sparserob_core.control.response.varying_motion import OUTWARD, VaryingMotion, VaryingSupport
+from sparserob_core.control.response.varying_motion import OUTWARD, SpreadMotion, VaryingMotion, VaryingSupport
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -608,7 +611,11 @@ class Execution:
     shares: Array
     felt: Array
 
-    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion) -> Support:
+    def seen(self, directions: Array, parameters: Array) -> Array:
+        """Directions ``(k, d)`` at parameters ``(k, nu)`` as those on the states that errors are followed in."""
+        return directions
+
+    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> Support:
         """What the worst errors of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time."""
         assert isinstance(leg, LiftedSystem)
         return ExecutionCellSupport(self, control, rows, leg)
@@ -778,26 +785,43 @@ class ExecutionCellSupport(KnownCellSupport):
 @dataclass(frozen=True, eq=False)
 class VaryingExecution(Execution):
     """`Execution` of a system that changes with time; ``disturbing``: what is commanded enters through ``E``, all of
-    it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do. ``before (m,)``: the
-    size of what acts until the first command does, where these act late. ``bound``: a flat set of what enters by the
-    columns ``through (m,)`` of ``E`` at once, in the place of channels of their own; there is one share of 1 then, and
-    integrals are those of its support function."""
+    it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do. ``bound``: a flat set of
+    what enters by the columns ``through (m,)`` of ``E`` at once, in the place of channels of their own; there is one
+    share of 1 then, and integrals are those of its support function. ``spread``: of which polynomials in parameters the
+    states are the coefficients, where they are, and directions those on all of them (`seen`)."""
 
     disturbing: bool = False
-    before: Array | None = None
     bound: ConvexSet | None = None
     through: np.ndarray | None = None
+    spread: Spread | None = None
     _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
     _ways: dict[bytes, tuple[Array, Kernel]] = field(default_factory=dict, repr=False)
+    _reaching: dict[bytes, VaryingExecutionCellSupport] = field(default_factory=dict, repr=False)
 
     def none(self) -> VaryingExecution:
         """`Execution.none`; what is remembered is of these shares."""
-        return replace(self, shares=np.zeros(self.shares.size), _lengths={})
+        return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _reaching={})
 
-    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion) -> Support:
+    def seen(self, directions: Array, parameters: Array) -> Array:
+        """`Execution.seen`: those on all coefficients, where there are any."""
+        if self.spread is None or not self.shares.any():
+            return directions
+        return self.spread.directions(directions, parameters)
+
+    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> Support:
         """`Execution.over`."""
+        if isinstance(leg, SpreadMotion):
+            return SpreadExecutionSupport(self.reaching(control), rows, leg)
         assert isinstance(leg, VaryingMotion)
         return VaryingExecutionCellSupport(self, control, rows, leg)
+
+    def reaching(self, control: Array) -> VaryingExecutionCellSupport:
+        """What errors of a control can have made of all coefficients, whatever the functional; remembered."""
+        key = control.tobytes()
+        if key not in self._reaching:
+            found = VaryingExecutionCellSupport(self, control, np.zeros((0, self.motion.states)), self.motion)
+            remember(self._reaching, key, found, KEPT)
+        return self._reaching[key]
 
     @cached_property
     def motion(self) -> VaryingMotion:
@@ -835,8 +859,8 @@ class VaryingExecution(Execution):
 
     def acts(self, control: Array) -> Array:
         """The size of all that acts, ``(m, late + K)``, from a command ``(m, K)``."""
-        size = np.abs(control)
-        return np.column_stack([self.before, size]) if self.late and self.before is not None else size
+        size, before = np.abs(control), self.motion.grid.before
+        return size if before is None or not self.late else np.column_stack([np.abs(before), size])
 
     @cached_property
     def kernel(self) -> Kernel:
@@ -1017,7 +1041,7 @@ class VaryingExecutionCellSupport(KnownCellSupport):
         entering = np.append(np.arange(d), d + columns)
         law, slope = law[:, :, entering], slope[:, :, entering]
         most, second, third = (one[pieces][:, :, entering] for one in (motion.most, motion.second, motion.third))
-        begun, pushed = self._sizes(start), self._sizing[pieces]
+        begun, pushed = self._sizes(start), self.sizing[pieces]
         exact = np.abs(self.rows @ (slope[:, :, :d] + law[:, :, :d] @ law[:, :, :d]))
         now = np.abs(self.rows @ slope[:, :, d:]) + np.abs(self.rows @ law[:, :, :d] @ law[:, :, d:])
         entered = width * np.einsum("kim,km->ki", most[:, :, d:], pushed)
@@ -1032,27 +1056,31 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     @cached_property
     def neglected(self) -> Array:
         """What is off in the transitions, on every piece: ``(r, K)``."""
-        motion = self.motion
-        pushed = motion.flow.sizes[..., self.execution.columns] * self._sizing[:, None]
-        total = motion.left_out(self._at_marks[:-1], pushed)
-        return product(np.abs(self.rows), total.T)
+        return product(np.abs(self.rows), self.missed.T)
+
+    @cached_property
+    def missed(self) -> Array:
+        """What states are off by, on every piece, ``(K, d)``."""
+        pushed = self.motion.flow.sizes[..., self.execution.columns] * self.sizing[:, None]
+        return self.motion.left_out(self.at_marks[:-1], pushed)
 
     @cached_property
     def reached(self) -> Array:
         """As in `VaryingSupport`, ``(K, d)``."""
         motion, lengths = self.motion, self.motion.grid.lengths
         columns = motion.states + self.execution.columns
-        entered = np.einsum("kim,km->ki", motion.most[:, :, columns], self._sizing)
-        return motion.grown(motion.every, lengths, self._at_marks[:-1] + lengths[:, None] * entered)
+        entered = np.einsum("kim,km->ki", motion.most[:, :, columns], self.sizing)
+        return motion.grown(motion.every, lengths, self.at_marks[:-1] + lengths[:, None] * entered)
 
     @cached_property
-    def _sizing(self) -> Array:
+    def sizing(self) -> Array:
         """How large errors may be on every piece between marks, ``(K, m)``."""
         size = self.execution.far[:, None] * self.execution.acts(self.control)
         return np.asarray(size[:, self.execution.acting].T * OUTWARD)
 
     @cached_property
-    def _at_marks(self) -> Array:
+    def at_marks(self) -> Array:
+        """What errors can have made of every state at the marks, ``(K + 1, d)``, at most."""
         return self._sizes(self.motion.grid.breakpoints)
 
     def _sizes(self, times: Array) -> Array:
@@ -1066,6 +1094,99 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     def _each(times: Array, rows: Array) -> tuple[Array, Array]:
         """Every time with every row."""
         return np.repeat(times, len(rows)), np.tile(rows, (times.size, 1))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SpreadExecutionSupport:
+    """What errors of execution add to functionals ``rows (r, d)`` over a cell of parameters, in the form of `Support`;
+    ``every`` is what they make of all coefficients.
+
+    Of one parameter alone a polynomial ``f`` is nowhere further from its chord than half the largest ``f''`` on
+    ``[-1, 1]``, and the absolute value of the chord is not above the chord of the absolute values. So the integrals
+    of ``|f|`` are, one parameter after another, at most what is linear in each between those at the corners, and half
+    of those of the second derivatives more.
+    """
+
+    every: VaryingExecutionCellSupport
+    rows: Array
+    motion: SpreadMotion
+
+    @shaped
+    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r nu"]:
+        """`Support.steepness`."""
+        return np.asarray(self._sizes(times) @ self.motion.space.exponents)
+
+    @shaped
+    def at(
+        self, times: Float[Array, " k"], ends: Float[Array, "k r nu"]
+    ) -> tuple[Float[Array, "k r M"], Float[Array, "k r"]]:
+        """`Support.at`."""
+        space, sizes, of = self.motion.space, self._sizes(times), self.every
+        coefficients, excess = np.zeros((*ends.shape[:2], space.size)), np.zeros(ends.shape[:2])
+        patterns, which = distinct_patterns(ends)
+        for position, pattern in enumerate(patterns):
+            here, row = np.nonzero(which == position)
+            free = np.flatnonzero(pattern == 0.0)
+            signs = np.array(list(every_choice((-1.0, 1.0), repeat=free.size)))
+            corners = np.tile(pattern, (len(signs), 1))
+            corners[:, free] = signs
+            powers = space.monomials(corners) @ self.motion.recentred  # of the coefficients in all parameters
+            directions = (powers[:, :, None] * self.rows[row][:, None, None, :]).reshape(len(row) * len(signs), -1)
+            bounds = of.execution.enclosed(of.control, np.repeat(times[here], len(signs)), directions)
+            bounds = bounds.reshape(len(row), len(signs), 2)
+            middle, off = bounds.mean(axis=2), (bounds[..., 1] - bounds[..., 0]).max(axis=1) / 2
+            bent = sizes[here, row] @ (space.exponents[:, free] * (space.exponents[:, free] - 1)).sum(axis=1)
+            lost = rounding(2 * len(signs) + 8) * np.abs(middle).max(axis=1)
+            excess[here, row] = (off + bent / 2 + len(signs) * lost) * OUTWARD
+            for chosen in every_choice((0, 1), repeat=free.size):
+                found = middle @ signs[:, np.flatnonzero(chosen)].prod(axis=1) / len(signs)
+                exponents = np.zeros(space.nu, dtype=int)
+                exponents[free] = chosen
+                place = space.index.get(tuple(exponents.tolist()))
+                if place is None:  # of more parameters than there are degrees
+                    excess[here, row] += np.abs(found)
+                else:
+                    coefficients[here, row, place] = found
+        return coefficients, excess
+
+    @shaped
+    def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
+        """`VaryingExecutionCellSupport.deviation`, by the largest numbers on every piece."""
+        bent = self._bent[self._pieces(start)] @ self.motion.sizes(np.abs(self.rows)).T
+        return np.asarray((widths**2 / 8)[:, None] * bent * OUTWARD)
+
+    @cached_property
+    def neglected(self) -> Array:
+        """What is off in the transitions, with what is beyond the degree, on every piece: ``(r, K)``."""
+        of, motion, rows = self.every, self.motion, np.abs(self.rows)
+        inputs = np.zeros((len(of.sizing), of.motion.most.shape[2] - of.motion.states))
+        inputs[:, of.execution.columns] = of.sizing
+        lost = motion.truncation.lost(of.at_marks[:-1] + of.missed, inputs)
+        return np.asarray((motion.sizes(rows) @ of.missed.T + rows @ lost.T) * OUTWARD)
+
+    @cached_property
+    def reached(self) -> Array:
+        """`Support.reached`, with what rounding there is more of them."""
+        return np.asarray((1.0 + self.motion.space.size) * self.motion.folded(self.every.reached))
+
+    @cached_property
+    def _bent(self) -> Array:
+        """The second derivative in time of every coefficient, at most, on every piece, ``(K, states)``."""
+        of, d = self.every, self.every.motion.states
+        second = of.motion.second
+        pushed = second[:, :, d + of.execution.columns]
+        found = np.einsum("kij,kj->ki", second[:, :, :d], of.reached) + np.einsum("kim,km->ki", pushed, of.sizing)
+        return np.asarray(found * OUTWARD)
+
+    def _sizes(self, times: Array) -> Array:
+        """What errors add along every coefficient on the cell, at most, ``(k, r, M)``."""
+        reached = self.every.reached[self._pieces(times)].reshape(times.size, self.motion.space.size, -1)
+        along = np.einsum("rd,kad->kra", np.abs(self.rows), reached)
+        return np.asarray(along @ np.abs(self.motion.recentred).T * OUTWARD)
+
+    def _pieces(self, times: Array) -> np.ndarray:
+        return np.asarray(np.minimum(self.every.motion.place(times), self.every.motion.origin.size - 1))
 
 
 @final

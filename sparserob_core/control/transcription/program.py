@@ -314,8 +314,6 @@ def family_of(constraint: StateConstraint) -> ConstraintFamily:
             raise InputError(
                 f"method: scenario: the constraint {constraint.name} has a curved set; expected sets with flat sides"
             )
-        if constraint.functionals.execution is not None:
-            raise InputError("method: scenario: expected no problem.execution, whose errors are not sampled")
         from sparserob_core.control.constraints.scenario import (
             ScenarioConstraint,
             sample_disturbances,

@@ -82,7 +82,7 @@ def _added(model: Transcription, result: Result, share: float, prices: Array | N
     multipliers, *indices = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
     times, directions, parameters = indices[0], indices[1], indices[2].reshape(len(rows), -1)
     weights = model.response.weights(times, directions, parameters)
-    sizes = np.abs(multipliers) @ _beside_control(model, weights, times, directions)
+    sizes = np.abs(multipliers) @ _beside_control(model, weights, times, directions, parameters)
     prices = prices if whole and _plain(model, result) else None
     return float(sizes) + besides + _pushed(model, prices, weights.control, multipliers, share)
 
@@ -127,8 +127,8 @@ def _beyond(model: Transcription, result: Result) -> float:
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:
     """The numbers ``(k,)`` that are added up to rows ``c'x(t)``, ``directions (k, d)``, at their largest."""
     weights = model.response.weights(times, directions, parameters)
-    controlled = _controlled(model, weights.control).sum(axis=(1, 2))
-    return np.asarray(_beside_control(model, weights, times, directions) + controlled)
+    others = _beside_control(model, weights, times, directions, parameters)
+    return np.asarray(others + _controlled(model, weights.control).sum(axis=(1, 2)))
 
 
 def _controlled(model: Transcription, weights: Array) -> Array:
@@ -136,7 +136,9 @@ def _controlled(model: Transcription, weights: Array) -> Array:
     return np.asarray(np.abs(model.functionals.decided(weights)) * _far(model.problem.control))
 
 
-def _beside_control(model: Transcription, weights: Weights, times: Array, directions: Array) -> Array:
+def _beside_control(
+    model: Transcription, weights: Weights, times: Array, directions: Array, parameters: Array
+) -> Array:
     """Those ``(k,)`` beside what the control brings."""
     functionals, free = model.functionals, np.abs(weights.free)
     sizes = free @ np.abs(model.response.initial_state)
@@ -144,7 +146,7 @@ def _beside_control(model: Transcription, weights: Weights, times: Array, direct
         sizes += free @ _far(model.problem.initial_set)
     sizes += np.einsum("klm,ml->k", np.abs(weights.control), np.abs(functionals.known))
     if functionals.execution is not None:
-        lengths = functionals.execution.lengths(times, directions)
+        lengths = functionals.execution.lengths(times, functionals.execution.seen(directions, parameters))
         sizes += lengths @ np.repeat(_far(model.problem.control), model.control.pieces)
     return np.asarray(sizes + _disturbing(model, weights.disturbance, times, directions))
 

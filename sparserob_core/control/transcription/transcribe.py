@@ -142,18 +142,28 @@ def _functionals(
         bound, breakpoints = problem.disturbance, problem.disturbance_breakpoints
         model = disturbance_model(problem.disturbance_class, bound, disturbance, grid, breakpoints)
     response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
-    execution = None
+    execution: Execution | None = None
     if problem.execution is not None:
         from sparserob_core.control.response.measurable import Execution, VaryingExecution
 
         shares, felt = np.asarray(problem.execution), np.ones(problem.system.states)
         felt[list(problem.commanded)] = 0.0
-        early = None if grid.before is None else np.abs(grid.before)
-        execution = (
-            VaryingExecution(response, control.breakpoints, shares, felt, before=early)
-            if system.varies
-            else Execution(response, control.breakpoints, shares, felt)
-        )
+        parts = response.propagator.spread
+        if len(parts) > 1:
+            raise InputError(
+                path="execution",
+                expected="none beside parameters over whose box the state is expanded in parts: smaller intervals",
+                got=f"{shares.tolist()}, and {len(parts)} parts",
+            )
+        if parts:  # they are followed as coefficients of polynomials too
+            ((spread, every),) = parts
+            none, felt = np.zeros(spread.states), np.tile(felt, spread.space.size)
+            followed = Response(every.system, every.grid, none, shared=every)
+            execution = VaryingExecution(followed, control.breakpoints, shares, felt, spread=spread)
+        elif system.varies:
+            execution = VaryingExecution(response, control.breakpoints, shares, felt)
+        else:
+            execution = Execution(response, control.breakpoints, shares, felt)
     functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)
 

@@ -8,25 +8,33 @@ piece is a polynomial with balls as coefficients.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, final
+from itertools import product as every_choice
+from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import Side, signed, swept
 from sparserob_core.checker.reach.varying.flow import VaryingFlow, products
 from sparserob_core.checker.reach.varying.loop import ORDER
+from sparserob_core.checker.reach.varying.spread import SpreadFlow
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb_mat
 
+    from sparserob_core.checker.reach.flow import Flow
+    from sparserob_core.checker.reach.tube import Known
+    from sparserob_core.checker.sets.parameters import Corners
+
 KEPT = 16  # nodes, up to which the transitions from every earlier one are remembered; cells come one after another
+PLACES_KEPT = 128  # parameters at which what errors do is remembered
 TIMES_KEPT = 4096  # times at which what errors make of the states is remembered
 
 
@@ -220,6 +228,119 @@ class VaryingExecution:
     @cached_property
     def _steps(self) -> list[arb_mat]:
         return [self.law.over(*ends)[0] for ends in pairwise(self.marks)]
+
+
+@final
+@dataclass(eq=False)
+class SpreadExecution:
+    """`VaryingExecution` of a control that enters a system with parameters that its state is no affine function of.
+
+    At one parameter it is that of the known system there. Over a box: of one parameter alone a function ``f`` is
+    nowhere further from its chord than half the largest ``f''`` in shares of half the interval, and the absolute value
+    of a chord is not above the chord of the absolute values. So the integrals of ``|f|`` are, one parameter after
+    another, at most what is linear in each between those at the corners, and half of those of the second derivatives
+    more; what is beyond the degree of the expansion that these are bounded by counts twice.
+    """
+
+    law: SpreadFlow
+    shares: Array
+    breakpoints: Array
+    pieces: Sequence[arb_mat]
+    numb: Sequence[int] = ()
+    _at: dict[tuple[float, ...], VaryingExecution] = field(default_factory=dict, repr=False)
+    _parts: dict[SpreadFlow, SpreadExecution] = field(default_factory=dict, repr=False)
+
+    def at(self, parameter: Sequence[float]) -> VaryingExecution:
+        """That at one parameter."""
+        point = tuple(map(float, parameter))
+        if point not in self._at:
+            if len(self._at) >= PLACES_KEPT:
+                self._at.clear()
+            law = self.law.at(point)
+            self._at[point] = VaryingExecution(law, self.shares, self.breakpoints, self.pieces, numb=self.numb)
+        return self._at[point]
+
+    def over(self, c: Array, times: Sequence[float], box: Corners, flow: Known | Flow) -> Spreading:
+        """What the worst errors add to ``c'x`` at one or two ``times``, between which there is no mark, over a ``box``
+        of parameters, which is in one part of all; ``flow`` has the monomials on it."""
+        part = next((law for inside, law in self.law.parted(box) if inside == box), None)
+        if part is None:
+            raise Unchecked("a box of parameters lies in several parts")
+        if part is not self.law:
+            if part not in self._parts:
+                self._parts[part] = replace(self, law=part, _parts={})
+            return self._parts[part].over(c, times, box, flow)
+        low, high, centre, radius = map(np.array, (*box, flow.centre, flow.radius))
+        signs = np.array(list(every_choice((-1.0, 1.0), repeat=low.size)))
+        corners = np.where(signs > 0.0, high, low).tolist()
+        found = np.array([[self.at(point).added(c, time) for time in times] for point in corners])
+        middle, off = found.mean(axis=2), float((found[..., 1] - found[..., 0]).max())
+        ends, numbers, rest = np.zeros((len(times), flow.monomials.size)), flow.monomials.number, 0.0
+        for chosen in every_choice((0, 1), repeat=low.size):
+            part = signs[:, np.flatnonzero(chosen)].prod(axis=1) @ middle / len(signs)
+            if chosen in numbers:
+                ends[:, numbers[chosen]] = part
+            else:  # of more parameters than there are degrees
+                rest += float(np.abs(part).max())
+        # the corners of a box are where its shares are 1 or -1, but for what the middle and the radius round
+        inside = np.minimum(high - centre, centre - low) * (1.0 - rounding(2))
+        skew = float(((radius - inside) / np.where(radius > 0.0, radius, 1.0)).sum())
+        rest += 2.0 * skew * float(np.ptp(middle, axis=0).max()) + rounding(4 * len(signs) + 8) * float(found.max())
+        wide, bent = self._curved(c, times, radius)
+        least = np.array([self.at(centre.tolist()).added(c, time)[0] for time in times])
+        over = max(0.0, float((middle.mean(axis=0) - least).max()))
+        total = float(wide.sum()) * OUTWARD
+        lost = 2.0 * float(np.abs(c) @ self._lost)
+        return Spreading(ends, (off + rest + total + lost + bent) * OUTWARD, over * OUTWARD, wide)
+
+    def _curved(self, c: Array, times: Sequence[float], radius: Array) -> tuple[Array, float]:
+        """How far integrals may be above what is linear between corners whose halves are ``radius (nu,)``, by each
+        parameter, but for what is beyond the degree; and in the time above a chord between ``times``."""
+        law, sizes, piece = self.law, self._sizes, np.zeros(self.law.inputs)
+        place = min(max(0, int(np.searchsorted(self.breakpoints, times[0], side="right")) - 1), len(sizes) - 1)
+        piece[: self.shares.size] = sizes[place]
+        felt = np.where(np.isin(np.arange(c.size), list(self.numb)), 0.0, np.abs(c))
+        norms, lost = self._reached, self._lost
+        degrees = np.arange(float(norms.shape[1]))
+        shares = radius / np.where(np.array(law.parts.scales) > 0.0, law.parts.scales, 1.0) * (1.0 + rounding(4))
+        unit = float(felt @ law.units) * OUTWARD
+        second = float((norms @ (degrees * (degrees - 1.0))).max(initial=0.0))
+        wide = unit * second * shares**2 / 2.0
+        width = (times[-1] - times[0]) * (1.0 + rounding(2))
+        states = float(norms.sum(axis=1).max(initial=0.0)) + float((lost / law.units).max(initial=0.0))
+        bent = 0.0 if not width else width**2 / 8.0 * unit * law.bent(times[0], piece, states)
+        return wide * OUTWARD, bent * OUTWARD
+
+    @cached_property
+    def _sizes(self) -> Array:
+        """How large errors may be on every piece, ``(K, m)``, at most."""
+        sizes = self.at(self.law.parts.middle).sizes
+        return (sizes.mid + sizes.rad) * OUTWARD
+
+    @cached_property
+    def _inputs(self) -> Array:
+        """How large at any time, among all inputs."""
+        found = np.zeros(self.law.inputs)
+        found[: self.shares.size] = self._sizes.max(axis=0, initial=0.0)
+        return found
+
+    @cached_property
+    def _reached(self) -> Array:
+        return self.law.reached(np.zeros(self.law.system.states), self._inputs)
+
+    @cached_property
+    def _lost(self) -> Array:
+        return self.law.lost(np.zeros(self.law.system.states), self._inputs)
+
+
+class Spreading(NamedTuple):
+    """Coefficients ``ends (T, M)`` over a box of parameters of what errors add at times, by how much they are ``off``
+    at most, how far ``over`` the truth in the middle of the box, and how much of it is the width of each parameter."""
+
+    ends: Array
+    off: float
+    over: float
+    wide: Array
 
 
 def _carried(rows: Enclosed, steps: Enclosed) -> Enclosed:

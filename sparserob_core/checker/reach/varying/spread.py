@@ -59,6 +59,9 @@ reached; where none is, the box of parameters is halved. Norms of transitions mu
 ridden to 1e-9. Twice as many numbers take four times as long."""
 FAR = 600.0  # exponents of what is too far in any case, whose exponential is a number
 MOST_PARTS = 64  # of a box of parameters, each with an expansion of its own
+GROWING = 0.5  # norm of the system times the length of a part: twice as much makes bounds of norms 2.7 times as large
+MOST_MARKS = 64  # of the horizon, but for its segments: of every pair a product is looked at
+FLOWS_KEPT = 256  # of single parameters
 MOST_DEGREE = 60  # of the expansion, which is that of a few states and one parameter
 MOST_TERMS = 30  # of power series of entries that are no polynomials; with q^n of them 40 take twice the time
 FURTHER = 40  # degrees beyond one, whose sum is about what is beyond: of norms of a few the rest is far less
@@ -136,6 +139,8 @@ class SpreadFlow:
         """The flow at one parameter."""
         point = tuple(map(float, parameter))
         if point not in self._at:
+            if len(self._at) >= FLOWS_KEPT:
+                self._at.clear()
             self._at[point] = VaryingFlow(self._fixed(point), self.until)
         return self._at[point]
 
@@ -180,6 +185,11 @@ class SpreadFlow:
                     moved[j] += size + pushed
         rest = 2.0 * np.append(rates[::-1].cumsum()[::-1][1:], 0.0)
         return Looks(u, degree, paces[1:], rest, drives, moved)
+
+    @property
+    def inputs(self) -> int:
+        """How many inputs there are, a drift and disturbances among them."""
+        return self.system.controls + (self.system.c is not None) + self.system.disturbances
 
     @property
     def units(self) -> Array:
@@ -475,8 +485,31 @@ class SpreadFlow:
 
     @cached_property
     def marks(self) -> list[float]:
-        """Where segments begin and end."""
-        return [0.0, *self.ends]
+        """Where segments begin and end, and between these where the norms of transitions would grow by much."""
+        parts, found = self._parts, [0.0]
+        for start, stop, count in zip([0.0, *self.ends[:-1]], self.ends, parts.tolist(), strict=True):
+            found += [start + (stop - start) * k / count for k in range(1, count)] + [stop]
+        return found
+
+    @cached_property
+    def _parts(self) -> np.ndarray:
+        """Into how many parts each segment is cut."""
+        grows = self._most[0].sum(axis=1) * np.diff([0.0, *self.ends])
+        wanted = np.ceil(grows / GROWING)
+        return np.asarray(np.maximum(np.floor(wanted * min(1.0, MOST_MARKS / wanted.sum())), 1.0), dtype=int)
+
+    @cached_property
+    def _sizes(self) -> tuple[Array, Array]:
+        """`_most` between all marks."""
+        return self._between(self._most)
+
+    @cached_property
+    def _left(self) -> tuple[Array, Array]:
+        """`_off` between all marks."""
+        return self._between(self._off)
+
+    def _between(self, sizes: tuple[Array, Array]) -> tuple[Array, Array]:
+        return np.repeat(sizes[0], self._parts, axis=0), np.repeat(sizes[1], self._parts, axis=0)
 
     def _degrees(self, sizes: Array) -> Array:
         """The norms ``(..., M)`` of all parts summed by their degree, ``(..., D + 1)``."""
@@ -488,16 +521,16 @@ class SpreadFlow:
     def _most(self) -> tuple[Array, Array]:
         """The norms of ``A`` on every segment by degree, ``(K, D + 1)``, and those of the columns of ``[B E]``, ``(K, m
         + mw, D + 1)``, all in own units."""
+        return self._norms(0)
+
+    def _norms(self, order: int) -> tuple[Array, Array]:
+        """Those of their derivatives of an ``order``, 0 or 1."""
         d, u, states, inputs = self.system.states, self.units, [], []
         for one in self.segments:
             far = upper(abs(_ball(one.stop) - _ball(one.centre)).max(abs(_ball(one.start) - _ball(one.centre))))
             table = np.array([
                 [
-                    [
-                        float((sum((upper(abs(c)) * far**k for k, c in enumerate(entry.coeffs())), far * 0)
-                               + upper(abs(left)) * far ** (ORDER + 1)).upper())
-                        for entry, left in zip(*rows, strict=True)
-                    ]
+                    [_largest_of(entry, left, far, order) for entry, left in zip(*rows, strict=True)]
                     for rows in zip(*part, strict=True)
                 ]
                 for part in zip(one.law, one.left, strict=True)
@@ -521,7 +554,7 @@ class SpreadFlow:
     @cached_property
     def _within_norms(self) -> Array:
         """What a segment makes of norms by degree, anywhere on it, ``(K, D + 1, D + 1)``."""
-        sizes, n = self._most[0], self.monomials.degree + 1
+        sizes, n = self._sizes[0], self.monomials.degree + 1
         rate = np.zeros((len(sizes), n, n))
         for j in range(n):
             for i in range(j + 1):
@@ -536,8 +569,8 @@ class SpreadFlow:
     def _beyond(self, norms: Array) -> float:
         """The integral over the horizon of what is beyond the degree where the state's norms by degree are at most
         ``norms (K, D + 1)`` on every segment."""
-        sizes = np.cumsum(self._most[0][:, ::-1], axis=1)
-        factors = np.concatenate([np.zeros((len(sizes), 1)), sizes[:, :-1]], axis=1) + self._off[0][:, None]
+        sizes = np.cumsum(self._sizes[0][:, ::-1], axis=1)
+        factors = np.concatenate([np.zeros((len(sizes), 1)), sizes[:, :-1]], axis=1) + self._left[0][:, None]
         return float(((norms * factors).sum(axis=1) * self._lengths).sum() * OUTWARD)
 
     @cached_property
@@ -573,20 +606,47 @@ class SpreadFlow:
     def lost(self, begun: Array, inputs: Array) -> Array:
         """What is beyond the degree of any state, ``(d,)``, that begins at no more than ``begun (d,)`` and is driven by
         at most ``inputs (m + mw,)``."""
-        sizes, lengths, u, n = self._most, self._lengths, self.units, self.monomials.degree + 1
-        driven = np.einsum("kcj,c->kj", sizes[1], inputs)
-        ends = float(np.exp(((sizes[0].sum(axis=1) + self._off[0]) * lengths).max())) * OUTWARD
-        carried, within = self._carried, self._within_norms
-        share = ends * self._beyond(np.einsum("kij,j->ki", within, carried))
+        missing = float((self._left[1] @ inputs * self._lengths).sum() * OUTWARD)
+        return self._growth * (self._beyond(self.reached(begun, inputs)) + missing) * self.units * OUTWARD
+
+    @cached_property
+    def _growth(self) -> float:
+        """The norm of the transitions from any time to any later one, at any parameter."""
+        ends = float(np.exp(((self._sizes[0].sum(axis=1) + self._left[0]) * self._lengths).max())) * OUTWARD
+        carried = self._carried
+        share = ends * self._beyond(np.einsum("kij,j->ki", self._within_norms, carried))
         if not share < 0.5:
             raise Unchecked("what the expansion in the parameters leaves out is not bounded")
-        growth = ends * ends * float(carried.sum()) / (1.0 - share) * OUTWARD
+        return ends * ends * float(carried.sum()) / (1.0 - share) * OUTWARD
+
+    def reached(self, begun: Array, inputs: Array) -> Array:
+        """The norms by degree of the coefficients of such states, at most, on every segment, ``(K, D + 1)``."""
+        sizes, lengths, u, n = self._sizes, self._lengths, self.units, self.monomials.degree + 1
+        driven, carried, within = np.einsum("kcj,c->kj", sizes[1], inputs), self._carried, self._within_norms
         pushed = (np.einsum("kij,kj->ki", within, driven) * lengths[:, None]).sum(axis=0)
         pushed[0] += float((begun / u).max(initial=0.0))
         at_marks = np.array([sum(carried[j - i] * pushed[i] for i in range(j + 1)) for j in range(n)])
-        norms = np.einsum("kij,kj->ki", within, at_marks + lengths[:, None] * driven)
-        missing = float((self._off[1] @ inputs * lengths).sum() * OUTWARD)
-        return growth * (self._beyond(norms) + missing) * u * OUTWARD
+        return np.asarray(np.einsum("kij,kj->ki", within, at_marks + lengths[:, None] * driven) * OUTWARD)
+
+    def bent(self, start: float, inputs: Array, states: float) -> float:
+        """How fast the slopes of states may change at any parameter, in own units: of states that are at most
+        ``states`` in the norm of these, driven by at most ``inputs (m + mw,)``, on the segment that a time is in."""
+        place = max(0, bisect_right(self._begins, start) - 1)
+        a, b, faster, driven = (one[place].sum(axis=-1) for parts in (self._most, self._moving) for one in parts)
+        return float(((driven + a * b) @ inputs + (faster + a * a) * states) * OUTWARD)
+
+    @cached_property
+    def _moving(self) -> tuple[Array, Array]:
+        return self._norms(1)
+
+
+def _largest_of(entry: arb_poly, left: arb, far: arb, order: int) -> float:
+    """The largest absolute value, no further than ``far`` from its centre, of a polynomial with what is ``left``, or of
+    its derivative."""
+    coefficients = [upper(abs(one)) for one in entry.coeffs()]
+    coefficients += [far * 0] * (ORDER + 1 - len(coefficients)) + [upper(abs(left))]
+    powers = enumerate(coefficients[order:])
+    return float(sum((one * (n + 1) ** order * far**n for n, one in powers), far * 0).upper())
 
 
 @final

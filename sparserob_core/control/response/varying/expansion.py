@@ -8,6 +8,7 @@ what the remainder may add by the formula of variation of constants.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -218,12 +219,12 @@ class Expansion:
     def kernel(self, starts: Array, stops: Array) -> Kernel:
         """The kernel of intervals ``(k,)`` within one segment each. With ``Psi(r) = Phi(end, end - r h)``, ``Psi' = h
         Psi A``: a series majorised by that of ``y' = a y``, times that of ``F``."""
-        d, segments = self.units.size, self.segment_of((starts + stops) / 2)
+        d, own, segments = self.units.size, self.own, self.segment_of((starts + stops) / 2)
         length = stops - starts
         law, bulk = self._recentred(segments, stops, -length, length)
-        A, F, scale = law[..., :d], law[..., d:], self.units / self.units[:, None]
-        sizes, full = ((np.abs(one[..., :d]) * scale).sum(axis=3).max(axis=2) for one in (law, bulk))
-        pushes, fuller = (self._driven(one[..., d:]) for one in (law, bulk))
+        A, F, scale = law[..., :own], law[..., own:], self.units / self.units[:, None]
+        sizes, full = (self._norm(one[..., :own]) for one in (law, bulk))
+        pushes, fuller = (self._driven(one[..., own:]) for one in (law, bulk))
         rest = self.remainder[segments] * length[:, None, None]
         lost = self._driven(rest[..., d:])
         inputs, most = _totals(pushes, lost)
@@ -239,16 +240,37 @@ class Expansion:
                     tail = np.fmin(tail, y * (shares * R**orders).sum(axis=1) * R ** -float(terms) / (R - 1.0))
             if (tail <= IDLE).all():
                 break
-        back, found = [np.tile(np.eye(d), (length.size, 1, 1))], []
-        for n in range(terms + 1):
-            last = min(n, DEGREE)
-            found.append(sum((back[n - k] @ F[:, k] for k in range(1, last + 1)), back[n] @ F[:, 0]))
-            back.append(sum((back[n - k] @ A[:, k] for k in range(1, last + 1)), back[n] @ A[:, 0]) / (n + 1))
+        found = self._backwards(A, F, terms)
         a, a_full = sizes.sum(axis=1), full.sum(axis=1)
         forced = (fuller.sum(axis=1) / most).max(axis=(1, 2), initial=0.0)
         rounded = rounding((DEGREE + 1) * (d + 4)) * (2.0 + a_full) * np.exp(a_full) * forced
         error = tail + (r + lost * (1.0 + r)) * np.exp(a + r) + rounded
-        return Kernel(np.stack(found, axis=1), error * (1.0 + 1e-9), inputs)
+        return Kernel(found, error * (1.0 + 1e-9), inputs)
+
+    def _backwards(self, A: Array, F: Array, terms: int) -> Array:
+        """The terms ``(k, terms + 1, d, m + mw)`` of ``Psi F`` with ``Psi' = Psi A``, ``Psi(0) = I``, from those of ``A
+        (k, DEGREE + 1, d, own)`` and ``F``; where the states are coefficients of polynomials, as in `_of_ring`."""
+        count, own = len(A), self.own
+        A, F = (one.reshape(count, DEGREE + 1, -1, own, one.shape[3]) for one in (A, F))
+        size = A.shape[2]
+        left, right, target = np.zeros((3, 1), dtype=int) if self.spread is None else self.spread.space.products
+        factors = [(left[right == b], target[right == b]) for b in range(size)]
+
+        def times(series: Sequence[Array], n: int, other: Array, there: Sequence[tuple[int, int]]) -> Array:
+            found = np.zeros((count, size, own, other.shape[4]))
+            for k, b in there:
+                if k <= n:
+                    mine, place = factors[b]
+                    found[:, place] += series[n - k][:, mine] @ other[:, k, b, None]
+            return found
+
+        of_A, of_F = (list(zip(*np.nonzero(one.any(axis=(0, 3, 4))), strict=True)) for one in (A, F))
+        back, found = [np.zeros((count, size, own, own))], []
+        back[0][:, 0] = np.eye(own)
+        for n in range(terms + 1):
+            found.append(times(back, n, F, of_F).reshape(count, size * own, -1))
+            back.append(times(back, n, A, of_A) / (n + 1))
+        return np.stack(found, axis=1)
 
     def _recentred(self, segments: np.ndarray, times: Array, steps: Array, length: Array) -> tuple[Array, Array]:
         """The coefficients of ``[A F]`` times a ``length (k,)`` in powers of the share of ``steps (k,)`` that are made
