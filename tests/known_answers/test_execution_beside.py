@@ -344,3 +344,27 @@ def test_scenarios_have_the_worst_errors_in_them(name: str, tmp_path: Path) -> N
     found = sr.run({**config, "method": {"name": "scenario", "scenarios": 3}}, out=tmp_path / "run", figures=False)
     assert found.result.status == "certified"  # nothing is left to be drawn
     assert found.result.cost == pytest.approx(least_cost(problem), rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["one system", "delay from another control"])
+def test_initial_states_from_which_errors_are_borne_are_those_of_a_linear_program(name: str) -> None:
+    problem = {**PROBLEM, **CASES.get(name, {})}
+    config = {"problem": problem, "dictionaries": {"control": pieces(PIECES)}, "observers": []}
+    found = sr.initial_states(config, directions=8, values=0)
+    assert found.status == "verified"
+    G, h, _ = rows_of({**problem, "initial_state": [0.0, 0.0]})
+    moved = np.stack([h - rows_of({**problem, "initial_state": e})[1] for e in np.eye(2).tolist()], axis=1)
+    for direction, bound, reached in zip(found.directions, found.bounds, found.reached, strict=True):
+        best = linprog(
+            np.concatenate([np.zeros(G.shape[1]), -direction]),
+            A_ub=np.hstack([G, moved]),
+            b_ub=h,
+            bounds=[(0, 1)] * G.shape[1] + [(None, None)] * 2,
+            method="highs",
+        )
+        assert reached <= -best.fun <= bound + 3e-5  # between fine steps a wall is exceeded by a little
+        assert bound - reached < 1e-6
+    for point, control in zip(found.inner, found.controls, strict=True):
+        both = np.concatenate([np.maximum(control, 0.0).ravel(), np.maximum(-control, 0.0).ravel()])
+        assert (G @ both + moved @ point <= h + 1e-7).all()

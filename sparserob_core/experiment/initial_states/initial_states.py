@@ -82,11 +82,6 @@ def initial_states(
         for path, (expected, given, got) in refused.items():
             if given:
                 raise InputError(path=path, expected=f"{expected}, where the system changes with time", got=got)
-    if model.problem.execution is not None:
-        expected = "none: with errors of execution no set of initial states is proven yet"
-        raise InputError(
-            path="problem.execution", expected=expected, got=f"{np.asarray(model.problem.execution).tolist()}"
-        )
     if about is not None:
         begun = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
         model = from_state(model, np.append(_about(about, model.stated), begun))
