@@ -73,6 +73,13 @@ class ConvexSet(ABC):
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         """A maximiser ``(k, d)`` of ``c'x`` for each direction ``(k, d)``; finite wherever the support function is."""
 
+    @shaped
+    def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
+        """How large at most, in absolute value, the support function is at complex directions whose entries are within
+        ``spread (k, d)`` of ``centre (k, d)``, where it is continued to an analytic function of all of these; ``inf``
+        where it may not be. ``None``: nothing is known of the set."""
+        return None
+
     # What shape it is
 
     @property
@@ -551,6 +558,10 @@ class Box(ConvexSet):
         return rows[finite], bounds[finite]
 
     @shaped
+    def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
+        return continued_by_signs(self.middle(), (self.upper - self.lower) / 2.0, centre, spread)
+
+    @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         excess: Array = np.maximum(np.asarray(points) - self.upper, self.lower - np.asarray(points)).max(axis=-1)
         return excess
@@ -594,6 +605,25 @@ class Box(ConvexSet):
         return Box(self.lower / units, self.upper / units)
 
 
+def continued_by_signs(middle: Array, half: Array, centre: Array, spread: Array) -> Array:
+    """`ConvexSet.continued` of ``sum_i middle_i z_i + half_i |z_i|``, in which every ``|z_i|`` is ``z_i`` or ``-z_i``
+    where the sign cannot change."""
+    size = np.abs(centre)
+    fixed = (size > spread) | (spread == 0.0) | (half == 0.0)
+    return np.where(fixed.all(axis=1), (size + spread) @ (np.abs(middle) + half), np.inf)
+
+
+def continued_by_corners(corners: Array, centre: Array, spread: Array) -> Array:
+    """`ConvexSet.continued` of the largest of ``v'z``, ``v`` one of ``corners (v, d)``: of the one that is best there
+    alone; with the same value where others are equal to it at all of them."""
+    heights = centre @ corners.T
+    best = corners[heights.argmax(axis=1)]
+    apart = np.einsum("kvd,kd->kv", np.abs(best[:, None] - corners), spread)
+    behind = heights.max(axis=1, keepdims=True) - heights
+    alone = (behind > apart) | ~(best[:, None] != corners).any(axis=2)
+    return np.where(alone.all(axis=1), (np.abs(best) * (np.abs(centre) + spread)).sum(axis=1), np.inf)
+
+
 @dataclass(frozen=True, eq=False)
 class SetInUnits(ConvexSet):
     """``{x / units : x in base}``: any set in other units ``(d,)``. Made by `ConvexSet.in_units`."""
@@ -608,6 +638,10 @@ class SetInUnits(ConvexSet):
     @property
     def kind(self) -> str:
         return self.base.kind
+
+    @shaped
+    def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
+        return self.base.continued(centre / self.units, spread / self.units)
 
     @shaped
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:

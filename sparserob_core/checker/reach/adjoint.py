@@ -19,7 +19,8 @@ import numpy as np
 from sparserob_core.checker.outcome import Clock, Unchecked
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.flow import OwnUnits, middles, stacked
-from sparserob_core.checker.reach.measurable import Side, swept
+from sparserob_core.checker.reach.measurable import Side
+from sparserob_core.checker.sets.along import Curve
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -514,7 +515,7 @@ class Worst:
         return top, rad
 
     @cached_property
-    def _sides(self) -> tuple[Array, list[Side]]:
+    def _sides(self) -> tuple[Array, list[Side | Curve]]:
         assert self.pushed is not None
         return middle(self.pushed), Side.of(self.pushed)
 
@@ -535,18 +536,9 @@ class Worst:
         lost = off.sum(axis=1) + rounding(2 * ORDER) * size
         value, more = np.zeros(steps.size), np.zeros(steps.size)
         for side in self._sides[1]:
-            corners = np.abs(side.corners)
-            P = np.einsum("kiw,vw->kiv", moved, side.corners)
-            e = (
-                lost @ (corners + side.rad).T
-                + size @ side.rad.T
-                + rounding(corners.shape[1] + 2 * ORDER) * size @ corners.T
-            )
-            high, over, less = swept(P, e * OUTWARD, 2.0 * shares - 1.0)
-            value, more = (
-                value + high,
-                more + np.maximum(over, less) + rounding(4 * ORDER) * 2.0 * np.abs(P).sum(axis=1).max(axis=1),
-            )
+            off = lost + rounding(size.shape[1] + 2 * ORDER) * size
+            high, over, less, tops = side.swept(moved, off, size, 2.0 * shares - 1.0)
+            value, more = value + high, more + np.maximum(over, less) + rounding(4 * ORDER) * 2.0 * tops
         half = self._row.step / 2.0
         return value * half, more * half * OUTWARD
 

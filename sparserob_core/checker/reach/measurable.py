@@ -25,6 +25,7 @@ from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
 from sparserob_core.checker.reach.flow import OwnUnits, column, flows, held, middles, stacked
+from sparserob_core.checker.sets.along import Curve
 from sparserob_core.checker.sets.flat import Boxed, Cornered
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
@@ -53,8 +54,8 @@ class Side:
     rad: Array
 
     @staticmethod
-    def of(shape: ConvexSet) -> list[Side]:
-        """Those of a set, counted from its middle: of a box one for every channel."""
+    def of(shape: ConvexSet) -> list[Side | Curve]:
+        """Those of a set, counted from its middle: of a box one for every channel, a curved one as it is."""
         from flint import arb, fmpq
 
         about, seen = [arb(float(m)) for m in middle(shape)], known(shape)
@@ -68,8 +69,28 @@ class Side:
             exact = [[arb(fmpq(x.numerator, x.denominator)) for x in corner] for corner in seen.corners]
             found = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
         else:
-            raise Unchecked("the checker knows measurable disturbances in boxes and polytopes only")
+            curved = Curve(seen, middle(shape))
+            _ = curved.far  # of a set that is not known it is `Unchecked`
+            return [curved]
         return [Side(one.mid, one.rad) for one in (Enclosed.of(stacked(rows)) for rows in found)]
+
+    @property
+    def dimension(self) -> int:
+        """How many coordinates there are."""
+        return int(self.corners.shape[1])
+
+    @cached_property
+    def far(self) -> Array:
+        """How far the set goes from 0 along every coordinate, at most, ``(mw,)``."""
+        return np.asarray((np.abs(self.corners) + self.rad).max(axis=0) * OUTWARD)
+
+    def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
+        """The integral over ``u`` from -1 to ``ends (n,)`` of the support function at polynomials ``plain (n, p + 1,
+        mw)``, which are off by at most ``off (n, mw)`` and whose coefficients add up to ``sizes (n, mw)``: values, by
+        how much more and less it may be, and the largest heights, ``(n,)`` each."""
+        P = np.einsum("npw,vw->npv", plain, self.corners)
+        e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
+        return *swept(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
 
 
 @final
@@ -125,7 +146,7 @@ class Kernel:
         off = (off + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
         return plain, off
 
-    def most(self, a: Enclosed, sides: list[Side], share: float = 1.0) -> Enclosed:
+    def most(self, a: Enclosed, sides: Sequence[Side | Curve], share: float = 1.0) -> Enclosed:
         """The integral of the support function of ``K(r)'a`` for ``a (N, d)``, over the first ``share`` of the length:
         between bounds, as a middle and a radius ``(N,)``."""
         size, count = np.abs(a.mid), self.count
@@ -135,16 +156,13 @@ class Kernel:
         last = min(int(place), count - 1)
         ends = np.where(np.arange(count) < last, 1.0, 2.0 * min(place - last, 1.0) - 1.0)[: last + 1]
         low, high, lost = np.zeros(len(size)), np.zeros(len(size)), np.zeros(len(size))
+        begun = [part[:, : last + 1].reshape(-1, *part.shape[2:]) for part in (plain, off, large)]
+        off = begun[1] + rounding(off.shape[2] + 2 * ORDER + 8) * begun[2]
         for side in sides:
-            C = np.abs(side.corners)
-            P = np.einsum("nspw,vw->nspv", plain[:, : last + 1], side.corners)
-            sums = np.abs(P).sum(axis=2)
-            e = (off[:, : last + 1] + rounding(C.shape[1] + 2 * ORDER + 8) * large[:, : last + 1]) @ (C + side.rad).T
-            e = (e + large[:, : last + 1] @ side.rad.T) * OUTWARD
-            value, more, less = swept(P.reshape(-1, *P.shape[2:]), e.reshape(-1, e.shape[2]), np.tile(ends, len(size)))
-            value, more, less = (one.reshape(len(size), -1).sum(axis=1) for one in (value, more, less))
+            every = side.swept(begun[0], off, begun[2], np.tile(ends, len(size)))
+            *bounds, tops = (one.reshape(len(size), -1) for one in every)
+            value, more, less = (one.sum(axis=1) for one in bounds)
             low, high = low + value - less, high + value + more
-            tops = sums.max(axis=2)
             lost += rounding(4 * count + 8) * 2.0 * tops.sum(axis=1)
             if share < 1.0:
                 lost += APART * count * tops.max(axis=1)
@@ -152,9 +170,9 @@ class Kernel:
         rad = (high - low) / 2.0 + (lost * self.half + rounding(4) * (np.abs(low) + np.abs(high)))
         return Enclosed((low + high) / 2.0, rad * OUTWARD)
 
-    def steepest(self, a: Array, sides: list[Side]) -> Array:
+    def steepest(self, a: Array, sides: Sequence[Side | Curve]) -> Array:
         """How fast the support function of ``K(r)'a`` changes with ``r`` at most, ``a (N, d)`` exact: ``(N,)``."""
-        radii = sum(((np.abs(side.corners) + side.rad).max(axis=0) for side in sides), np.zeros(self.off.shape[2]))
+        radii = sum((side.far for side in sides), np.zeros(self.off.shape[2]))
         large = np.einsum("nd,spdw->npsw", np.abs(a), np.abs(self.coefficients))
         plain = np.abs(np.einsum("nd,spdw->npsw", a, self.coefficients)) + rounding(a.shape[1]) * large
         slopes = (np.arange(ORDER + 1)[:, None, None] * plain).sum(axis=1) / self.half
@@ -259,7 +277,7 @@ class MeasurableLoop(ClosedLoop):
         return [0, *accumulate([d] * (self.blocks + (self.initial is not None)))]
 
     @cached_property
-    def sides(self) -> list[Side]:
+    def sides(self) -> list[Side | Curve]:
         """The sets of the deviations, which add up."""
         assert self.shape is not None
         return Side.of(self.shape)

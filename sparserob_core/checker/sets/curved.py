@@ -20,6 +20,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
+DIGITS = 4  # times the working precision, in which an ellipsoid is compared with its factor
 LEAST = 2.0**-1000  # of an error: smaller ones have lost digits to underflow
 MOST_ENDS = 8  # dimension up to which a ball of a p-norm is looked at in all corners of a range
 
@@ -63,14 +64,24 @@ class Ellipsoidal(Shape):
 
     @cached_property
     def round(self) -> tuple[Array, Array]:
-        """Cholesky's factor is rounded: what the matrix exceeds ``L L'`` by, as a share of it, is measured in balls."""
-        from flint import arb_mat
+        return self.centre, self.source.factor * np.nextafter(1.0 + self.missed, np.inf) * OUTWARD
+
+    @cached_property
+    def missed(self) -> float:
+        """Cholesky's factor is rounded: what the matrix differs from ``L L'`` by, as a share of it, measured in
+        balls."""
+        from flint import arb_mat, ctx
 
         L = self.source.factor
-        inverse = arb_mat(L.tolist()).inv()
-        shares = (inverse * arb_mat(self.source.shape.tolist()) * inverse.transpose()).tolist()
-        off = total((x - int(i == j)) ** 2 for i, row in enumerate(shares) for j, x in enumerate(row))
-        return self.centre, L * np.nextafter(1.0 + above(off.nonnegative_part().sqrt()), np.inf) * OUTWARD
+        with ctx.workprec(DIGITS * ctx.prec):  # of a long one most of them cancel
+            inverse = arb_mat(L.tolist()).inv()
+            shares = (inverse * arb_mat(self.source.shape.tolist()) * inverse.transpose()).tolist()
+            rest = [x - int(i == j) for i, row in enumerate(shares) for j, x in enumerate(row)]
+            # a square as a product: a power of a ball that holds 0 is none
+            found = above(total(x * x for x in rest).nonnegative_part().sqrt())
+        if not found < 1.0:
+            raise Unchecked("the ellipsoid is too long for its axes to be told in floats")
+        return found
 
 
 @final

@@ -76,6 +76,16 @@ class Boxed(Flat):
             self._low, self._high = [m - radius for m in middles], [m + radius for m in middles]
 
     @cached_property
+    def exact(self) -> list[tuple[Fraction, Fraction]]:
+        """The ends of every side of a bounded one, as fractions."""
+        if isinstance(self.source, Box):
+            ends = zip(self.source.lower.tolist(), self.source.upper.tolist(), strict=True)
+            return [(Fraction(low), Fraction(high)) for low, high in ends]
+        assert isinstance(self.source, NormBall)
+        radius, middles = Fraction(float(self.source.radius)), [Fraction(float(m)) for m in self.source.centre]
+        return [(m - radius, m + radius) for m in middles]
+
+    @cached_property
     def facets(self) -> list[Facet]:
         axes = np.eye(self.dimension)
         return [(axis, b) for axis, b in zip(axes, self._high, strict=True) if b.is_finite()] + [

@@ -39,6 +39,7 @@ from sparserob_core.control.problem.terms.windows import (
     checked_set,
     restricts_nothing,
 )
+from sparserob_core.control.sets.integrals import enclosed
 from sparserob_core.control.sets.sets import Equality, Product
 from sparserob_core.control.term import (
     CONTROLS,
@@ -168,10 +169,11 @@ class OptimalControlProblem(Term):
             self._set("control_step", None if restricts_nothing(step) else step)
         self._check_disturbance()
         bound = self.measurable
-        if self.system.varies and bound is not None and bound.halfspaces() is None:
+        if self.system.varies and bound is not None and not enclosed(bound):
             raise InputError(
                 path="disturbance",
-                expected="a box or a polytope where the system changes with time and disturbances are measurable",
+                expected="a box, polytope, ellipsoid or ball where the system changes with time and disturbances are"
+                " measurable",
                 got=bound.kind,
             )
         self._set("measurements", self._measured())

@@ -39,6 +39,7 @@ from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.response.varying_motion import OUTWARD, SpreadMotion, VaryingMotion, VaryingSupport
+from sparserob_core.control.sets.integrals import curved_integral, enclosed
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -177,8 +178,8 @@ class MeasurableSupport:
 
     @property
     def is_enclosed(self) -> bool:
-        """Whether `enclosed` is close: the set is flat."""
-        return self.bound.halfspaces() is not None
+        """Whether `enclosed` is close: the set is flat, or its support function is known to be analytic."""
+        return enclosed(self.bound)
 
     @shaped
     def enclosed(
@@ -401,6 +402,8 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
     """Lower and upper bounds ``(l, 2)`` of the integrals of the support function of ``bound`` over intervals of
     ``lengths (l,)``, on which its argument is a polynomial with ``terms (l, p + 1, w)`` in the share of the
     interval that has passed; intervals across a kink are halved until their bounds are within ``accuracy (l,)``."""
+    if bound.halfspaces() is None:
+        return curved_integral(bound, terms, lengths, accuracy)
     total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
     order = terms.shape[1] - 1
     points = np.einsum("kj,ljw->lkw", bezier(order), terms)

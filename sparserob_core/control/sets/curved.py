@@ -13,9 +13,21 @@ import numpy.typing as npt
 from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Bool, Float, dense, sealed, shaped
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, bisect, few_digits, ratios, vertex_excess
+from sparserob_core.sip.convex_set import (
+    Array,
+    Box,
+    ConvexSet,
+    as_bound,
+    bisect,
+    continued_by_corners,
+    continued_by_signs,
+    few_digits,
+    ratios,
+    vertex_excess,
+)
 
 _SIGN_DIMENSIONS = 10
+ROOM = 0.999  # of a sum of powers, by which it may move: it is away from 0 whatever rounding does
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +85,11 @@ class Ellipsoid(ConvexSet):
         directions = np.asarray(directions, dtype=float)
         height: Array = directions @ self.centre + np.linalg.norm(directions @ self.factor, axis=-1)
         return height
+
+    @shaped
+    def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
+        root = _continued_root(centre @ self.factor, spread @ np.abs(self.factor), 2.0)
+        return np.asarray((np.abs(centre) + spread) @ np.abs(self.centre) + root)
 
     @shaped
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
@@ -199,6 +216,16 @@ class NormBall(ConvexSet):
         directions = np.asarray(directions, dtype=float)
         height: Array = directions @ self.centre + self.radius * np.linalg.norm(directions, ord=self.dual, axis=-1)
         return height
+
+    @shaped
+    def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
+        if self.p == np.inf or self.dimension == 1:
+            return continued_by_signs(self.centre, np.full(self.dimension, self.radius), centre, spread)
+        if self.p == 1.0:
+            axes = self.radius * np.eye(self.dimension)
+            return continued_by_corners(self.centre + np.vstack([axes, -axes]), centre, spread)
+        root = self.radius * _continued_root(centre, spread, self.dual)
+        return np.asarray((np.abs(centre) + spread) @ np.abs(self.centre) + root)
 
     @shaped
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
@@ -423,6 +450,22 @@ def _pivoted(matrix: Array) -> Array:
         columns.append(rest[pivot] / np.sqrt(rest[pivot, pivot]))
         rest = rest - np.outer(columns[-1], columns[-1])
     return np.array(columns).reshape(len(columns), matrix.shape[0])
+
+
+def _continued_root(a: Array, b: Array, q: float) -> Array:
+    """How large ``(sum_i z_i^q)^(1/q)`` is at most where every ``z_i`` is within ``b_i`` of ``|a_i|``; ``inf`` where
+    the sum may leave the right half-plane, or for ``q`` other than 2 an entry may be 0 without being 0 everywhere.
+
+    ``z^q`` is off by at most ``q b (|a| + b)^(q - 1)``, the integral of its slope; ``a, b (k, d)``; returns ``(k,)``.
+    """
+    largest = (np.abs(a) + b).max(axis=1, keepdims=True)
+    unit = np.where(largest > 0.0, largest, 1.0)
+    a, b = np.abs(a) / unit, b / unit
+    total, off = (a**q).sum(axis=1), (q * b * (a + b) ** (q - 1.0)).sum(axis=1)
+    analytic = off < ROOM * total
+    if q != 2.0:
+        analytic &= ((a > b) | (b == 0.0)).all(axis=1)
+    return np.where(analytic, unit[:, 0] * (total + off) ** (1.0 / q), np.inf)
 
 
 @shaped

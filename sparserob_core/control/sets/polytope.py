@@ -16,7 +16,7 @@ import numpy.typing as npt
 from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, dense, sealed, shaped
-from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_excess
+from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, continued_by_corners, vertex_excess
 
 _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
@@ -203,6 +203,10 @@ class Polytope(ConvexSet):
             highest: Array = (directions @ self.vertices.T).max(axis=-1)
             return highest
         return self._maximise_all(directions.reshape(-1, self.dimension))[0].reshape(directions.shape[:-1])
+
+    @shaped
+    def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
+        return None if self.vertices is None else continued_by_corners(self.vertices, centre, spread)
 
     def scaled(self, factor: float) -> Polytope:
         offset = self.H @ self.middle()

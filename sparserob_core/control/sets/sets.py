@@ -301,6 +301,13 @@ class Product(ConvexSet):
         return np.asarray(sum(part.support(own) for part, own in self.split(directions)))
 
     @shaped
+    def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
+        every = zip(self.split(centre), self.split(spread), strict=True)
+        found = [part.continued(own, apart) for (part, own), (_, apart) in every]
+        known = [one for one in found if one is not None]
+        return np.sum(known, axis=0) if len(known) == len(found) else None
+
+    @shaped
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         return np.concatenate([part.support_point(own) for part, own in self.split(directions)], axis=-1)
 

@@ -9,6 +9,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.sets.integrals import enclosed
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.errors import NotEnclosable
 
@@ -53,10 +54,10 @@ def announced(why: str, limited: bool) -> str:
 
 def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
     """What a claim about a problem rests on that is not proven; empty where there is nothing of the kind, as where the
-    set of measurable disturbances is flat. Under ``feedback`` the checker proves it."""
+    integrals over the set of measurable disturbances are enclosed. Under ``feedback`` the checker proves it."""
     if problem.measurable is None:
         return ""
-    if not feedback and problem.measurable.halfspaces() is not None:
+    if not feedback and enclosed(problem.measurable):
         return ""
     if feedback:
         return (

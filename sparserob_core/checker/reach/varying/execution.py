@@ -23,6 +23,7 @@ from sparserob_core.checker.reach.measurable import Side, signed, swept
 from sparserob_core.checker.reach.varying.flow import VaryingFlow, products
 from sparserob_core.checker.reach.varying.loop import ORDER
 from sparserob_core.checker.reach.varying.spread import SpreadFlow
+from sparserob_core.checker.sets.along import Curve
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
 
@@ -54,7 +55,7 @@ class VaryingExecution:
     first: int = 0
     off: Array | None = None
     numb: Sequence[int] = ()
-    side: Side | None = None
+    side: Side | Curve | None = None
     _kernels: dict[tuple[float, float], Enclosed] = field(default_factory=dict, repr=False)
     _onward: dict[int, Enclosed] = field(default_factory=dict, repr=False)
     _added: dict[tuple[float, bytes], tuple[Array, Array]] = field(default_factory=dict, repr=False)
@@ -81,14 +82,14 @@ class VaryingExecution:
     @property
     def columns(self) -> int:
         """How many columns of ``[B E]`` it enters through."""
-        return int(self.shares.size if self.side is None else self.side.corners.shape[1])
+        return int(self.shares.size if self.side is None else self.side.dimension)
 
     @cached_property
     def _far(self) -> Array:
         """How far from 0 at most what enters by each column is, ``(m,)``, as a multiple of its size."""
         if self.side is None:
             return np.ones(self.shares.size)
-        return np.asarray((np.abs(self.side.corners) + self.side.rad).max(axis=0) * OUTWARD)
+        return self.side.far
 
     def least(self, c: Array, time: float) -> Array:
         """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
@@ -185,15 +186,14 @@ class VaryingExecution:
         return (value - less) / OUTWARD, (value + more) * OUTWARD, which
 
     @staticmethod
-    def _together(side: Side, plain: Array, off: Array) -> tuple[Array, Array]:
+    def _together(side: Side | Curve, plain: Array, off: Array) -> tuple[Array, Array]:
         """Bounds ``(q, n, 1)`` of the integrals of the support function of a set at polynomials ``(q, n, p + 1, m)``
         that are off by ``off (q, n, m)``."""
-        q, n, order, _ = plain.shape
-        far, sizes = np.abs(side.corners) + side.rad, np.abs(plain).sum(axis=2)
-        P = np.einsum("qnpm,vm->qnpv", plain, side.corners)
-        e = (off @ far.T + sizes @ side.rad.T + rounding(4 * order + 32 + far.shape[1]) * (sizes @ far.T)) * OUTWARD
-        found = swept(P.reshape(q * n, order, -1), e.reshape(q * n, -1), np.ones(q * n))
-        value, more, less = (one.reshape(q, n, 1) / 2.0 for one in found)
+        q, n, order, m = plain.shape
+        sizes = np.abs(plain).sum(axis=2).reshape(q * n, m)
+        lost = off.reshape(q * n, m) + rounding(4 * order + 32 + m) * sizes
+        found = side.swept(plain.reshape(q * n, order, m), lost, sizes, np.ones(q * n))
+        value, more, less, _ = (one.reshape(q, n, 1) / 2.0 for one in found)
         return np.minimum(value - less, (value - less) / OUTWARD), np.maximum(value + more, 0.0) * OUTWARD
 
     def _kernel(self, start: float, stop: float) -> Enclosed:

@@ -1,0 +1,115 @@
+"""Guards checker/sets/along.py: support functions of curved sets along polynomials, beside balls of many digits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from flint import arb, ctx
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.closed_loop import middle
+from sparserob_core.checker.sets.along import LEFT, NODES, Curve, _heights, _most, rule
+from sparserob_core.checker.sets.known import known
+from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope, Zonotope, product
+
+SETS: dict[str, ConvexSet] = {
+    "ellipsoid": Ellipsoid([0.1, -0.3], [[0.04, 0.01], [0.01, 0.09]]),
+    "long ellipsoid": Ellipsoid([5.0, 0.0], [[1.0, 1.9999], [1.9999, 4.0]]),
+    "ball": NormBall(2.0, 0.7, [0.1, 0.0]),
+    "3-norm": NormBall(3.0, 0.7, dimension=2),
+    "1.3-norm": NormBall(1.3, 0.7, dimension=2),
+    "product": product([NormBall(2.0, 0.5, dimension=2), Box([-1.0], [2.0])]),
+    "with a triangle": product([Polytope([[-1, 0], [0, -1], [1, 1]], [0.4, -0.1, 1.0]), NormBall(2.0, 0.5, [1, 0])]),
+}
+
+
+def curve(bound: ConvexSet) -> Curve:
+    return Curve(known(bound), middle(bound))
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("size", [1.0, 1e-180, 1e150])
+def test_heights_are_those_of_the_set_in_balls(name: str, size: float) -> None:
+    bound, rng = SETS[name], np.random.default_rng(1)
+    some = curve(bound)
+    more = np.array([[1.0, -0.5, 2.0, 0.25][: bound.dimension]])
+    values = size * np.vstack([rng.normal(size=(20, bound.dimension)), np.eye(bound.dimension), more])
+    heights, off = _heights(some.shape, some.about, values)
+    with ctx.workprec(300):
+        for c, height, wrong in zip(values, heights, off, strict=True):
+            moved = sum((a * b for a, b in zip(balls(c), balls(some.about), strict=True)), arb(0))
+            assert abs(known(bound).support(balls(c)) - moved - arb(float(height))) < arb(float(wrong))
+            assert wrong <= (1e-11 if "long" in name else 1e-13) * size
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("end", [1.0, -0.4])
+def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, end: float) -> None:
+    bound, rng = SETS[name], np.random.default_rng(3)
+    some, count = curve(bound), 8
+    plain = rng.normal(size=(5, count, bound.dimension)) * 0.4 ** np.arange(count)[:, None]
+    plain[:3, 0] += 2.0 * np.sign(plain[:3, 0])  # the other two may go through 0
+    plain[:3, 0, 0] += 3.0 * np.sign(plain[:3, 0, 0])  # one corner of the triangle is best
+    plain[4], vector = 0.0, rng.normal(size=bound.dimension)
+    plain[4, 0], plain[4, 1] = 0.75 * vector, vector  # a multiple of one vector, 0 at -0.75
+    zero = np.zeros((5, bound.dimension))
+    value, more, less, tops = some.swept(plain, zero, zero, np.full(5, end))
+    fine, shares = np.polynomial.legendre.leggauss(60)
+    for k in range(3):
+        total = 0.0
+        for a, b in zip(*(np.linspace(-1.0, end, 31)[i : 30 + i] for i in (0, 1)), strict=True):
+            u = (a + b) / 2 + (b - a) / 2 * fine
+            at = u[:, None] ** np.arange(count) @ plain[k]
+            total += float((bound.support(at) - at @ some.about) @ shares) * (b - a) / 2
+        assert -less[k] - 2e-15 * tops[k] <= total - value[k] <= more[k] + 2e-15 * tops[k]
+    (ahead, back), _ = _heights(some.shape, some.about, np.array([vector, -vector]))
+    exact = back * 0.25**2 / 2 + ahead * (end + 0.75) ** 2 / 2
+    assert -less[4] <= exact - value[4] <= more[4]
+    assert ((more + less) <= (1e-11 if "long" in name else 3e-13) * tops).all()
+    moved = some.swept(plain, zero + 1e-3, zero, np.full(5, end))
+    assert (moved[1] >= more + 1e-3 * (end + 1.0) * some.far.sum() * (1 - 1e-12)).all()
+    np.testing.assert_allclose(moved[0], value)
+
+
+def test_the_rule_of_gauss_is_the_one_whose_remainder_is_told() -> None:
+    with ctx.workprec(200):
+        nodes = [arb.legendre_p_root(NODES, k, weight=True) for k in range(NODES)]
+        for (x, w), node, weight in zip(nodes, *rule(), strict=True):
+            assert abs(x - arb(float(node))) < 1.2e-16 and abs(w - arb(float(weight))) < 1.2e-16
+        # of 1 / (z^2 + a^2), which is at most 1 / (a^2 - 9) where |z| <= 3
+        a = arb(3.0) + arb(2.0) ** -20
+        true = 2 * (1 / a).atan() / a
+        found = sum((w / (x * x + a * a) for x, w in nodes), arb(0))
+        assert abs(true - found) * (a * a - 9) < LEFT
+
+
+def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> None:
+    corners = Polytope([[-1, 0], [0, -1], [1, 1]], [0.0, 0.0, 1.0])
+
+    def analytic(bound: ConvexSet, centre: list[float], spread: list[float]) -> bool:
+        return bool(np.isfinite(_most(known(bound), np.zeros(len(centre)), np.array([centre]), np.array([spread]))[0]))
+
+    ball, third = NormBall(2.0, 1.0, dimension=2), NormBall(3.0, 1.0, dimension=2)
+    assert not analytic(ball, [1.0, 0.0], [0.0, 1.0])  # 1 + i^2 = 0
+    assert not analytic(ball, [1.0, 0.0], [1.0, 0.0]) and analytic(ball, [1.0, 0.0], [0.2, 0.2])
+    assert not analytic(third, [1.0, 0.1], [0.0, 0.1]) and analytic(third, [1.0, 0.0], [0.1, 0.0])
+    assert analytic(Box([-1.0], [1.0]), [1.0], [0.99]) and not analytic(Box([-1.0], [1.0]), [1.0], [1.0])
+    assert analytic(corners, [1.0, 0.5], [0.24, 0.24]) and not analytic(corners, [1.0, 0.5], [0.26, 0.26])
+    with pytest.raises(Unchecked, match="boxes, polytopes, ellipsoids"):
+        analytic(product([ball, Zonotope(np.zeros(1), np.ones((1, 1)))]), [1.0, 0.0, 1.0], [0.0, 0.0, 0.0])
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize("name", SETS)
+def test_what_is_said_of_complex_directions_holds_of_those_that_are_real(name: str) -> None:
+    bound, rng = SETS[name], np.random.default_rng(2)
+    some, centre = curve(bound), rng.normal(size=(200, bound.dimension))
+    spread = np.abs(centre) * rng.uniform(0.0, 0.4, size=centre.shape)
+    most = _most(some.shape, some.about, centre, spread)
+    assert np.isfinite(most).sum() > 10
+    for sign in rng.uniform(-1.0, 1.0, size=(20, bound.dimension)):
+        inside, _ = _heights(some.shape, some.about, centre + sign * spread)
+        assert (np.abs(inside) <= most).all()
