@@ -16,7 +16,7 @@ from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import measured, plain
 from sparserob_core.experiment.sweep.axes import Axis
 from sparserob_core.experiment.sweep.study import Study
-from sparserob_core.experiment.sweep.table import Row
+from sparserob_core.experiment.sweep.table import Row, axis_unit
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
     ax.plot([], [], color=look.INK, linewidth=0.8, label="proven lower bound (thin)")
     _scale(ax.set_xscale, along, [float(row[along.key]) for row in study.table])
     _cost_scale(ax.set_yscale, study.table)
-    ax.set_xlabel(along.key)
+    ax.set_xlabel(measured(along.key, axis_unit(along.key, study.table)))
     ax.set_ylabel(measured("cost $J$", study.cost_unit))
     _finish(figure, ax, study, told)
     return figure
@@ -188,8 +188,8 @@ def _map(study: Study, axes: Sequence[Axis]) -> Figure:
             edge: dict[str, Any] = {"edgecolors": colour} if kind else {"color": colour}
             ax.scatter(places[:, 0], places[:, 1], marker=MARKS[status], s=26, linewidths=1.0, **kind, **edge)
     figure.colorbar(drawn, ax=ax, label=measured("cost $J$", study.cost_unit))
-    ax.set_xlabel(first.key)
-    ax.set_ylabel(second.key)
+    ax.set_xlabel(measured(first.key, axis_unit(first.key, study.table)))
+    ax.set_ylabel(measured(second.key, axis_unit(second.key, study.table)))
     for spine in ("top", "right"):
         ax.spines[spine].set_visible(True)
     _finish(figure, ax, study, told=False, marked=[one for one in MARKS if one != "certified"])

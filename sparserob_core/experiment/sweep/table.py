@@ -65,6 +65,8 @@ MEANING = {
 """Unit and meaning of the columns. ``cost``, ``constraint`` and ``time``: the units in which the config states them;
 the columns of `UNITS` tell those that it names."""
 UNITS = {"cost": "units.cost", "constraint": "units.worst", "time": "units.time"}
+TIMES = frozenset({"horizon", "from", "to", "delay", "latency"})
+"""Keys that are times, wherever they stand in a config's problem."""
 
 
 def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str, digest: str, said: str = "") -> Row:
@@ -144,11 +146,21 @@ def shared_unit(rows: Iterable[Row], kind: str = "cost") -> str:
     return found.pop() if len(found) == 1 else ""
 
 
+def axis_unit(key: str, rows: Iterable[Row]) -> str:
+    """The unit of an axis, a key of the config: that of times where it is one, and all rows have the same; else empty,
+    since what other keys are measured in depends on what they are entries of."""
+    first, *steps = key.split(".")
+    names = [step for step in steps if not step.isdigit()]
+    return shared_unit(rows, "time") if first == "problem" and names and names[-1] in TIMES else ""
+
+
 def columns_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
     """The unit and the meaning of every column, as CSV."""
     lines = [["column", "unit", "meaning"]]
     for name in columns_of(axes, rows):
-        unit, meaning = ("", "an axis: this key of the config") if name in axes else MEANING.get(name, ("1", ""))
+        unit, meaning = MEANING.get(name, ("1", ""))
+        if name in axes:
+            unit, meaning = axis_unit(name, rows), "an axis: this key of the config"
         unit = (shared_unit(rows, unit) or unit) if unit in UNITS else unit
         if axis := _entry_of(name, axes):
             unit, meaning = "", f"the number at place {name.rpartition('.')[2]} of {axis}"

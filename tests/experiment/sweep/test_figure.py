@@ -12,6 +12,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.sweep.axes import parse_axes
 from sparserob_core.experiment.sweep.figure import MARKS, draw_study, write_study_figure
 from sparserob_core.experiment.sweep.study import Study, shown
+from sparserob_core.experiment.sweep.table import axis_unit, columns_text
 from sparserob_core.sip.result import MEANING
 
 pytest.importorskip("matplotlib")
@@ -123,6 +124,16 @@ def test_costs_have_the_unit_that_all_runs_share_and_names_are_no_formulas() -> 
         assert figure.axes[0].get_xlabel() == f"cost $J${told}, down to its proven lower bound"
         assert f"cost{told}" in shown(known)[0]
     figure.draw_without_rendering()
+
+
+def test_an_axis_that_is_a_time_has_its_unit() -> None:
+    for key, told in ("problem.horizon", " [s]"), ("problem.path.0.from", " [s]"), ("problem.control.box", ""):
+        rows = [{key: value, "cost": 1.0, "units.time": "s"} for value in (1.0, 2.0)]
+        figure = draw_study(study({key: [1.0, 2.0]}, rows))
+        assert figure.axes[0].get_xlabel() == f"{key}{told}"
+        assert f"{key},{told.strip(' []')},an axis" in columns_text([key], rows)
+    others = [{key: 1.0, "cost": 1.0, "units.time": unit} for unit in "sh"]
+    assert axis_unit("problem.horizon", others) == axis_unit("horizon", rows) == ""
 
 
 def test_many_seeds_of_a_category_are_a_box() -> None:
