@@ -244,7 +244,8 @@ class VaryingMotion:
     def grown(self, pieces: np.ndarray, width: Array, sizes: Array) -> Array:
         """What states of at most ``sizes (k, d)`` may become within a ``width (k,)`` of a piece, ``(k, d)``: by the
         exponential of the largest entries of ``A`` there."""
-        units, most, pace = self.expansion.units, self.most[pieces][:, :, : self.states], self._paces[pieces] * width
+        most, pace = self.most[pieces][:, :, : self.states], self._paces[pieces] * width
+        units = self.expansion.units * self.expansion.ratios[self._segments[pieces]]
         total, term = sizes.astype(float), sizes.astype(float)
         for n in range(1, GROWN):
             term = np.einsum("kij,kj->ki", most, term) * (width / n)[:, None]
@@ -306,7 +307,8 @@ class VaryingMotion:
         A, slope = most[:, :, :d], once[:, :, :d]
         second = once + A @ most
         third = twice + slope @ most + A @ once + second[:, :, :d] @ most
-        pace = (A / expansion.units[:, None] * expansion.units).sum(axis=2).max(axis=1)
+        units = expansion.units * expansion.ratios
+        pace = (A / units[:, :, None] * units[:, None]).sum(axis=2).max(axis=1)
         return most * OUTWARD, second * OUTWARD, third * OUTWARD, pace * OUTWARD
 
     @cached_property

@@ -123,7 +123,7 @@ class VaryingExecution:
         place = min(max(0, int(np.searchsorted(self.breakpoints, start, side="right")) - 1), len(self.pieces) - 1)
         size = (self.sizes.mid[place] + self.sizes.rad[place]) * self._far
         if size.any():
-            (most, slope), units = self.law.most(start, stop), np.array(self.law.units)
+            (most, slope), units = self.law.most(start, stop), np.array(self.law.units_on(start, stop))
             entering = slice(d + self.first, d + self.first + m)
             A, B = most[:, :d], most[:, entering]
             pace = float((A * units / units[:, None]).sum(axis=1).max())

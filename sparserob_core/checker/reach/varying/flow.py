@@ -30,6 +30,7 @@ ORDER = 24  # of the system in time on a segment; with a tenth of it segments ar
 TERMS = (16, 24, 32, 48, 64)  # of the solution over a part of a segment: the fewest that are sharp, else the last
 SHARP = 2.0**-100  # of the system's numbers, what is left out on a segment; 2^-10 would show in what states miss
 ENOUGH = 2.0**-64  # the same of a kernel, which goes on as numbers of 53 bits; 2^-54 would show, 2^-74 takes more terms
+SHORTER = 0.5  # of `LONG`, to which a slow part is brought: ten times less doubles digits lost, 1 takes more terms
 LONG = 2.0  # norm of the system times the length of a segment; ten times more takes more terms than there are
 FIRST = 8  # segments to begin with
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment holds a pole
@@ -41,13 +42,14 @@ CIRCLES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 24.0, 48.0, 96.0)
 @dataclass(frozen=True, eq=False)
 class Segment:
     """``[A B E]`` from ``start`` to ``stop``: a table of polynomials in the time since ``centre``, and balls ``left``
-    that hold what stands before the next power of it."""
+    that hold what stands before the next power of it. ``units``: of the states, in which it is small there."""
 
     start: float
     stop: float
     centre: float
     law: list[list[arb_poly]]
     left: list[list[arb]]
+    units: list[float]
 
 
 @final
@@ -94,6 +96,7 @@ class VaryingFlow:
     system: VaryingSystem
     until: float
     _known: dict[tuple[float, float], tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict)
+    _whole: dict[int, tuple[arb_mat, arb_mat]] = field(default_factory=dict)
     _weights: dict[tuple[float, ...], Weights] = field(default_factory=dict)
     _most: dict[float, tuple[Array, Array]] = field(default_factory=dict)
 
@@ -118,22 +121,41 @@ class VaryingFlow:
         except Unchecked:
             return None
         d, u = self.system.states, self.units
-        lost, size = arb(0), arb(0)
+        lost, size, most = arb(0), arb(0), []
         for i, row in enumerate(exact):
             sums, over = arb(0), arb(0)
+            most.append([])
             for j, entry in enumerate(row):
                 far = sum((upper(abs(one)) * half**k for k, one in enumerate(entry)), arb(0))
                 rest = upper(abs(wide[i][j][ORDER + 1])) * half ** (ORDER + 1)
                 if j < d:
-                    sums, over = sums + far * u[j] / u[i], over + rest * u[j] / u[i]
+                    most[i].append(far * u[j] / u[i])
+                    sums, over = sums + most[i][j], over + rest * u[j] / u[i]
                 elif not rest <= arb(SHARP) * self._inputs[j - d]:
                     return None
             size, lost = size.max(sums), lost.max(over)
-        most = size.max(arb(self._pace))
-        if not (size * (arb(stop) - arb(start)) <= LONG and lost <= arb(SHARP) * most):
+        ratios = [1.0] * d if size * (arb(stop) - arb(start)) <= LONG else self._slow(most, start, stop)
+        if ratios is None or not lost * max(ratios) <= arb(SHARP) * size.max(arb(self._pace)):
             return None
         law = [[arb_poly(entry) for entry in row] for row in exact]
-        return Segment(start, stop, centre, law, [[entry[ORDER + 1] for entry in row] for row in wide])
+        left = [[entry[ORDER + 1] for entry in row] for row in wide]
+        return Segment(start, stop, centre, law, left, [one * ratio for one, ratio in zip(u, ratios, strict=True)])
+
+    @staticmethod
+    def _slow(most: list[list[arb]], start: float, stop: float) -> list[float] | None:
+        """Ratios of units of the states, in which a system of at most ``most (d, d)`` is small enough on a segment, to
+        those in which it is not: with ``g`` a share of `LONG`, ``u = (1 - M / g)^-1 1`` has ``M u <= g u``; ``None``
+        where there are none. Any would be right."""
+        from flint import arb
+
+        M = np.array([[float(entry.upper()) for entry in row] for row in most]) * ((stop - start) / (SHORTER * LONG))
+        u = np.linalg.lstsq(np.eye(len(M)) - M, np.ones(len(M)), rcond=None)[0]
+        if not (np.isfinite(u).all() and u.min() > 0.0):
+            return None
+        ratios, h = [arb(float(one)) for one in np.maximum(u, 1.0)], arb(stop) - arb(start)
+        rows = [sum((entry * one for entry, one in zip(row, ratios, strict=True)), arb(0)) * h for row in most]
+        small = all(row <= LONG * ratio for row, ratio in zip(rows, ratios, strict=True))
+        return [float(one.mid()) for one in ratios] if small else None
 
     @staticmethod
     def _table(law: LinearSystem, centre: arb, length: int) -> list[list[list[arb]]]:
@@ -194,7 +216,7 @@ class VaryingFlow:
             times = [start, *begins[first + 1 : last + 1], stop]
             whole = None
             for number, (one, other) in enumerate(pairwise(times), first):
-                part = self._within(self.segments[number], one, other)
+                part = self._on(number, one, other)
                 whole = part if whole is None else (part[0] * whole[0], part[0] * whole[1] + part[1])
             assert whole is not None
             table = whole[1].tolist()
@@ -204,6 +226,15 @@ class VaryingFlow:
                 stacked([row[m:] for row in table]),
             )
         return self._known[start, stop]
+
+    def _on(self, number: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
+        """`_within` of a part of a segment; of the whole of it remembered, since many intervals go across it."""
+        segment = self.segments[number]
+        if (start, stop) != (segment.start, segment.stop):
+            return self._within(segment, start, stop)
+        if number not in self._whole:
+            self._whole[number] = self._within(segment, start, stop)
+        return self._whole[number]
 
     def _within(self, segment: Segment, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         """``Y(1)`` of ``Y' = h A Y + [0, h B, h E]`` in the share of the interval, ``Y(0) = [I, 0, 0]``."""
@@ -235,13 +266,13 @@ class VaryingFlow:
         from flint import arb, arb_poly
 
         segment = self._segment_of(start, stop)
-        d, h, u = self.system.states, arb(stop) - arb(start), [arb(one) for one in self.units]
+        d, h, u = self.system.states, arb(stop) - arb(start), [arb(one) for one in segment.units]
         shifted = arb_poly([arb(stop) - arb(segment.centre), -h])
         table = [[(entry(shifted) * h).coeffs() for entry in row] for row in segment.law]
         order = max(1, *(len(entry) for row in table for entry in row))
         rows = [[[entry[k] if k < len(entry) else arb(0) for entry in row] for row in table] for k in range(order)]
         A, F = ([stacked([row[part] for row in one]) for one in rows] for part in (slice(d), slice(d, None)))
-        tails, rest = _Tails(self._norms(table)), self._rest(segment, h)
+        tails, rest = _Tails(self._norms(table, segment)), self._rest(segment, h)
         columns = range(F[0].ncols())
         forced = [[_largest([upper(abs(F[k][i, j])) / u[i] for i in range(d)]) for k in range(order)] for j in columns]
         every = [_largest([one[k] for one in forced]) for k in range(order)] if forced else [arb(0)]
@@ -286,6 +317,10 @@ class VaryingFlow:
                 tables.append(np.array([[float(one.upper()) for one in row] for row in rows]))
             self._most[segment.start] = tables[0], tables[1]
         return self._most[segment.start]
+
+    def units_on(self, start: float, stop: float) -> list[float]:
+        """Units of the states in which the system is small on the segment that an interval is in."""
+        return self._segment_of(start, stop).units
 
     def _segment_of(self, start: float, stop: float) -> Segment:
         if not 0.0 <= start <= stop <= self.until:
@@ -344,7 +379,7 @@ class VaryingFlow:
             driven.append(arb_mat([[none] * d + row[d:] for row in rows]))
         first = [[arb(int(i == j)) for j in range(columns)] for i in range(d)]
         terms = [arb_mat(first)]
-        tails = _Tails(self._norms(table))
+        tails = _Tails(self._norms(table, segment))
         count = next((one for one in TERMS if tails.of(one, None) <= arb(SHARP)), TERMS[-1])
         for n in range(count):
             nexts = A[0] * terms[n]
@@ -355,11 +390,11 @@ class VaryingFlow:
             terms.append(nexts / (n + 1))
         return terms, self._left_out([[none] * columns for _ in range(d)], segment, table, h, tails, count)
 
-    def _norms(self, table: list[list[list[arb]]]) -> list[arb]:
-        """The norms of largest row sums, in own units, of the coefficients of ``A``."""
+    def _norms(self, table: list[list[list[arb]]], segment: Segment) -> list[arb]:
+        """The norms of largest row sums, in the units of a segment, of the coefficients of ``A``."""
         from flint import arb
 
-        d, u = self.system.states, [arb(one) for one in self.units]
+        d, u = self.system.states, [arb(one) for one in segment.units]
         found = []
         for k in range(max(len(entry) for row in table for entry in row)):
             sums = [
@@ -383,7 +418,7 @@ class VaryingFlow:
         power of the time, by the formula of variation of constants."""
         from flint import arb
 
-        d, u = self.system.states, [arb(one) for one in self.units]
+        d, u = self.system.states, [arb(one) for one in segment.units]
         sizes, rest = tails.sizes, self._rest(segment, h)
         r = _largest([sum((one * u[j] / u[i] for j, one in enumerate(row[:d])), arb(0)) for i, row in enumerate(rest)])
         a = sum(sizes, arb(0))

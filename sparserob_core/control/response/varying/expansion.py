@@ -33,6 +33,7 @@ IDLE = 2.0**-58  # of what is added up, what does not show; ten times more would
 CIRCLES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 24.0, 48.0, 96.0)
 """Shares of an interval on which Cauchy's bound is looked at; short intervals need the wide ones."""
 LONG = 2.0  # norm of A times the length of a segment; ten times more needs three times the terms
+SLOW = 0.25  # norm to which a slow part is brought by units of its own: four times more rounds more, a tenth halves it
 SHARPEST = 1e-13  # remainder on a segment, as a share of the numbers: ten times less is below what is rounded
 BLUNTEST = 1e-10  # from which on a segment is halved even where that did not help: else what a state misses shows
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
@@ -72,13 +73,12 @@ class Kernel(NamedTuple):
 
 class Majorant(NamedTuple):
     """How far the series of a flow is summed, ``terms`` of it with ``degree`` of the system's; what it is off by then,
-    ``error (k,)``; what drives states, ``sizes (k, d, m + mw)``; and by what factor they grow, ``growth (k,)``."""
+    ``error (k,)``; and what drives states, ``sizes (k, d, m + mw)``."""
 
     terms: int
     degree: int
     error: Array
     sizes: Array
-    growth: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +86,16 @@ class Expansion:
     """A system on segments between ``ends (s + 1,)``: ``coefficients (s, DEGREE + 1, d, d + m + mw)`` of ``[A B E]``
     in powers of the time from -1 to 1 over each segment, and what they may be off by, ``remainder (s, d, d + m + mw)``.
 
-    ``units (d,)``: of states, in which no entry of ``A`` is much larger than the others. ``turns``: the numbers of the
-    ends at which another law takes over. ``spread``: of which polynomials the states are the coefficients.
+    ``units (d,)``: of states, in which no entry of ``A`` is much larger than the others. ``ratios (s, d)``: of those in
+    which a segment is looked at to these, at least 1 (`steadied`). ``turns``: the numbers of the ends at which another
+    law takes over. ``spread``: of which polynomials the states are the coefficients.
     """
 
     ends: Array
     coefficients: Array
     remainder: Array
     units: Array
+    ratios: Array
     channels: tuple[int, int]
     turns: tuple[int, ...] = ()
     spread: Spread | None = None
@@ -124,6 +126,7 @@ class Expansion:
             self.coefficients * factors,
             self.remainder * factors,
             self.units * states,
+            self.ratios,
             (system.controls, system.disturbances),
             self.turns,
         )
@@ -148,12 +151,12 @@ class Expansion:
             for begin, until, law in system.laws
             for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
         ][::-1]
-        ends, found, left = [0.0], [], []
+        ends, found, left, ratios = [0.0], [], [], []
         while todo:
             start, stop, before, law = todo.pop()
             centre = (start + stop) / 2
             radius = float(np.nextafter(max(stop - centre, centre - start), np.inf))
-            off, here = np.inf, np.inf
+            off, here, own, sharp = np.inf, np.inf, np.ones(units.size), False
             try:
                 parts = law.taylor(space, np.array([centre]), np.array([radius]))
             except NotEnclosable as error:
@@ -163,40 +166,72 @@ class Expansion:
                 coefficients, rest = np.concatenate(parts[0::2], axis=2), np.concatenate(parts[1::2], axis=1)
                 off, here = _sharpness(coefficients, rest, units, size)
                 here *= stop - start
-            if here <= LONG and (off <= SHARPEST or before / 2 <= off <= BLUNTEST):  # or halving does not help
+                sharp = here <= LONG and (off <= SHARPEST or before / 2 <= off <= BLUNTEST)  # or halving does not help
+                if here > LONG and spread is None:
+                    steady = steadied(
+                        (np.abs(coefficients).sum(axis=0) + rest)[:, : units.size] * scale * units, stop - start
+                    )
+                    if steady is not None:
+                        own, sharp = (
+                            steady,
+                            _lost(coefficients, rest, units * steady, stop - start) * steady.max() <= SHARPEST,
+                        )
+            if sharp:
                 ends.append(stop)
                 found.append(coefficients)
                 left.append(rest)
+                ratios.append(own)
             elif stop - start <= SHORTEST * horizon:
                 raise InputError(f"near t = {centre:.9g} the system {why}", path="system")
             else:
                 todo += [(centre, stop, off, law), (start, centre, off, law)]
         turns = tuple(ends.index(begin) for begin, _ in system.later)
         channels = system.controls, system.disturbances
-        return Expansion(np.array(ends), np.array(found), np.array(left), units, channels, turns, spread)
+        parts = np.array(found), np.array(left), units, np.array(ratios)
+        return Expansion(np.array(ends), *parts, channels, turns, spread)
 
     @shaped
     def flow(self, starts: Float[Array, " k"], stops: Float[Array, " k"]) -> Flow:
         """What each of the intervals makes of states and inputs."""
         d, (m, mw) = self.units.size, self.channels
-        state = np.tile(np.eye(d), (starts.size, 1, 1))
-        inputs, error = np.zeros((starts.size, d, m + mw)), np.zeros(starts.size)
-        sizes, grown = np.zeros((starts.size, d, m + mw)), np.ones(starts.size)
-        segments = self.segment_of(starts)
-        active, at = np.flatnonzero(stops > starts), starts.copy()
-        while active.size:
-            mine = segments[active]
-            last = mine == self.ends.size - 2  # which holds whatever rounding puts behind the horizon
-            until = np.where(last, stops[active], np.minimum(stops[active], self.ends[mine + 1]))
-            step, driven, off, pushed, growth = self._within(mine, at[active], until)
-            state[active], inputs[active] = step @ state[active], step @ inputs[active] + driven
-            error[active] = error[active] * growth + off * grown[active]
-            sizes[active] += pushed
-            grown[active] *= growth
-            at[active] = until
-            segments[active] += 1
-            active = active[until < stops[active]]
+        wide = (starts.size, d, m + mw)
+        state, inputs = np.tile(np.eye(d), (starts.size, 1, 1)), np.zeros(wide)
+        error, sizes = np.zeros(starts.size), np.zeros(wide)
+
+        def follow(here: np.ndarray, step: Array, driven: Array, off: Array, pushed: Array) -> None:
+            before = state[here], inputs[here], error[here], sizes[here]
+            state[here], inputs[here] = step @ before[0], step @ before[1] + driven
+            error[here], sizes[here] = self._off(before, step, off), before[3] + pushed
+
+        first = self.segment_of(starts)
+        last = np.clip(np.searchsorted(self.ends, stops, side="left") - 1, first, self.ends.size - 2)
+        moved = np.flatnonzero(stops > starts)
+        if moved.size:
+            ends = np.where(last > first, self.ends[first + 1], stops)  # the last one holds what is behind the horizon
+            begun = self._within(first[moved], starts[moved], ends[moved])
+            state[moved], inputs[moved], error[moved], sizes[moved] = begun
+        for n in range(1, int((last - first).max(initial=0))):
+            here = moved[(first + n < last)[moved]]
+            follow(here, *(part[first[here] + n] for part in self._whole))
+        here = moved[(last > first)[moved]]
+        if here.size:
+            follow(here, *self._within(last[here], self.ends[last[here]], stops[here]))
         return Flow(state, inputs[..., :m], inputs[..., m:], error, sizes)
+
+    def _off(self, before: tuple[Array, ...], step: Array, off: Array) -> Array:
+        """What products ``P S`` are off by, ``P`` a ``step (k, d, d)`` that is off by ``off (k,)``, and ``S`` what was
+        ``before``: ``off (|S| + error) + |P| error``, and what is rounded; of inputs as shares of what drives."""
+        state, inputs, error, sizes = before
+        driven = np.where(sizes > 0.0, sizes, np.inf) * self.units[:, None]
+        most = np.maximum(self._norm(state[..., : self.own]), (np.abs(inputs) / driven).max(axis=(1, 2), initial=1.0))
+        grown = self._norm(step[..., : self.own])
+        found = off * (most + error) + grown * error + rounding(self.units.size + 1) * grown * (most + error)
+        return np.asarray(found * (1.0 + 1e-9))
+
+    @cached_property
+    def _whole(self) -> tuple[Array, ...]:
+        """`_within` of every segment as a whole."""
+        return self._within(np.arange(self.ends.size - 1), self.ends[:-1], self.ends[1:])
 
     def segment_of(self, times: Array) -> np.ndarray:
         """The segment that each time is in, or begins, ``(k,)``."""
@@ -222,12 +257,14 @@ class Expansion:
         d, own, segments = self.units.size, self.own, self.segment_of((starts + stops) / 2)
         length = stops - starts
         law, bulk = self._recentred(segments, stops, -length, length)
+        rest = self.remainder[segments] * length[:, None, None]
         A, F, scale = law[..., :own], law[..., own:], self.units / self.units[:, None]
+        inputs = _totals(self._driven(law[..., own:]), self._driven(rest[..., d:]))[0]
+        law, bulk, rest = (self._steady(segments, one) for one in (law, bulk, rest))
         sizes, full = (self._norm(one[..., :own]) for one in (law, bulk))
         pushes, fuller = (self._driven(one[..., own:]) for one in (law, bulk))
-        rest = self.remainder[segments] * length[:, None, None]
         lost = self._driven(rest[..., d:])
-        inputs, most = _totals(pushes, lost)
+        most = _totals(pushes, lost)[1]
         shares = (pushes / most[:, None]).max(axis=(2, 3), initial=0.0)
         r = (rest[..., :d] * scale).sum(axis=2).max(axis=1)
         lost = (lost / most).max(axis=(1, 2), initial=0.0)
@@ -244,7 +281,7 @@ class Expansion:
         a, a_full = sizes.sum(axis=1), full.sum(axis=1)
         forced = (fuller.sum(axis=1) / most).max(axis=(1, 2), initial=0.0)
         rounded = rounding((DEGREE + 1) * (d + 4)) * (2.0 + a_full) * np.exp(a_full) * forced
-        error = tail + (r + lost * (1.0 + r)) * np.exp(a + r) + rounded
+        error = (tail + (r + lost * (1.0 + r)) * np.exp(a + r) + rounded) * self.ratios[segments].max(axis=1)
         return Kernel(found, error * (1.0 + 1e-9), inputs)
 
     def _backwards(self, A: Array, F: Array, terms: int) -> Array:
@@ -336,8 +373,7 @@ class Expansion:
         return total.reshape(count, size * d, wide)
 
     def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
-        """`flow` of intervals within one segment each, with control and disturbance side by side, and by what factor
-        states grow at most."""
+        """`flow` of intervals within one segment each, with control and disturbance side by side."""
         d = self.units.size
         length = stops - starts
         law, bulk = self._recentred(segments, starts, length, length)
@@ -347,7 +383,7 @@ class Expansion:
         if self.spread is not None:
             total = self._of_ring(A, driven, majorant.terms, majorant.degree)
             flown = self.spread.filled(total[..., :own])
-            return flown, total[..., own:], majorant.error, majorant.sizes, majorant.growth
+            return flown, total[..., own:], majorant.error, majorant.sizes
         total, terms = np.zeros((starts.size, *shape[2:])), []
         first = np.zeros((starts.size, *shape[2:]))
         first[:, :, :d] = np.eye(d)
@@ -361,7 +397,7 @@ class Expansion:
             terms.append(nexts / (n + 1))
         for term in reversed(terms):
             total += term
-        return total[..., :d], total[..., d:], majorant.error, majorant.sizes, majorant.growth
+        return total[..., :d], total[..., d:], majorant.error, majorant.sizes
 
     def _majorant(self, segments: np.ndarray, law: Array, bulk: Array, length: Array) -> Majorant:
         """Of a series whose coefficients are at most those of ``y' = a(s) y + b(s)`` in the norm of largest row sums in
@@ -373,10 +409,12 @@ class Expansion:
         them, of every term, and of the sum, whose first term is exact.
         """
         d, own = self.units.size, self.own
-        sizes = self._norm(law[..., :own])
         rest = self.remainder[segments] * length[:, None, None]
+        inputs = _totals(self._driven(law[..., own:]), self._driven(rest[..., d:]))[0]
+        law, bulk, rest = (self._steady(segments, one) for one in (law, bulk, rest))
+        sizes = self._norm(law[..., :own])
         pushes, lost = self._driven(law[..., own:]), self._driven(rest[..., d:])
-        inputs, most = _totals(pushes, lost)
+        most = _totals(pushes, lost)[1]
         shares = (pushes / most[:, None]).max(axis=(2, 3), initial=0.0)
         seen = (np.maximum(sizes, shares) > IDLE * np.maximum(sizes.sum(axis=1), 1e-300)[:, None]).any(axis=0)
         degree = int(np.flatnonzero(seen).max(initial=0))
@@ -399,7 +437,17 @@ class Expansion:
         growth = np.exp(a + r)
         rounded = rounding((degree + 1) * d + terms) * np.minimum(a, 1.0) + rounding(DEGREE) * fuller
         error = tail + (r + share) * growth + (rounded * (1.0 + a) + EPSILON) * growth
-        return Majorant(terms, degree, error * (1.0 + 1e-9), inputs, growth * (1.0 + 1e-9))
+        return Majorant(terms, degree, error * self.ratios[segments].max(axis=1) * (1.0 + 1e-9), inputs)
+
+    def _steady(self, segments: np.ndarray, table: Array) -> Array:
+        """A ``table (k, ..., d, n)`` of ``[A F]`` on segments as it is where states are counted in `ratios`."""
+        ratios = self.ratios[segments]
+        if (ratios == 1.0).all():
+            return table
+        ratios = ratios.reshape(ratios.shape[0], *([1] * (table.ndim - 3)), -1)
+        d, found = self.units.size, table / ratios[..., None]
+        found[..., :d] *= ratios[..., None, :]
+        return np.asarray(found)
 
     @cached_property
     def together(self) -> list[np.ndarray]:
@@ -447,6 +495,35 @@ def _totals(pushes: Array, lost: Array) -> tuple[Array, Array]:
     of `BLUNTEST` of it, also where they cancel; and what to divide by."""
     inputs = np.maximum(pushes.sum(axis=1), lost / BLUNTEST)
     return inputs, np.where(inputs > 0.0, inputs, np.inf)
+
+
+def steadied(A: Array, length: float) -> Array | None:
+    """Units ``(d,)``, powers of two from 1 on, in which the norm of largest row sums of a system of at most ``A (d,
+    d)``, times a length, is at most twice `SLOW`; ``None`` where none are found.
+
+    With ``M`` the product and ``g`` that number, ``u = (1 - M / g)^-1 1`` has ``M u = g (u - 1)``; rounded up to powers
+    of two the row sums at most double. There is such a ``u`` where the spectral radius of ``M`` is below ``g``:
+    of a motion that is slow here and fast elsewhere it is, though its norm in units of the fast part is not.
+    """
+    M = A * (length / SLOW)
+    try:
+        units = np.linalg.solve(np.eye(len(M)) - M, np.ones(len(M)))
+    except np.linalg.LinAlgError:
+        return None
+    if not (np.isfinite(units).all() and units.min() > 0.0):
+        return None
+    units = np.exp2(np.ceil(np.log2(np.maximum(units, 1.0))))
+    return units if ((A * length) @ units <= 2.0 * SLOW * units).all() else None
+
+
+def _lost(coefficients: Array, rest: Array, units: Array, length: float) -> float:
+    """What a segment of this length misses: of states in these ``units``, in the norm of largest row sums, and of what
+    drives them as a share."""
+    d = units.size
+    off = float((rest[:, :d] * units / units[:, None]).sum(axis=1).max()) * length
+    driven, lost = (one / units[:, None] for one in (np.abs(coefficients[:, :, d:]).sum(axis=0), rest[:, d:]))
+    most = np.where(driven.max(axis=0, initial=0.0) > 0.0, driven.max(axis=0, initial=0.0), np.inf)
+    return max(off, float((lost / most).max(initial=0.0)))
 
 
 def _sharpness(coefficients: Array, rest: Array, units: Array, size: float) -> tuple[float, float]:

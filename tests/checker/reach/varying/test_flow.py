@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from decimal import Decimal
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ from sparserob_core.checker.arithmetic.jets import kepler_root, kepler_series
 from sparserob_core.checker.arithmetic.timed import Timed
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.flow import VaryingFlow, products
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.control.problem.system import VaryingSystem
 from tests.support.integration import mathieu
@@ -169,3 +170,22 @@ def test_keplers_equation_is_solved_in_balls(M: float, e: float) -> None:
             assert all(wide[k].contains(other[k]) and wide[k].contains(found[k]) for k in range(9))
         finally:
             ctx.cap = before
+
+
+@pytest.mark.slow
+def test_a_slow_part_has_units_of_its_own_and_balls_hold_what_shorter_parts_make() -> None:
+    terms = ["-1 / (1 - 0.9 * cos(kepler(t, 0.9)))^3", "exp(-t)"]
+    system = VaryingSystem.of([[0, 1], [terms[0], 0]], [[0], [1]], 2 * np.pi, [[terms[1]], [0]])
+    with ctx.workprec(BITS):
+        flow = VaryingFlow(system, system.horizon)
+        slow = max(flow.segments, key=lambda one: one.units[0])
+        assert slow.units[0] > flow.units[0] and len(flow.segments) < 240  # 246 in the units of the pericentre
+        ends = [slow.start, *np.linspace(slow.start, slow.stop, 9).tolist()[1:-1], slow.stop]
+        whole, parts = flow.over(slow.start, slow.stop), [flow.over(*each) for each in pairwise(ends)]
+        after = products([part[0] for part in parts])
+        pushed = [sum((Z * part[k] for Z, part in zip(after[2:], parts[1:], strict=True)), after[1] * parts[0][k])
+                  for k in (1, 2)]  # fmt: skip
+        for mine, other in zip(whole, (after[0], *pushed), strict=True):
+            for one, two in zip(mine.entries(), other.entries(), strict=True):
+                assert one.overlaps(two) and one.rad() < 1e-18 * (1 + abs(two))
+        assert flow.over(slow.start, slow.stop)[0] is whole[0] and len(flow._whole) == 1

@@ -7,11 +7,12 @@ from decimal import Decimal
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import sparserob_core.control.response.varying.expansion as varying
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.response import Response, merge_grids
-from sparserob_core.control.response.varying.expansion import Expansion, Flow, balanced
+from sparserob_core.control.response.varying.expansion import Expansion, Flow, balanced, steadied
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from tests.support.integration import mathieu
@@ -164,3 +165,62 @@ def test_units_are_those_in_which_rows_and_columns_are_of_like_size(seed: int) -
     # a state that reaches others, and that no other one reaches, is no state of infinite or no size
     one_way = np.triu(A)
     assert np.isfinite(balanced(one_way, 1.0)).all() and (balanced(np.zeros((2, 2)), 1.0) == 1.0).all()
+
+
+def eccentric(e: float) -> VaryingSystem:
+    """A pendulum whose stiffness is that of an orbit of this eccentricity, from one apocentre to the next."""
+    return VaryingSystem.of(
+        [[0, 1], [f"-1 / (1 - {e} * cos(kepler(t, {e})))^3", 0]], [[0], [1]], 2 * np.pi - 0.01, [["exp(-t)"], [0]]
+    )
+
+
+@pytest.mark.slow
+def test_a_slow_part_is_looked_at_in_units_of_its_own() -> None:
+    system = eccentric(0.9)
+    expansion = Expansion._made(system)
+    assert expansion.ratios.max() >= 8.0 and expansion.ends.size < 140  # 146 in the units of the pericentre
+    slow = np.flatnonzero(expansion.ratios.max(axis=1) > 1.0)[::8]
+    starts = np.append(expansion.ends[slow], np.linspace(0.0, 4.0, 3))
+    stops = np.append(expansion.ends[slow + 1], np.linspace(2.0, system.horizon, 3))
+    found, units = expansion.flow(starts, stops), expansion.units
+    inputs = np.concatenate([found.control, found.disturbance], axis=2)
+    for k, ends in enumerate(zip(starts, stops, strict=True)):
+        off = np.abs(np.column_stack([found.state[k], inputs[k]]) - integrated(system, *ends)) / units[:, None]
+        off = np.maximum(off - 1e-12, 0.0)  # which is the integrator's
+        assert (off[:, :2] * units).sum(axis=1).max() <= found.error[k]
+        assert (off[:, 2:] <= found.error[k] * found.sizes[k]).all()
+
+
+def test_what_a_slow_part_misses_is_counted_in_the_units_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    fast, A = 1024.0, np.array([[0.0, 1024.0], [-0.05 / 1024.0, 0.0]])
+    law = np.zeros((1, varying.DEGREE + 1, 2, 4))
+    law[0, 0] = np.column_stack([A, [0.0, 1.0], [1.0, 0.0]]) / 2
+    ratios = steadied(A / 2, 1.0)
+    assert ratios is not None and ratios[0] > fast
+    expansion = Expansion(np.array([0.0, 1.0]), law, np.zeros((1, 2, 4)), np.ones(2), ratios[None], (1, 1))
+    monkeypatch.setattr(varying, "TERMS", 1)
+    found = expansion.flow(np.zeros(1), np.ones(1))
+    state, driven = np.eye(2), np.zeros((2, 2))
+    for n in range(20, 0, -1):  # Horner's scheme of the exponential and of its integral
+        state, driven = np.eye(2) + A / 2 @ state / n, (law[0, 0, :, 2:] + A / 2 @ driven) / n if n > 1 else driven
+    off = np.abs(found.state[0] - state).sum(axis=1).max() / found.error[0]
+    assert off <= 1.0 < off * ratios.max()  # without the ratio the bound would not hold
+
+
+def test_units_of_a_slow_part_make_it_small() -> None:
+    A = np.array([[0.0, 8.0], [1e-3, 0.0]])
+    units = steadied(A, 1.0)
+    assert units is not None and units.min() >= 1.0 and (A @ units <= 2 * varying.SLOW * units).all()
+    assert steadied(A, 10.0) is None and steadied(np.array([[0.0, 1.0], [1.0, 0.0]]), 1.0) is None
+
+
+def integrated(system: VaryingSystem, start: float, stop: float) -> Array:
+    """What an interval makes of a state and of inputs, by an integrator."""
+
+    def rates(t: float, values: Array) -> Array:
+        A, B, E = (part[0] for part in system.law.matrices(np.array([[t]])))
+        return np.asarray(A @ values.reshape(2, -1) + np.column_stack([np.zeros((2, 2)), B, E])).ravel()
+
+    first = np.column_stack([np.eye(2), np.zeros((2, 2))]).ravel()
+    found = solve_ivp(rates, (start, stop), first, method="DOP853", rtol=1e-13, atol=1e-13)
+    return np.asarray(found.y[:, -1].reshape(2, -1))
