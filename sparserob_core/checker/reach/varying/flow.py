@@ -121,7 +121,7 @@ class VaryingFlow:
         except Unchecked:
             return None
         d, u = self.system.states, self.units
-        lost, size, most = arb(0), arb(0), []
+        lost, size, most = arb(0), arb(0), list[list[arb]]()
         for i, row in enumerate(exact):
             sums, over = arb(0), arb(0)
             most.append([])

@@ -168,14 +168,10 @@ class Expansion:
                 here *= stop - start
                 sharp = here <= LONG and (off <= SHARPEST or before / 2 <= off <= BLUNTEST)  # or halving does not help
                 if here > LONG and spread is None:
-                    steady = steadied(
-                        (np.abs(coefficients).sum(axis=0) + rest)[:, : units.size] * scale * units, stop - start
-                    )
-                    if steady is not None:
-                        own, sharp = (
-                            steady,
-                            _lost(coefficients, rest, units * steady, stop - start) * steady.max() <= SHARPEST,
-                        )
+                    largest = (np.abs(coefficients).sum(axis=0) + rest)[:, : units.size] * scale * units
+                    if (steady := steadied(largest, stop - start)) is not None:
+                        missed = _lost(coefficients, rest, units * steady, stop - start) * float(steady.max())
+                        own, sharp = steady, missed <= SHARPEST
             if sharp:
                 ends.append(stop)
                 found.append(coefficients)
@@ -187,8 +183,8 @@ class Expansion:
                 todo += [(centre, stop, off, law), (start, centre, off, law)]
         turns = tuple(ends.index(begin) for begin, _ in system.later)
         channels = system.controls, system.disturbances
-        parts = np.array(found), np.array(left), units, np.array(ratios)
-        return Expansion(np.array(ends), *parts, channels, turns, spread)
+        every, lost, owns = (np.array(part) for part in (found, left, ratios))
+        return Expansion(np.array(ends), every, lost, units, owns, channels, turns, spread)
 
     @shaped
     def flow(self, starts: Float[Array, " k"], stops: Float[Array, " k"]) -> Flow:
