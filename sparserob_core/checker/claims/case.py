@@ -523,7 +523,7 @@ class Case:
     def running(self) -> Running | None:
         """What is integrated, where nothing else changes with time."""
         system = self.problem.system
-        if not isinstance(system, SwitchedSystem) or self.measurable:
+        if not isinstance(system, SwitchedSystem):
             return None
         found, d = Running.of(spelt(self.stated)), self.stated.system.states
         return found if found is not None and all(found.is_beside(mode, d) for mode in system.modes) else None

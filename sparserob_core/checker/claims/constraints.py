@@ -144,8 +144,12 @@ def _adjoint(case: Case, c: Array) -> Adjoint | Stopped:
     """That of a row ``c (d,)``, of what is integrated in a window as of two that stop."""
     if case.running is not None:
         parts = case.running.parts(c)
+        rows = [(_kept(case, row), until) for row, until in parts]
+        if case.measurable and len(parts) == 2 and not (parts[0][0] + parts[1][0]).any():
+            (row, end), (_, begin) = parts
+            return Stopped.integral(rows, row, begin, end)
         if len(parts) > 1 or parts[0][1] < np.inf:
-            return Stopped([(_kept(case, row), until) for row, until in parts])
+            return Stopped(rows, [(*rows[0], 0.0)] if len(parts) == 1 else ())
     return _kept(case, c)
 
 

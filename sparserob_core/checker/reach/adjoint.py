@@ -202,7 +202,12 @@ class Adjoint:
         """That of the row ``c (d,)``, an exact one."""
         from flint import arb
 
-        found, place, count = [[arb(float(v)) for v in c]], floor(log2(motion.apart)), motion.count // motion.apart + 1
+        return Adjoint.of_balls(motion, [arb(float(v)) for v in c])
+
+    @staticmethod
+    def of_balls(motion: Motion, c: list[arb]) -> Adjoint:
+        """That of a row ``(d,)`` of balls."""
+        found, place, count = [c], floor(log2(motion.apart)), motion.count // motion.apart + 1
         while len(found) < BLOCK:
             found += (stacked(found) * motion.over(place)).tolist()
             place += 1
@@ -213,13 +218,13 @@ class Adjoint:
             blocks += [block * power for block in blocks[: -(-count // BLOCK) - len(blocks)]]
         parts = [Enclosed.of(block) for block in blocks]
         mid, rad = (np.concatenate(one)[:count] for one in zip(*((p.mid, p.rad) for p in parts), strict=True))
-        nodes = [np.empty((count, motion.apart, c.size)) for _ in range(2)]
+        nodes = [np.empty((count, motion.apart, len(c))) for _ in range(2)]
         nodes[0][:, 0], nodes[1][:, 0] = mid, rad
         for j in range(1, motion.apart):
             motion.clock.check()
             for node, product in zip(nodes, _product(Enclosed(mid, rad), motion.between[j - 1]), strict=True):
                 node[:, j] = product[:, 0]
-        return Adjoint(motion, Enclosed(*(node.reshape(-1, c.size)[: motion.count + 1] for node in nodes)))
+        return Adjoint(motion, Enclosed(*(node.reshape(-1, len(c))[: motion.count + 1] for node in nodes)))
 
     @property
     def step(self) -> float:
@@ -323,11 +328,11 @@ class Adjoint:
         (late, first), (early, second) = self.integrals(since), self.integrals(until)
         mid = late.mid - early.mid
         rad = np.abs(late.rad - early.rad) + (OUTWARD - 1.0) * (late.rad + early.rad) + first + second
-        rad = rad + HALF_ULP * np.abs(mid) + (one + other)[..., None] * self._fastest
+        rad = rad + HALF_ULP * np.abs(mid) + (one + other)[..., None] * self.fastest
         return Enclosed(mid, rad * OUTWARD)
 
     @cached_property
-    def _fastest(self) -> Array:
+    def fastest(self) -> Array:
         """The largest absolute value of ``l'F``, ``(q,)``."""
         return np.asarray((np.abs(self.driven.mid) + self.driven.rad).sum(axis=1).max(axis=0) * OUTWARD)
 
@@ -355,9 +360,26 @@ class Adjoint:
 @dataclass(frozen=True, eq=False)
 class Stopped:
     """A sum of rows of which each stays what it was at a time of its own: at the earlier of ``t`` and that time. In the
-    place of an `Adjoint`, at single times, under disturbances that are constant on pieces."""
+    place of an `Adjoint`, at single times.
+
+    ``ways``: of an integral from ``a`` to ``b``, what of it measurable disturbances meet, backwards: its row for
+    ``b - a``, and for ``a`` what has become of the row then, less the row. How long each is, and by how much that is
+    rounded.
+    """
 
     parts: Sequence[tuple[Adjoint, float]]
+    ways: Sequence[tuple[Adjoint, float, float]] = ()
+
+    @staticmethod
+    def integral(parts: Sequence[tuple[Adjoint, float]], row: Array, begin: float, end: float) -> Stopped:
+        """That of ``parts`` which are a row ``(d,)`` that is integrated from ``begin`` to ``end``."""
+        from flint import arb, arb_mat
+
+        (first, _), motion = parts[0], parts[0][0].motion
+        exact = arb_mat([[arb(float(v)) for v in row]])
+        turned = exact * (motion.A * (arb(end) - arb(begin))).exp() - exact
+        length, rounded = (part.item() for part in _apart(np.array([end]), begin))
+        return Stopped(parts, [(first, length, rounded), (Adjoint.of_balls(motion, turned.tolist()[0]), begin, 0.0)])
 
     @property
     def motion(self) -> Motion:
@@ -543,6 +565,16 @@ class Worst:
         return value * half, more * half * OUTWARD
 
     def _measurable(self, times: Array) -> tuple[Array, Array]:
+        if isinstance(self.adjoint, Stopped):
+            if not self.adjoint.ways:
+                raise Unchecked("of measurable disturbances one integral at a time is followed")
+            top, rad = np.zeros(times.size), np.zeros(times.size)
+            far = np.abs(self._sides[0]) + np.array(known(self.pushed).radius)
+            for row, length, rounded in self.adjoint.ways:
+                value, more = replace(self, adjoint=row)._measurable(np.full(times.size, length))
+                top = top + value
+                rad = rad + more + HALF_ULP * np.abs(top) + rounded * float(row.fastest[self._mine] @ far)
+            return top, rad * OUTWARD
         about, _ = self._sides
         steps, shares = self._row.placed(times)
         inside, more = self._part(steps, shares)

@@ -197,6 +197,17 @@ class MeasurableSupport:
         grid = self.response.grid
         return [grid] if grid.mode is None else [grid.leg(number) for number in range(len(grid.turns))]
 
+    @cached_property
+    def _differing(self) -> np.ndarray | None:
+        """The states ``(k,)`` by whose equations alone known systems that take turns differ, if no others depend on
+        them, as of integrals in windows: rows without these see one system all along. ``None`` elsewhere."""
+        system = self.response.system
+        if self.response.grid.mode is None or system.parameter_count:
+            return None
+        every = [np.concatenate(one.matrices(np.zeros((1, 0)))[::2], axis=2)[0] for one in system.modes]
+        A, differ = every[0][:, : system.states], np.ptp(every, axis=0).any(axis=1)
+        return None if A[~differ][:, differ].any() else np.flatnonzero(differ)
+
     @shaped
     def _at(
         self,
@@ -209,12 +220,17 @@ class MeasurableSupport:
         """The integrals, or with ``enclosed`` their lower and upper bounds, as columns: those of the last system from
         where it begins, and what each before it adds for the rows that the way from its end makes of the directions."""
         begins = np.array([one.elapsed for one in self._legs])
+        total = np.zeros((times.size, 2 if enclosed else 1))
+        if self._differing is not None and not directions[:, self._differing].any():
+            A, E = (part[0] for part in self.response.system.modes[0].matrices(parameter[None])[::2])
+            since, key = (0.0 if leg is None else begins[leg]), parameter.tobytes() + b"all" + bytes([enclosed])
+            return total + self._until(A, E, self.response.grid.breakpoints, times + since, directions, key)
         if leg is None:
             legs = np.maximum(np.searchsorted(begins, times) - 1, 0)
             times = times - begins[legs]
         else:
             legs = np.full(times.size, leg)
-        total, rows = np.zeros((times.size, 2 if enclosed else 1)), directions
+        rows = directions
         for number in range(int(legs.max(initial=0)), -1, -1):
             A, E = (part[0] for part in self.response.system.modes[number].matrices(parameter[None])[::2])
             ages, length = self._legs[number].breakpoints, float(self._legs[number].breakpoints[-1])

@@ -16,7 +16,7 @@ from sparserob_core.checker.claims import cells, claims, constraints, multiplier
 from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Duality, Row
-from sparserob_core.checker.outcome import Broken
+from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.flow import held
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
@@ -184,6 +184,7 @@ def test_a_violation_along_rows_is_the_one_of_the_tube(which: str, monkeypatch: 
             assert found[1] == pytest.approx(found[0], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_an_integral_that_begins_later_is_the_one_of_pieces_where_rows_are_followed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -204,6 +205,29 @@ def test_an_integral_that_begins_later_is_the_one_of_pieces_where_rows_are_follo
         found.append(numbers + [float(x.mid()) for part in ([row.constant], *row.slope) for x in part])
     assert found[1] == pytest.approx(found[0], abs=1e-12)
     assert len(set(np.round(found[0], 6))) > 6  # of other states, rows and pieces others
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [0.0, 0.4])
+def test_measurable_disturbances_of_an_integral_are_those_of_pieces(
+    start: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = replace(kind("known"), begun=Box([-0.1, -0.05], [0.15, 0.1]))
+    other = {"H": [[0.0, 1.0]], "G": [[0.1, 0.0]], "upper": [1.0], "lower": [-1.0], "start": 1.5, "stop": 1.8}
+    entry = IntegralConstraint(H=[[1.0, -0.5]], G=[[0.2, -0.1]], upper=[1.0], lower=[-2.0], start=start, stop=1.3)
+    entries = [entry, IntegralConstraint(**other)]
+    case = made.case(path=[], integral=entries, disturbance_class="measurable")
+    window, found = case.windows[0], list[list[float]]()
+    for followed in (100, 1):
+        monkeypatch.setattr(constraints, "FOLLOWED", followed)
+        assert constraints.follows(case) == (followed == 1)
+        said = {"constraint": window.name, "time": window.start, "violation": 0.0}
+        over, slack = replay.exceeded(case, said)
+        found.append(over)
+        assert slack < 1e-7
+    assert found[1] == pytest.approx(found[0], abs=1e-9)
+    with pytest.raises(Unchecked, match="one integral at a time"):
+        constraints.followed(case, np.array([0.0, 0.0, 1.0, 1.0])).most(np.array([1.8]))
 
 
 def _by_duality(case: Any, c: np.ndarray, time: float, limit: Any) -> Any:

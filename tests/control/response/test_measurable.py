@@ -199,6 +199,26 @@ def test_bounds_over_turns_hold_what_both_systems_add_and_are_close(name, short)
             assert high - low <= 1e-10 * abs(truth)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["box", "triangle"])
+def test_rows_of_no_integral_see_one_system_where_turns_integrate(name):
+    plain, times = random_system(np.random.default_rng(4), 3), np.array([0.0, 0.2, 0.9, 1.3, HORIZON])
+    plain = LinearSystem(*(part[0] for part in plain.matrices(np.zeros((1, 0)))))
+    first, second = (plain.accumulating(share * np.array([[1.0, 0.5, 0.0]]), np.zeros((1, 1))) for share in (0.0, 1.0))
+    grid = merge_grids(UNEVEN.breakpoints, UNEVEN.breakpoints, switches=(0.9,))
+    turning = Response(SwitchedSystem([(0.9, first), (HORIZON, second)]), grid, np.zeros(4))
+    alone = Response(plain, merge_grids(UNEVEN.breakpoints, UNEVEN.breakpoints), np.zeros(3))
+    found, known = (measurable.MeasurableSupport(one, BOUNDS[name]) for one in (turning, alone))
+    rows, none = np.random.default_rng(5).normal(size=(times.size, 3)), np.zeros((times.size, 0))
+    wide = np.hstack([rows, np.zeros((times.size, 1))])
+    assert found(times, wide, none) == pytest.approx(known(times, rows, none), rel=1e-9, abs=1e-12)
+    assert found.enclosed(times[3:] - 0.9, wide[3:], 1) == pytest.approx(known.enclosed(times, rows)[3:], rel=1e-7)
+    wide[:, 3] = 1.0  # what is integrated goes through both systems
+    with patch.object(measurable.MeasurableSupport, "_differing", None):
+        through = measurable.MeasurableSupport(turning, BOUNDS[name])(times, wide, none)
+    assert found(times, wide, none) == pytest.approx(through, rel=1e-9, abs=1e-12)
+
+
 def test_bounds_across_a_root_are_those_of_the_modulus_of_a_sine():
     system = LinearSystem([[0, 1], [-1, 0]], [[0.0], [1.0]], [[0.0], [1.0]])
     support = worst_case(system, uniform(3, 5.0), bound=Box([-1.0], [1.0]), kind="measurable").measurable
