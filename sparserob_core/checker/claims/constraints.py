@@ -98,10 +98,10 @@ def is_followed(case: Case, window: Window) -> bool:
 
 def follows(case: Case) -> bool:
     """Whether rows of the system, which is known and has many states, are followed by their adjoints."""
-    system = case.problem.system
+    system, still = case.problem.system, case.still
     if case.answering or not case.alike or case.execution is not None or len(case.grid) > MOST_PIECES:
         return False
-    return case.still is not None and not system.parameter_count and system.states >= FOLLOWED
+    return still is not None and not system.parameter_count and system.states >= FOLLOWED
 
 
 def _along_rows(case: Case, window: Window) -> Proven:

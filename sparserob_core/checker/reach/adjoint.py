@@ -566,15 +566,7 @@ class Worst:
 
     def _measurable(self, times: Array) -> tuple[Array, Array]:
         if isinstance(self.adjoint, Stopped):
-            if not self.adjoint.ways:
-                raise Unchecked("of measurable disturbances one integral at a time is followed")
-            top, rad = np.zeros(times.size), np.zeros(times.size)
-            far = np.abs(self._sides[0]) + np.array(known(self.pushed).radius)
-            for row, length, rounded in self.adjoint.ways:
-                value, more = replace(self, adjoint=row)._measurable(np.full(times.size, length))
-                top = top + value
-                rad = rad + more + HALF_ULP * np.abs(top) + rounded * float(row.fastest[self._mine] @ far)
-            return top, rad * OUTWARD
+            return self._over_ways(self.adjoint, times)
         about, _ = self._sides
         steps, shares = self._row.placed(times)
         inside, more = self._part(steps, shares)
@@ -583,6 +575,19 @@ class Worst:
         top = self._swept[0][steps] + inside + mid @ about
         rad = self._swept[1][steps] + more + off @ np.abs(about)
         return top, rad + rounding(about.size + 2) * (np.abs(mid) @ np.abs(about) + np.abs(top))
+
+    def _over_ways(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:
+        """`_measurable` of what is integrated, once for all ``times (k,)``."""
+        assert self.pushed is not None
+        if not stopped.ways or (times < stopped.parts[0][1]).any():
+            raise Unchecked("of measurable disturbances one integral at a time is followed")
+        top, rad = np.zeros(times.size), np.zeros(times.size)
+        far: Array = np.abs(self._sides[0]) + np.array(known(self.pushed).radius)
+        for row, length, rounded in stopped.ways:
+            value, more = replace(self, adjoint=row)._measurable(np.full(times.size, length))
+            top = top + value
+            rad = rad + more + HALF_ULP * np.abs(top) + rounded * float(row.fastest[self._mine] @ far)
+        return top, rad * OUTWARD
 
     @cached_property
     def _bent(self) -> Array:
