@@ -6,9 +6,11 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.control.transcription.provable import remark
 from tests.checker.test_check import DECAY, SPRING, on
 from tests.support.tampering import Forgery, forged
 
@@ -22,6 +24,7 @@ WARM = {
 KINDS: dict[str, tuple[dict[str, Any], str]] = {
     "box": (on(10, STIRRED), "certified"),
     "1-norm": (on(10, {**STIRRED, "disturbance": {"norm": {"p": 1.0, "radius": 0.03}}}), "certified"),
+    "ball": (on(6, {**STIRRED, "disturbance": {"norm": {"p": 2.0, "radius": 0.03}}}), "certified"),
     "initial states": (on(6, {**WARM, "initial_state": {"centre": [2], "box": [0.05]}}), "certified"),
     "mixed": (on(6, {**WARM, "path": [{"mixed": {"H": [[1.0]], "G": [[0.3]], "h": [1.9]}, "from": 0.2}]}), "certified"),
     "nominal": (on(6, WARM, method={"name": "nominal"}), "refuted"),
@@ -80,10 +83,32 @@ def test_a_higher_lower_bound_and_another_violation_are_refuted(tmp_path: Path) 
         assert sr.check(forged(run(kind, place), place / "forged", change, consistent=True)).status == "refuted"
 
 
-def test_a_curved_set_of_measurable_disturbances_is_not_checked_and_the_run_says_what_is_estimated(
-    tmp_path: Path,
-) -> None:
-    curved = {**STIRRED, "disturbance": {"norm": {"p": 2.0, "radius": 0.03}}}
-    outcome = sr.run(on(6, curved), out=tmp_path / "run", quiet=True, figures=False)
-    assert "estimated" in outcome.result.message
-    assert sr.check(tmp_path / "run").status == "undecided"
+class Egg(sr.ConvexSet):
+    """A disc that says nothing but its support function."""
+
+    dimension = 2
+
+    def support(self, directions: np.ndarray) -> np.ndarray:
+        return np.asarray(0.03 * np.linalg.norm(directions, axis=-1))
+
+    def support_point(self, directions: np.ndarray) -> np.ndarray:
+        size = np.linalg.norm(directions, axis=-1, keepdims=True)
+        return np.asarray(0.03 * directions / np.where(size > 0.0, size, 1.0))
+
+
+def test_of_a_set_that_only_tells_its_support_function_a_run_says_what_is_estimated() -> None:
+    problems = [
+        sr.OptimalControlProblem(
+            system=sr.LinearSystem([[0, 1], [-1, -0.4]], [[0], [1]], [[1, 0], [0, 1]]),
+            horizon=2.0,
+            initial_state=[-0.5, 0.5],
+            control=sr.Box([-1.0], [1.0]),
+            terminal=[sr.Box([-0.2, -0.2], [0.2, 0.2])],
+            disturbance=bound,
+            disturbance_class="measurable",
+        )
+        for bound in (Egg(), sr.NormBall(2.0, 0.03, dimension=2))
+    ]
+    assert ["estimated" in remark(problem) for problem in problems] == [True, False]
+    costs = [sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4}).cost for problem in problems]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-7)

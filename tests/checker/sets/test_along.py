@@ -74,6 +74,17 @@ def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, e
     np.testing.assert_allclose(moved[0], value)
 
 
+def test_heights_count_from_any_point_and_allow_for_what_the_factor_of_a_long_ellipsoid_misses() -> None:
+    long = Ellipsoid([0.0, 0.0], [[1.0, 1.99999999], [1.99999999, 4.0]])
+    values = np.array([[-1.99999999, 1.0], [-2.0, 1.0], [0.3, -0.2]])  # the first two along the shorter axis
+    for bound, about in ((long, np.zeros(2)), (SETS["ball"], np.array([0.3, -0.2])), (SETS["ellipsoid"], np.ones(2))):
+        heights, off = _heights(known(bound), about, values)
+        with ctx.workprec(300):
+            for c, height, wrong in zip(values, heights, off, strict=True):
+                moved = sum((a * b for a, b in zip(balls(c), balls(about), strict=True)), arb(0))
+                assert abs(known(bound).support(balls(c)) - moved - arb(float(height))) < arb(float(wrong))
+
+
 def test_the_rule_of_gauss_is_the_one_whose_remainder_is_told() -> None:
     with ctx.workprec(200):
         nodes = [arb.legendre_p_root(NODES, k, weight=True) for k in range(NODES)]
