@@ -115,7 +115,7 @@ def in_other_units(given: Config) -> Config:
     """`SPRING` with states, controls, times and its parameter in other units; costs are those of the other time."""
     problem, states, controls = copy.deepcopy(given), np.array([7.0, 0.003]), np.array([40.0, 0.9])
     shares = states / states[:, None] * TIME
-    A = [[0, shares[0, 1]], [f"(-4 + p / 250) * {shares[1, 0]!r}", -0.3 * shares[1, 1]]]
+    A = [[0, float(shares[0, 1])], [f"(-4 + p / 250) * {float(shares[1, 0])!r}", -0.3 * TIME]]
     problem["system"] = {
         "A": A,
         "B": (np.array(B) * controls / states[:, None] * TIME).tolist(),
