@@ -433,7 +433,7 @@ def test_what_an_expansion_leaves_out_widens_the_rows_from_which_states_are_feas
         begun = model.functionals.from_state(plane.point(np.array(z)))
         assert (plane.beyond * (1 + 1e-12) >= begun.beyond(np.array([1.0]))).all()
     (family,) = plane._families
-    index = np.array([[0.4]])
+    index = np.array([[2.0, 0.4]])
     with_it = family.rows(index)[1]
     vars(plane)["beyond"] = 0.0 * plane.beyond
     constraint = model.constraint(model.program.families[0])
