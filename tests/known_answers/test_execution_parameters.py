@@ -36,6 +36,9 @@ ENDS = {"terminal": [{"box": [0.35, 0.5]}]}
 CASES: dict[str, Config] = {
     "stiffness": {"system": SPRING},
     "stiffness that changes": {"system": MATHIEU},
+    "stiffness that is no polynomial": {
+        "system": {"A": [[0, 1], ["-4 * exp(-p / 4)", -0.3]], "B": B, "parameters": {"p": [-0.2, 0.3]}}
+    },
     "two": {"system": TWO},
     "delay": {"system": {**SPRING, "delay": 0.25}, "initial_control": [0.4, -0.6], "terminal": [{"box": [0.5, 0.7]}]},
     "pieces": {
@@ -59,6 +62,8 @@ def flows_at(name: str, p: float, q: float) -> tuple[np.ndarray, np.ndarray]:
         M[:2, :2], M[:2, 2:] = [[0.0, 1.0], [-4.0 + p, -0.3 - q]], B
         if name == "stiffness that changes":
             M[1, 0], M[0, 3] = -4.0 + p + p * np.cos(2.0 * time), 0.4 + p * p
+        elif name == "stiffness that is no polynomial":
+            M[1, 0] = -4.0 * np.exp(-p / 4.0)
         elif name == "pieces" and time > 1.5:
             M[:2, :2], M[:2, 2:] = [[0.0, 1.0], [-1.0 - p, -0.4]], [[0.3, 0.1], [0.0, 0.8]]
         known.append(M * step)
@@ -224,7 +229,7 @@ def test_the_checker_bounds_errors_over_boxes_and_cells_of_time_from_above_and_b
     case = Case(experiment.problem, experiment.control, experiment.disturbance, {"decision": CONTROL})
     delivered, c, box = case.execution, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
     assert isinstance(delivered, SpreadExecution)
-    tube = SpreadTube(case.spread, np.eye(2), box)
+    tube = SpreadTube(case.spread(box), np.eye(2), box)
     start, stop = 1.52, 1.53
     found = delivered.over(c, [start, stop], box, tube.flow)
     powers = np.array(tube.flow.monomials.exponents)
@@ -238,7 +243,7 @@ def test_the_checker_bounds_errors_over_boxes_and_cells_of_time_from_above_and_b
             assert over - low < found.off + found.over + 1e-5
     assert found.off < 2e-3
     half = ((-0.0175, 0.0025), (-0.0125, 0.0075))
-    smaller = delivered.over(c, [start, start + 0.005], half, SpreadTube(case.spread, np.eye(2), half).flow)
+    smaller = delivered.over(c, [start, start + 0.005], half, SpreadTube(case.spread(half), np.eye(2), half).flow)
     assert smaller.off < 0.26 * found.off  # of second order in the widths and in the time
     middle = delivered.at(tube.flow.centre).added(c, start)[0]
     assert found.ends[0, 0] - found.off - found.over <= middle

@@ -496,7 +496,7 @@ class SpreadFlow:
         """Into how many parts each segment is cut."""
         grows = self._most[0].sum(axis=1) * np.diff([0.0, *self.ends])
         wanted = np.ceil(grows / GROWING)
-        return np.asarray(np.maximum(np.floor(wanted * min(1.0, MOST_MARKS / wanted.sum())), 1.0), dtype=int)
+        return np.asarray(np.maximum(np.floor(wanted * min(1.0, MOST_MARKS / max(1.0, wanted.sum()))), 1.0), dtype=int)
 
     @cached_property
     def _sizes(self) -> tuple[Array, Array]:
