@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sparserob_core.control.enclosures.taylor import TaylorSpace
@@ -12,6 +14,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.integrals import enclosed
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.result import Result
 
 SECONDS = 30.0  # that the search takes for a problem that cannot be proven, unless a limit is given: for a witness
 TINY = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
@@ -52,21 +55,30 @@ def announced(why: str, limited: bool) -> str:
     return f"{why}{ends}"
 
 
-def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
+def remarked(problem: OptimalControlProblem, result: Result, feedback: bool = False) -> Result:
+    """The same result with a word on what its claim rests on that is not proven; nothing is added where there is no
+    claim, or nothing of the kind."""
+    rests = _remark(problem, feedback)
+    if not rests or rests in result.message or result.status not in ("certified", "verified"):
+        return result
+    return replace(result, message=f"{result.message}; {rests}")
+
+
+def _remark(problem: OptimalControlProblem, feedback: bool) -> str:
     """What a claim about a problem rests on that is not proven; empty where there is nothing of the kind, as where the
     integrals over the set of measurable disturbances are enclosed. Under ``feedback`` the checker proves it."""
     if problem.measurable is None:
-        return ""
-    if not feedback and enclosed(problem.measurable):
         return ""
     if feedback:
         return (
             "the integrals over measurable disturbances are allowed a relative error of 1e-12, which sparserob check"
             " encloses"
         )
+    if enclosed(problem.measurable):
+        return ""
     return (
-        "the integrals over measurable disturbances in a curved set are allowed a relative error of 1e-12, which is"
-        " estimated, not enclosed"
+        "the integrals over measurable disturbances in a set that is known by its support function alone are allowed a"
+        " relative error of 1e-12, which is estimated, not enclosed"
     )
 
 

@@ -136,7 +136,10 @@ def solve(
     result = solve_in_own_units(chosen, program, tools).accounted(tools.solver)
     if isinstance(model, SemiInfiniteProgram):
         return result
+    from sparserob_core.control.transcription.provable import remarked
     from sparserob_core.experiment.run.outcome import Asked, SolvedProblem
+
+    result = remarked(model.problem, result, model.feedback is not None)
 
     asked = Asked(
         problem=model.stated,

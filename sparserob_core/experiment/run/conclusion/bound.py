@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.control.transcription.provable import remark
+from sparserob_core.control.transcription.provable import remarked
 from sparserob_core.control.transcription.rounding import SMALL_GAP, rounded_down
 from sparserob_core.experiment.assemble import ControlExperiment, counting
 from sparserob_core.experiment.directory.artefacts import finite
@@ -27,13 +27,8 @@ INWARDS = 1e-13  # of it, so that whoever derives it with another precision does
 
 def bounded(experiment: ControlExperiment, result: Result) -> Result:
     """The same result with a lower bound that its multipliers prove, and with a word on what is not proven of it."""
-    found, rests = (
-        _bounded(experiment, result),
-        remark(experiment.problem, experiment.transcription.feedback is not None),
-    )
-    if not rests or found.status not in ("certified", "verified"):
-        return found
-    return replace(found, message=f"{found.message}; {rests}")
+    feedback = experiment.transcription.feedback is not None
+    return remarked(experiment.problem, _bounded(experiment, result), feedback)
 
 
 def _bounded(experiment: ControlExperiment, result: Result) -> Result:
