@@ -58,13 +58,13 @@ def announced(why: str, limited: bool) -> str:
 def remarked(problem: OptimalControlProblem, result: Result, feedback: bool = False) -> Result:
     """The same result with a word on what its claim rests on that is not proven; nothing is added where there is no
     claim, or nothing of the kind."""
-    rests = _remark(problem, feedback)
+    rests = remark(problem, feedback)
     if not rests or rests in result.message or result.status not in ("certified", "verified"):
         return result
     return replace(result, message=f"{result.message}; {rests}")
 
 
-def _remark(problem: OptimalControlProblem, feedback: bool) -> str:
+def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
     """What a claim about a problem rests on that is not proven; empty where there is nothing of the kind, as where the
     integrals over the set of measurable disturbances are enclosed. Under ``feedback`` the checker proves it."""
     if problem.measurable is None:
