@@ -236,7 +236,7 @@ def failing(found: Check) -> list[str]:
     return [f"{claim.name}: {claim.text}" for claim in found.claims if claim.verdict != "holds"]
 
 
-@pytest.mark.first(8)
+@pytest.mark.first(4)
 @pytest.mark.parametrize("name", CONFIGS)
 def test_every_claim_of_an_honest_run_holds(name: str, runs: Runs) -> None:
     found = check(runs(name))
@@ -333,7 +333,7 @@ GROUPS = {
 }
 
 
-@pytest.mark.first(6)
+@pytest.mark.first(3)
 @pytest.mark.parametrize(
     "group", [pytest.param(name, marks=pytest.mark.slow if name == "nonsense" else ()) for name in GROUPS]
 )
@@ -344,7 +344,7 @@ def test_no_forgery_is_accepted_even_where_all_files_agree_with_it(group: str, h
     assert accepted == []
 
 
-@pytest.mark.first(27)
+@pytest.mark.first(12)
 @pytest.mark.parametrize("kind", [*FILES, *CRUDE])
 def test_a_crude_forgery_of_the_files_is_refused(kind: str, runs: Runs, tmp_path: Path) -> None:
     name, change = {**KINDS, **FILES}[kind]
@@ -387,6 +387,7 @@ def test_what_nothing_was_compared_with_is_named_and_changes_no_verdict(runs: Ru
     assert {"notes.txt", "trace.npz", "rounds.npz"} <= set(named)
 
 
+@pytest.mark.first(4)
 @pytest.mark.parametrize(
     ("name", "change", "place"),
     [

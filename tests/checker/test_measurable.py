@@ -39,7 +39,7 @@ def run(kind: str, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-@pytest.mark.first(3)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_claim_about_measurable_disturbances_holds(kind: str, tmp_path: Path) -> None:
     found = sr.check(run(kind, tmp_path))

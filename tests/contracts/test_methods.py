@@ -290,7 +290,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.first(13)
+@pytest.mark.first(6)
 @pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=[one.__name__ for one in FAULTS])
 def test_the_contract_catches_a_method_that_claims_too_much_on_purpose(flawed, test):
     fails(MethodContract, flawed, test)

@@ -98,6 +98,7 @@ def step_rows(independent: PolicyProgram, least: float, most: float, first: floa
         independent.below(-controls[0], -least - first)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 @pytest.mark.parametrize(
     ("changed", "rows"),

@@ -94,6 +94,7 @@ def test_costs_are_those_of_linear_programs_of_their_own(spring: sr.InitialState
         assert cost == pytest.approx(least(point), rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_symmetric_problem_has_a_symmetric_set(spring: sr.InitialStates) -> None:
     assert within(spring, -spring.inner)
     np.testing.assert_allclose(spring.outer.max(axis=0), -spring.outer.min(axis=0), atol=1e-6)

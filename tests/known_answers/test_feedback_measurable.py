@@ -313,6 +313,7 @@ def test_what_a_bound_rests_on_is_composed_once(tmp_path: Path, monkeypatch: pyt
     assert len(composed) == len(set(composed))
 
 
+@pytest.mark.slow
 def test_no_causal_policy_costs_less_than_signals_that_are_held_prove(certified: Path) -> None:
     said = json.loads((certified / "result.json").read_text())
     assert 0.9 * said["cost"] < said["causal_lower_bound"] <= said["cost"]

@@ -214,6 +214,7 @@ def test_what_measurable_disturbances_do_over_turns_is_enclosed(seed: int) -> No
     assert high == pytest.approx(dense, rel=2e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_bounds_of_cells_over_turns_are_above_every_violation_and_close(seed: int) -> None:
     problem, control = _random(seed)

@@ -808,6 +808,7 @@ def test_units_know_how_far_each_channel_of_the_decision_goes_at_any_time():
     assert case_of(decision=((0.5, -2.0), (-3.0, 1.0)), certificate={"decision": None}, **two)._acting is None
 
 
+@pytest.mark.first(3)
 @pytest.mark.parametrize("size", [1.0, 1e-150, 1e-200, 1e-250])
 @pytest.mark.parametrize("kind", ["ball", "ellipsoid"])
 def test_a_round_set_of_disturbances_takes_the_state_as_far_in_units_of_any_size(kind, size):

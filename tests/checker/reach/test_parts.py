@@ -228,6 +228,7 @@ def tube_of(system, control, disturbance, bound, degree, theta, start):
     )
 
 
+@pytest.mark.first(16)
 @pytest.mark.parametrize("sharp", [False, True])
 @pytest.mark.parametrize("name", ["box", "polytope", "ellipsoid", "zonotope", "1.5-norm", "2.0-norm"])
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ def highest(family, x, low, high, rng, count=40):
     return family.violations(x, indices).reshape(len(low), count, -1).max(axis=(1, 2))
 
 
+@pytest.mark.first(2)
 @pytest.mark.parametrize("kind", STAGED)
 def test_no_cell_is_bounded_below_what_is_met_in_it_and_narrow_ones_hardly_above(kind):
     rng, made = np.random.default_rng(2), program(kind)

@@ -57,6 +57,7 @@ def test_at_a_corner_of_the_set_the_multipliers_are_exact():
     assert abs(found @ s - g @ corner) <= 1e-12
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", MANY)
 def test_what_is_added_is_nowhere_negative_on_the_set(name):
     rng, index, space, tried = np.random.default_rng(0), ParameterIndex(SETS[name]), TaylorSpace(2, 4), 0
@@ -111,6 +112,7 @@ def test_a_step_to_the_support_point_ends_where_a_linear_function_is_highest(nam
     assert SETS[name].contains(points[:, 1:]).all()
 
 
+@pytest.mark.slow
 def test_a_constraint_that_an_ellipsoid_of_parameters_makes_active_is_proven_with_few_cells():
     constraint = constraint_over(SETS["ellipsoid"], np.random.default_rng(3), None, curved=False)
     x = np.ones(5)
@@ -149,6 +151,7 @@ def constraint_over(parameters, rng, bound, curved):
     return FlatConstraint("path", functionals, rng.normal(size=(2, 2)), rng.normal(size=2), 0.0, 2.0, index)
 
 
+@pytest.mark.first(1)
 @settings(max_examples=4, deadline=None)
 @pytest.mark.parametrize("name", MANY)
 @pytest.mark.parametrize("curved", [False, True])

@@ -114,7 +114,7 @@ def drives(outcome, rng):
     yield lambda k, x, c: adaptive(c.plan, k)
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("name", ["open loop", "nominal", "peak"])
 @pytest.mark.parametrize("resolve", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_no_loop_violates_a_constraint(plans, name, resolve) -> None:

@@ -100,6 +100,7 @@ def test_it_finds_and_proves_the_best_nominal_control_for_the_gains(outcome, fir
     assert found.lower <= found.cost <= found.lower + 1e-6
 
 
+@pytest.mark.first(1)
 def test_no_loop_violates_a_constraint_when_nominal_controls_are_chosen_anew(outcome) -> None:
     plant, controller, taken = Plant(outcome), tuning(outcome), 0
     for drive in drives(outcome, np.random.default_rng(5)):

@@ -57,6 +57,7 @@ def test_no_draw_is_larger_than_the_most_that_any_disturbance_causes(data: Figur
     assert (data.effort[-1] > 0.5 * most)[most > 0.1].mean() > 0.5  # and they come near to it
 
 
+@pytest.mark.slow
 def test_the_ground_is_white_exactly_where_the_control_is_off_whatever_happens(data: FigureData) -> None:
     assert data.control_least is not None and data.control_most is not None
     figure = run_figures.draw_effort(data)
