@@ -260,7 +260,7 @@ class ConvexSet(ABC):
         if flat is None:
             gauge = self.gauge(points)
             length = np.linalg.norm((points - self.interior_point()) @ self.normals.T, axis=-1)
-            inside = (gauge - 1.0) * (self._inner_radius if (gauge < 1.0).any() else 0.0)
+            inside = (np.minimum(gauge, 1.0) - 1.0) * (self._inner_radius if (gauge < 1.0).any() else 0.0)
             return np.asarray(np.where(gauge > 1.0, length * (1.0 - 1.0 / np.maximum(gauge, 1.0)), inside))
         H, h = flat
         if h.size == 0:

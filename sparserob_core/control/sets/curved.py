@@ -214,7 +214,7 @@ class NormBall(ConvexSet):
     @shaped
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
-        height: Array = directions @ self.centre + self.radius * np.linalg.norm(directions, ord=self.dual, axis=-1)
+        height: Array = directions @ self.centre + self.radius * _norm(directions, self.dual)
         return height
 
     @shaped
@@ -224,7 +224,7 @@ class NormBall(ConvexSet):
         if self.p == 1.0:
             axes = self.radius * np.eye(self.dimension)
             return continued_by_corners(self.centre + np.vstack([axes, -axes]), centre, spread)
-        root = self.radius * _continued_root(centre, spread, self.dual)
+        root = self.radius * _continued_root(centre, spread, self.dual) if self.radius > 0.0 else 0.0  # of a point
         return np.asarray((np.abs(centre) + spread) @ np.abs(self.centre) + root)
 
     @shaped
@@ -287,7 +287,7 @@ class NormBall(ConvexSet):
         if self.halfspaces() is not None:
             return super().violation(points)
         z = np.abs(np.asarray(points, dtype=float) - self.centre)
-        excess: Array = np.linalg.norm(z, ord=self.p, axis=-1) - self.radius
+        excess: Array = _norm(z, self.p) - self.radius
         if self.p == 2.0:
             return excess
         if self.radius == 0.0:
@@ -304,7 +304,7 @@ class NormBall(ConvexSet):
         if self.halfspaces() is not None:
             return super().contains(points, tolerance)
         rays = np.asarray(points, dtype=float) - self.centre
-        excess = np.atleast_1d(np.linalg.norm(rays, ord=self.p, axis=-1) - self.radius)
+        excess = np.atleast_1d(_norm(rays, self.p) - self.radius)
         most, least = (self.dimension ** max(0.0, sign * (1.0 / self.p - 0.5)) for sign in (1.0, -1.0))
         inside = excess <= most * tolerance
         open_yet = inside & (excess > 0.0) & (least * excess > tolerance)
@@ -326,7 +326,7 @@ class NormBall(ConvexSet):
 
     @shaped
     def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        return ratios(np.linalg.norm(np.asarray(points, dtype=float) - self.centre, ord=self.p, axis=-1), self.radius)
+        return ratios(_norm(np.asarray(points, dtype=float) - self.centre, self.p), self.radius)
 
     @shaped
     def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
@@ -468,6 +468,15 @@ def _continued_root(a: Array, b: Array, q: float) -> Array:
     return np.where(analytic, unit[:, 0] * (total + off) ** (1.0 / q), np.inf)
 
 
+def _norm(vectors: Array, q: float) -> Array:
+    """The ``q``-norms of ``(..., d)``, in units of their largest entries: a power of those themselves is 0 or infinite
+    where ``q`` is large and they are not near 1."""
+    if q in (1.0, 2.0, np.inf):
+        return np.asarray(np.linalg.norm(vectors, ord=q, axis=-1))
+    unit = np.abs(vectors).max(axis=-1, keepdims=True)
+    return np.asarray(unit[..., 0] * np.linalg.norm(vectors / np.where(unit > 0.0, unit, 1.0), ord=q, axis=-1))
+
+
 @shaped
 def _power_excess(a: Float[Array, "*k d"], b: Float[Array, "*k d"], q: float) -> Float[Array, " *k"]:
     """A bound of ``|a + s|_q - |a|_q - gradient's`` for ``|s_i| <= b_i``: the root is concave in ``sum |a_i + s_i|^q``,
@@ -475,9 +484,11 @@ def _power_excess(a: Float[Array, "*k d"], b: Float[Array, "*k d"], q: float) ->
 
     ``a, b (..., d)``; returns ``(...,)``, infinite where ``a`` vanishes.
     """
+    unit = np.abs(a).max(axis=-1, keepdims=True)
+    a, b, unit = *(one / np.where(unit > 0.0, unit, 1.0) for one in (a, b)), unit[..., 0]
     slope = q * np.sign(a) * np.abs(a) ** (q - 1.0)
     ends = [np.abs(a + sign * b) ** q - np.abs(a) ** q - sign * slope * b for sign in (-1.0, 1.0)]
     norms = np.linalg.norm(a, ord=q, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        excess = norms ** (1.0 - q) * np.maximum(*ends).sum(axis=-1) / q
+        excess = unit * norms ** (1.0 - q) * np.maximum(*ends).sum(axis=-1) / q
     return np.where(norms > 0.0, excess, np.inf)

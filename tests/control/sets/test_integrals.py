@@ -93,3 +93,10 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_continued() -> No
     assert analytic(box, [1.0], [0.99]) and not analytic(box, [1.0], [1.0])
     assert analytic(corners, [1.0, 0.5], [0.24, 0.24]) and not analytic(corners, [1.0, 0.5], [0.26, 0.26])
     assert not enclosed(product([ball, Zonotope(np.zeros(1), np.ones((1, 1)))]))
+
+
+def test_of_a_ball_that_is_a_point_nothing_moves() -> None:
+    rows = np.array([[1.0, 0.5], [0.0, 0.0]])
+    with np.errstate(all="raise"):
+        found = NormBall(3.0, 0.0, [2.0, 0.0]).continued(rows, rows + 1.0)
+    np.testing.assert_array_equal(found, [6.0, 2.0])

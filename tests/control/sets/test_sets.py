@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from sparserob_core.control.sets.curved import _power_excess
 from sparserob_core.control.sets.sets import (
     Box,
     Cylinder,
@@ -351,3 +352,20 @@ def test_a_point_amid_a_simplex_is_the_same_in_other_units():
     units = np.array([2.0**-6, 1.0, 2.0**9])
     assert simplex.middle() == pytest.approx([0.25] * 3, rel=1e-12)  # that of the bounding box is outside
     assert simplex.in_units(units).middle() * units == pytest.approx(simplex.middle(), rel=1e-12)
+
+
+@pytest.mark.parametrize("p", [1.01, 1.5, 3.0, 50.0])
+def test_a_ball_is_the_same_in_any_units(p: float) -> None:
+    rows, spread = np.array([[1.0, 0.2], [-0.3, 2.0]]), np.array([[0.1, 0.1], [0.05, 0.3]])
+    one = NormBall(p, 2.0, dimension=2)
+    for unit in (1e-9, 1e9):
+        with np.errstate(over="raise", invalid="raise"):
+            other = NormBall(p, 2.0 * unit, dimension=2)
+            np.testing.assert_allclose(one.support(rows * unit), unit * one.support(rows), rtol=1e-12)
+            np.testing.assert_allclose(other.gauge(rows * unit), one.gauge(rows), rtol=1e-12)
+            np.testing.assert_allclose(
+                other.violation(rows * unit), unit * one.violation(rows), rtol=1e-6, atol=unit * 1e-9
+            )
+            np.testing.assert_array_equal(other.contains(rows * unit, 1e-9 * unit), one.contains(rows))
+            found = [_power_excess(rows * u, spread * u, one.dual) for u in (1.0, unit)]
+            np.testing.assert_allclose(found[1], unit * found[0], rtol=1e-9)
