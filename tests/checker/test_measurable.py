@@ -6,12 +6,12 @@ import copy
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.transcription.provable import remark
 from tests.checker.test_check import DECAY, SPRING, on
+from tests.control.sets.test_sets import ByItsSupport
 from tests.support.tampering import Forgery, forged
 
 STIRRED = {**SPRING, "disturbance_class": "measurable", "disturbance": {"box": [0.03, 0.03]}}
@@ -83,19 +83,6 @@ def test_a_higher_lower_bound_and_another_violation_are_refuted(tmp_path: Path) 
         assert sr.check(forged(run(kind, place), place / "forged", change, consistent=True)).status == "refuted"
 
 
-class Egg(sr.ConvexSet):
-    """A disc that says nothing but its support function."""
-
-    dimension = 2
-
-    def support(self, directions: np.ndarray) -> np.ndarray:
-        return np.asarray(0.03 * np.linalg.norm(directions, axis=-1))
-
-    def support_point(self, directions: np.ndarray) -> np.ndarray:
-        size = np.linalg.norm(directions, axis=-1, keepdims=True)
-        return np.asarray(0.03 * directions / np.where(size > 0.0, size, 1.0))
-
-
 def test_of_a_set_that_only_tells_its_support_function_a_run_says_what_is_estimated() -> None:
     problems = [
         sr.OptimalControlProblem(
@@ -107,7 +94,7 @@ def test_of_a_set_that_only_tells_its_support_function_a_run_says_what_is_estima
             disturbance=bound,
             disturbance_class="measurable",
         )
-        for bound in (Egg(), sr.NormBall(2.0, 0.03, dimension=2))
+        for bound in (ByItsSupport(sr.NormBall(2.0, 0.03, dimension=2)), sr.NormBall(2.0, 0.03, dimension=2))
     ]
     assert ["estimated" in remark(problem) for problem in problems] == [True, False]
     costs = [sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4}).cost for problem in problems]

@@ -17,6 +17,7 @@ from sparserob_core.control.studies.adversary import pushed_by, worst_signal
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
+from tests.control.sets.test_sets import ByItsSupport
 from tests.known_answers.test_checks import pieces, verified
 from tests.known_answers.test_pairs import BASE, in_turns, of_two_classes, with_drift
 from tests.known_answers.test_varying_systems import FADING
@@ -264,19 +265,6 @@ def test_a_constant_plant_in_a_curved_set_costs_the_same_as_a_function_of_time(m
     assert costs[1] == pytest.approx(costs[0], rel=1e-8)
 
 
-class Egg(sr.ConvexSet):
-    """A disc that says nothing but its support function."""
-
-    dimension = 2
-
-    def support(self, directions: np.ndarray) -> np.ndarray:
-        return np.asarray(0.1 * np.linalg.norm(directions, axis=-1))
-
-    def support_point(self, directions: np.ndarray) -> np.ndarray:
-        size = np.linalg.norm(directions, axis=-1, keepdims=True)
-        return np.asarray(0.1 * directions / np.where(size > 0.0, size, 1.0))
-
-
 def test_a_set_of_which_no_integral_is_known_is_refused_by_name() -> None:
     with pytest.raises(sr.InputError, match="disturbance: expected a box, polytope, ellipsoid or ball where the"):
         sr.OptimalControlProblem(
@@ -284,7 +272,7 @@ def test_a_set_of_which_no_integral_is_known_is_refused_by_name() -> None:
             horizon=1.0,
             initial_state=[1.0],
             control=sr.Box([-1.0], [1.0]),
-            disturbance=Egg(),
+            disturbance=ByItsSupport(sr.NormBall(2.0, 0.1, dimension=2)),
             disturbance_class="measurable",
         )
 
