@@ -14,6 +14,7 @@ from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Bool, Float, dense, sealed, shaped
 from sparserob_core.sip.convex_set import (
+    HALVINGS,
     Array,
     Box,
     ConvexSet,
@@ -287,14 +288,15 @@ class NormBall(ConvexSet):
         if self.halfspaces() is not None:
             return super().violation(points)
         z = np.abs(np.asarray(points, dtype=float) - self.centre)
-        excess: Array = _norm(z, self.p) - self.radius
+        excess = np.asarray(_norm(z, self.p) - self.radius)
         if self.p == 2.0:
             return excess
         if self.radius == 0.0:
             return np.asarray(np.linalg.norm(z, axis=-1))
-        distance = self.radius * np.linalg.norm(z / self.radius - self._projected(z / self.radius), axis=-1)
-        steepest = self.dimension ** max(0.0, 1.0 / self.p - 0.5)
-        signed: Array = np.where(excess > 0.0, distance, excess / steepest)
+        signed, outside = np.array(excess / self.dimension ** max(0.0, 1.0 / self.p - 0.5)), excess > 0.0
+        if outside.any():
+            z = z[outside] / self.radius
+            signed[outside] = self.radius * np.linalg.norm(z - self._projected(z), axis=-1)
         return signed
 
     @shaped
@@ -395,8 +397,20 @@ def _round_excess(centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) 
 
 
 def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
-    """The root ``0 <= y <= z`` of ``y + multiplier y^power = z``, by bisection."""
-    return bisect(lambda y: y + multiplier * y**power > z, np.zeros_like(z), z.copy())[1]
+    """The root ``0 <= y <= z`` of ``y + multiplier y^power = z``.
+
+    Of its two parts one, ``a``, has the other as a convex function ``(a / unit)^q``, ``q >= 1``; Newton's method comes
+    down to it from where either part alone would be ``z``."""
+    q = max(power, 1.0 / power)
+    unit = multiplier if power < 1.0 else multiplier ** (-1.0 / q)
+    a = np.minimum(z, unit * z ** (1.0 / q))
+    for _ in range(HALVINGS):
+        other = (a / unit) ** q
+        step = ratios((a + other - z) * a, a + q * other)
+        a = np.maximum(a - step, 0.0)
+        if (np.abs(step) <= np.finfo(float).eps * a).all():
+            break
+    return np.minimum(z, (a / unit) ** q if power < 1.0 else a)
 
 
 def _in_ball(p: float, dimension: int, count: int, rng: np.random.Generator) -> Array:

@@ -142,7 +142,9 @@ class Polytope(ConvexSet):
     @cached_property
     def is_bounded(self) -> bool:
         axes = np.eye(self.dimension)
-        return all(np.isfinite(self._maximise(axis)[0]) for axis in np.vstack([axes, -axes]))
+        return bool(np.isfinite(self._reach)) or all(
+            np.isfinite(self._maximise(axis)[0]) for axis in np.vstack([axes, -axes])
+        )
 
     @cached_property
     def vertices(self) -> Array | None:
@@ -238,10 +240,7 @@ class Polytope(ConvexSet):
     def _maximise_all(self, directions: Float[Array, "k d"]) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
         """`_maximise` for directions ``(k, d)``: several linear programs side by side in one, since calling the solver
         costs far more than a small program does; one by one where that fails."""
-        from scipy.optimize import linprog
-        from scipy.sparse import block_diag, csc_array
-
-        H, h, units = self._balanced
+        _, h, units = self._balanced
         values, points = np.zeros(len(directions)), np.tile(self.interior_point(), (len(directions), 1))
         endless = self._endless(directions * units)
         values[endless] = np.inf
@@ -249,21 +248,33 @@ class Polytope(ConvexSet):
         for start in range(0, asking.size, _TOGETHER):
             part = asking[start : start + _TOGETHER]
             scaled = directions[part] * units
-            costs = -scaled / np.abs(scaled).max(axis=1, keepdims=True)
-            if part.size > 1 and h.size and np.isfinite(costs).all():
-                rows = block_diag([csc_array(H)] * part.size, format="csc")
-                answer = linprog(costs.reshape(-1), rows, np.tile(h, part.size), bounds=(None, None))
-                if answer.status == 0:
-                    found = np.asarray(answer.x).reshape(scaled.shape)
-                    multipliers = -np.asarray(answer.ineqlin.marginals).reshape(part.size, h.size)
-                    sizes = np.abs(scaled).max(axis=1)
-                    proven = sizes * self._dual_bound(-costs, multipliers)
+            sizes = np.abs(scaled).max(axis=1)
+            balanced = scaled / sizes[:, None]
+            if part.size > 1 and h.size and np.isfinite(balanced).all():
+                answer = self._side_by_side(balanced)
+                if answer is not None:
+                    found, multipliers = answer
+                    proven = sizes * self._dual_bound(balanced, multipliers)
                     values[part] = np.maximum((scaled * found).sum(axis=1), proven)
                     points[part] = found * units
                     continue
             for position in part:
                 values[position], points[position] = self._maximise(directions[position])
         return values, points
+
+    def _side_by_side(self, directions: Array) -> tuple[Array, Array] | None:
+        """Maximisers ``(k, d)`` and multipliers ``(k, r)`` of directions ``(k, d)`` in balanced coordinates, by one
+        linear program; ``None`` where that has no answer, as of an unbounded direction."""
+        from scipy.optimize import linprog
+        from scipy.sparse import block_diag, csc_array
+
+        (H, h, _), count = self._balanced, len(directions)
+        rows = block_diag([csc_array(H)] * count, format="csc")
+        answer = linprog(-directions.reshape(-1), rows, np.tile(h, count), bounds=(None, None))
+        if answer.status != 0:
+            return None
+        multipliers = -np.asarray(answer.ineqlin.marginals).reshape(count, h.size)
+        return np.asarray(answer.x).reshape(directions.shape), multipliers
 
     def _endless(self, directions: Array) -> npt.NDArray[np.bool_]:
         """Which directions ``(k, d)`` in balanced coordinates have a part along a line that no row bounds, clearly."""
@@ -321,16 +332,18 @@ class Polytope(ConvexSet):
         With multipliers ``y`` of each axis ``M = max |x_i|`` is at most ``y'h + |e_i - H'y|_1 M``, which bounds ``M``
         where the second factor is below 1.
         """
-        from scipy.optimize import linprog
-
         H, h, _ = self._balanced
+        axes = np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
         highest, left = 0.0, 0.0
-        for axis in np.vstack([np.eye(self.dimension), -np.eye(self.dimension)]):
-            answer = linprog(-axis, H, h, bounds=(None, None))
-            if answer.status != 0:
+        if not h.size:
+            return np.inf
+        for start in range(0, len(axes), _TOGETHER):
+            part = axes[start : start + _TOGETHER]
+            answer = self._side_by_side(part)
+            if answer is None:
                 return np.inf
-            y = np.maximum(-np.asarray(answer.ineqlin.marginals), 0.0)
-            highest, left = max(highest, float(y @ h)), max(left, float(np.abs(axis - y @ H).sum()))
+            y = np.maximum(answer[1], 0.0)
+            highest, left = max(highest, float((y @ h).max())), max(left, float(np.abs(part - y @ H).sum(axis=1).max()))
         return 2.0 * abs(highest) / (1.0 - left) if left < 0.5 else np.inf
 
 

@@ -424,3 +424,19 @@ def test_whether_points_of_many_coordinates_are_inside_does_not_ask_how_deep() -
     assert bound.contains(np.stack([np.zeros(12), bound.support_point(np.ones(12))])).all()
     assert "_inner_radius" not in vars(bound)
     assert bound.violation(np.zeros(12)) < 0.0 and "_inner_radius" in vars(bound)
+
+
+@pytest.mark.parametrize("p", [1.02, 1.3, 3.0, 40.0])
+def test_the_distance_from_a_ball_is_what_its_own_direction_proves(p: float) -> None:
+    """Weak duality: no point of the ball is nearer to ``x`` than ``c'x - |c|_q`` for a unit ``c``, and the one from the
+    nearest point to ``x`` attains it, near the ball and far from it."""
+    rng, q = np.random.default_rng(0), p / (p - 1.0)
+    points = rng.normal(size=(200, 3))
+    points *= ((1.0 + 10.0 ** rng.uniform(-6.0, 6.0, 200)) / np.linalg.norm(points, ord=p, axis=1))[:, None]
+    ball = NormBall(p, 1.0, np.zeros(3))
+    away = points - np.sign(points) * ball._projected(np.abs(points))
+    units = away / np.linalg.norm(away, axis=1, keepdims=True)
+    proven = (units * points).sum(axis=1) - np.linalg.norm(units, ord=q, axis=1)
+    np.testing.assert_allclose(ball.violation(points), proven, rtol=1e-7, atol=1e-11)
+    inside = 0.5 * points / np.linalg.norm(points, ord=p, axis=1, keepdims=True)
+    assert (ball.violation(inside) < 0.0).all()
