@@ -141,7 +141,10 @@ class TaylorSpace:
     @shaped
     def monomials(self, delta: Float[Array, "k nu"]) -> Float[Array, "k M"]:
         """Values ``(k, M)`` of every monomial at ``delta (k, nu)``."""
-        values: Array = np.prod(np.asarray(delta)[:, None, :] ** self.exponents[None], axis=-1)
+        powers = np.asarray(delta)[:, :, None] ** np.arange(self.degree + 1)
+        values: Array = np.ones((len(powers), self.size))
+        for i in range(self.nu):
+            values *= powers[:, i, self.exponents[:, i]]
         return values
 
 

@@ -417,11 +417,14 @@ class LinearSystem:
             raise NotEnclosable(
                 f"system: the function {name} returns shape {shape} for numbers, but {models.shape} for Taylor models"
             )
-        for place, model in np.ndenumerate(models):
+        every, left = coefficients.reshape(space.size, -1), remainder.reshape(-1)
+        for place, model in enumerate(models.ravel().tolist()):
+            if type(model) is int and not model:  # nearly all of them where states are coefficients of polynomials
+                continue
             if isinstance(model, TaylorModel):
-                coefficients[:, *place], remainder[place] = model.coefficients, model.remainder
+                every[:, place], left[place] = model.coefficients, model.remainder
             elif isinstance(model, int | float | np.integer | np.floating):
-                coefficients[0, *place] = model
+                every[0, place] = model
             else:
                 raise NotEnclosable(
                     f"system: the function {name} returned {type(model).__name__} for an entry, expected a number"

@@ -466,21 +466,36 @@ class Propagator:
             self._exponentials[mode] = Leaps(self.system.modes[mode].matrices(np.zeros((1, 0)))[0][0])
         return self._exponentials[mode]
 
-    def _varying_weights(self, expansion: Expansion, times: Array, directions: Array) -> Weights:
-        """`weights` of a system that changes with time, without an input matrix for every index."""
+    def _varying_weights(
+        self,
+        expansion: Expansion,
+        times: Array,
+        directions: Array,
+        how: Spread | None = None,
+        parameters: Array | None = None,
+    ) -> Weights:
+        """`weights` of a system that changes with time, without an input matrix for every index; of all coefficients
+        where the state is a polynomial in ``parameters (k, nu)``, and ``directions`` are those of its values: within a
+        piece rows are theirs, and at its beginning those on the coefficients."""
         steps, pieces = self.steps(np.zeros((1, 0))), self.grid.locate(times)
         order = np.argsort(-pieces, kind="stable")
         rows, at = np.array(directions, dtype=float)[order], pieces[order]
         begun = self.grid.breakpoints[at]
-        distinct, which = np.unique(np.stack([begun, np.maximum(times[order], begun)]), axis=1, return_inverse=True)
-        key, which = distinct.tobytes(), which.reshape(-1)
-        if key not in self._flows:
-            remember(self._flows, key, expansion.flow(distinct[0], distinct[1]), FLOWS_KEPT)
-        over = self._flows[key]
-        both = np.concatenate([over.control, over.disturbance], axis=2)
+        if how is None or parameters is None:
+            distinct, which = np.unique(np.stack([begun, np.maximum(times[order], begun)]), axis=1, return_inverse=True)
+            key, which = distinct.tobytes(), which.reshape(-1)
+            if key not in self._flows:
+                remember(self._flows, key, expansion.flow(distinct[0], distinct[1]), FLOWS_KEPT)
+            over = self._flows[key]
+            state, both = over.state[which], np.concatenate([over.control, over.disturbance], axis=2)[which]
+        else:
+            powers = how.space.monomials(how.shares(parameters[order]))
+            state, both = expansion.at_parameters(begun, np.maximum(times[order], begun), powers)
         found = np.zeros((times.size, self.grid.pieces, both.shape[2]))
-        found[np.arange(times.size), at] = (rows[:, None] @ both[which])[:, 0]
-        rows = (rows[:, None] @ over.state[which])[:, 0]
+        found[np.arange(times.size), at] = (rows[:, None] @ both)[:, 0]
+        rows = (rows[:, None] @ state)[:, 0]
+        if how is not None and parameters is not None:
+            rows = how.directions(rows, parameters[order])
         pushes, Phi = self._pushes, steps.Phi[0]
         last = int(at[0]) if at.size else 0
         reaching = np.searchsorted(-at, -np.arange(last)).tolist()
@@ -490,7 +505,7 @@ class Propagator:
             rows[: reaching[piece]] = part @ Phi[piece]
         back = np.empty_like(order)
         back[order] = np.arange(order.size)
-        channels = over.control.shape[2]
+        channels = expansion.channels[0]
         return Weights(rows[back], found[back, :, :channels], found[back, :, channels:])
 
     @cached_property
@@ -591,9 +606,10 @@ class Propagator:
         """The functional ``c'x(t)`` of each index as weights on what is given and on inputs: `adjoint` and
         `TimeGrid.through`, without ``(k, L, d)`` numbers."""
         if self.spread:
-            none, found = np.zeros((times.size, 0)), []
+            found = []
             for here, how, every in self.by_part(parameters):
-                one = every.weights(times[here], how.directions(directions[here], parameters[here]), none[here])
+                assert every.expansion is not None
+                one = every._varying_weights(every.expansion, times[here], directions[here], how, parameters[here])
                 # at the beginning nothing depends on parameters
                 found.append((here, one._replace(free=one.free[:, : how.d])))
             return Weights(*_joined_parts(found))
@@ -824,7 +840,6 @@ class Outputs:
     H: Array
     times: Array
     points: Array
-    _axes: list[Outputs] = field(default_factory=list, repr=False)
 
     @cached_property
     def within(self) -> tuple[np.ndarray, Array, np.ndarray]:
@@ -895,17 +910,27 @@ class Outputs:
         return np.asarray(found)
 
     def _spread(self, response: Response, control: Array) -> Array:
-        """`at` of a system whose state is a polynomial in its parameters: of all coefficients, which are seen then."""
-        found = np.empty((len(self.points), self.H.shape[0], self.times.size))
-        for number, (here, how, every) in enumerate(self.propagator.by_part(self.points)):
-            if len(self._axes) <= number:
-                self._axes.append(Outputs(every, np.eye(how.states), self.times, np.zeros((1, 0))))
-            begun = np.append(response.initial_state, np.zeros(how.states - how.d))
-            whole = Response(every.system, every.grid, begun, shared=every)
-            states = self._axes[number].at(whole, control)[0].T
-            at = how.seen(np.broadcast_to(states, (here.size, *states.shape)), self.points[here])
-            found[here] = np.einsum("ri,vti->vrt", self.H, at)
-        return found
+        """`at` of a system whose state is a polynomial in its parameters: from the values of this at the breakpoints
+        on, as of a known one."""
+        grid, pieces = self.propagator.grid, self.within[0]
+        nodes, inputs = response.nodes(control, self.points), grid.inputs(control).T[pieces]
+        flow, driven = self._at_points
+        found = np.einsum("vtri,vti->vrt", flow, nodes[:, pieces])
+        return np.asarray(found + np.einsum("vtrm,tm->vrt", driven, inputs))
+
+    @cached_property
+    def _at_points(self) -> tuple[Array, Array]:
+        """`_over_pieces` of a system whose state is a polynomial in its parameters, at each of the points, ``(v, T, r,
+        d)`` and ``(v, T, r, m)``."""
+        begun, count, found = self.propagator.grid.breakpoints[self.within[0]], self.times.size, []
+        stops = np.maximum(self.times, begun)
+        for here, how, every in self.propagator.by_part(self.points):
+            powers = np.repeat(how.space.monomials(how.shares(self.points[here])), count, axis=0)
+            assert every.expansion is not None
+            both = every.expansion.at_parameters(np.tile(begun, here.size), np.tile(stops, here.size), powers)
+            found.append((here, tuple((self.H @ one).reshape(here.size, count, len(self.H), -1) for one in both)))
+        flow, driven = _joined_parts(found)
+        return flow, driven[..., : self.propagator.system.controls]
 
     def _in_blocks(self, initial_state: Array, inputs: Array) -> Array:
         """``(r, T)`` from inputs ``(m, L)``."""

@@ -8,11 +8,12 @@ from math import factorial
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import sparserob_core as sr
 from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.response.response import Propagator, merge_grids
+from sparserob_core.control.response.response import Outputs, Propagator, Response, merge_grids
 from sparserob_core.control.response.varying import spread as expansions
 from sparserob_core.control.response.varying.discs import cauchy
 from sparserob_core.control.response.varying_motion import Truncation, VaryingMotion
@@ -162,3 +163,52 @@ def test_what_power_series_leave_of_entries_is_in_what_is_beyond(name: str, degr
         series = sum(np.exp(0.05) * (0.25 * np.linspace(-1.0, 1.0, 31)) ** n / factorial(n) for n in range(degree + 1))
         true = 2.0 * float(np.abs(exact - series).max())
         assert true <= truncation.lost(0.0 * np.abs(states[:-1]), others)[-1, 0] <= 1e2 * true
+
+
+PUSHED = sr.VaryingSystem.of(
+    [["0", "1"], ["-(1 + p*sin(2*t)) - q", "-1/(4 + q)"]],
+    [["0"], ["1 + p^2*cos(t)"]],
+    3.0,
+    [["q"], ["1"]],
+    parameters=sr.Box([0.1, -0.1], [0.3, 0.05]),
+    names=["p", "q"],
+)
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize("most", [140, 30])
+def test_rows_and_outputs_at_any_time_and_parameter_are_those_of_an_integrator(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(expansions, "LEFT", ((1e-8, most),))  # fewer numbers are several parts
+    breaks, rng = np.linspace(0.0, 3.0, 3), np.random.default_rng(4)
+    system = replace(PUSHED)
+    response = Response(system, merge_grids(breaks, breaks, varying=True), np.array([1.0, -0.5]))
+    assert (len(response.propagator.spread) > 1) == (most == 30)
+    times, c = np.array([0.4, 1.5, 2.3, 3.0]), rng.normal(size=(4, 2))
+    points = rng.uniform(PUSHED.parameters.lower, PUSHED.parameters.upper, (4, 2))  # type: ignore[union-attr]
+    control, disturbance = np.array([[1.0, -2.0]]), np.array([0.5, 0.3])
+    weights = response.weights(times, c, points)
+    rows = weights.free @ response.initial_state
+    rows += weights.control[..., 0] @ control[0] + weights.disturbance[..., 0] @ disturbance
+    outputs = Outputs(response.propagator, c, times, points).at(response, control)
+    for k, (p, q) in enumerate(points.tolist()):
+
+        def rate(t: float, x: np.ndarray, u: float, w: float, p: float = p, q: float = q) -> np.ndarray:
+            moved = -(1 + p * np.sin(2 * t) + q) * x[0] - x[1] / (4 + q) + (1 + p**2 * np.cos(t)) * u + w
+            return np.array([x[1] + q * w, moved])
+
+        for share in (1.0, 0.0):
+            x, seen = response.initial_state, {}
+            for piece in range(2):
+                inputs = control[0, piece], share * disturbance[piece]
+                inside = times[(times > breaks[piece]) & (times <= breaks[piece + 1])]
+                ends = breaks[piece], breaks[piece + 1]
+                path = solve_ivp(rate, ends, x, args=inputs, t_eval=inside, method="DOP853", rtol=1e-12, atol=1e-13)
+                seen |= dict(zip(inside.tolist(), path.y.T, strict=True))
+                x = solve_ivp(rate, ends, x, args=inputs, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+            states = np.array([seen[t] for t in times.tolist()])
+            if share:
+                assert rows[k] == pytest.approx(c[k] @ states[k], abs=1e-7)
+            else:
+                assert outputs[k] == pytest.approx(c @ states.T, abs=1e-7)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from math import ceil, comb
 from typing import NamedTuple
@@ -40,6 +40,7 @@ SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure ho
 _KNOWN: WeakKeyDictionary[LinearSystem, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
 FIRST = 8  # segments to begin with
 SWEEPS = 20  # of balancing
+NUMBERS = np.zeros((3, 1), dtype=int)  # the products of polynomials that are numbers
 
 
 class Flow(NamedTuple):
@@ -214,6 +215,57 @@ class Expansion:
             follow(here, *self._within(last[here], self.ends[last[here]], stops[here]))
         return Flow(state, inputs[..., :m], inputs[..., m:], error, sizes)
 
+    @shaped
+    def at_parameters(
+        self, starts: Float[Array, " k"], stops: Float[Array, " k"], powers: Float[Array, "k M"]
+    ) -> tuple[Float[Array, "k d d"], Float[Array, "k d n"]]:
+        """What each of the intervals makes of states and of inputs, those of the disturbance after the others, where
+        the states are coefficients of polynomials whose monomials are ``powers (k, M)``: of the values of these.
+
+        A system of few states, which is that of all coefficients at a parameter, but for products beyond the degree;
+        in it all is at most what it is in that of all coefficients, so that it is off by no more.
+        """
+        own = self.own
+        state, inputs = np.tile(np.eye(own), (starts.size, 1, 1)), np.zeros((starts.size, own, sum(self.channels)))
+        first = self.segment_of(starts)
+        last = np.clip(np.searchsorted(self.ends, stops, side="left") - 1, first, self.ends.size - 2)
+        for n in range(int((last - first).max(initial=-1)) + 1):
+            here = np.flatnonzero((first + n <= last) & (stops > starts))
+            if not here.size:
+                continue
+            segments = first[here] + n
+            begun = np.maximum(starts[here], self.ends[segments])
+            ended = np.where(segments < last[here], self.ends[segments + 1], stops[here])
+            step = self._of_values(segments, begun, ended, powers[here])
+            state[here] = step[..., :own] @ state[here]
+            inputs[here] = step[..., :own] @ inputs[here] + step[..., own:]
+        return state, inputs
+
+    def _of_values(self, segments: np.ndarray, starts: Array, stops: Array, powers: Array) -> Array:
+        """`at_parameters` of intervals within one segment each, side by side, ``(k, d, d + n)``."""
+        size, own, there = powers.shape[1], self.own, self._there
+        both = np.column_stack([segments, powers[:, there]])
+        _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)
+        which, given = which.reshape(-1), self._first
+        given = given.reshape(*given.shape[:2], size, own, given.shape[3])[:, :, there]
+        values = np.einsum("ka,knaij->knij", powers[first][:, there], given[segments[first]])[which]
+        length = stops - starts
+        moved = self._moved(segments, starts, length)
+        law = (moved @ values.reshape(*values.shape[:2], -1)).reshape(values.shape) * length[:, None, None, None]
+        units = self.units[:own, None]
+        sizes = (np.abs(law[..., :own]) * units[:, 0] / units).sum(axis=3).max(axis=2)
+        pushes = np.abs(law[..., own:]) / units
+        most = pushes.sum(axis=1).max(axis=1)
+        shares = (pushes / np.where(most > 0.0, most, np.inf)[:, None, None]).max(axis=(2, 3), initial=0.0)
+        terms, _ = _tail(sizes, shares)
+        return self._summed(law[..., :own], law[..., own:], terms, DEGREE, 1)
+
+    @cached_property
+    def _there(self) -> np.ndarray:
+        """The coefficients of polynomials that the law has."""
+        every = self._first.reshape(*self._first.shape[:2], -1, self.own, self._first.shape[3])
+        return np.flatnonzero(every.any(axis=(0, 1, 3, 4)))
+
     def _off(self, before: tuple[Array, ...], step: Array, off: Array) -> Array:
         """What products ``P S`` are off by, ``P`` a ``step (k, d, d)`` that is off by ``off (k,)``, and ``S`` what was
         ``before``: ``off (|S| + error) + |P| error``, and what is rounded; of inputs as shares of what drives."""
@@ -282,11 +334,11 @@ class Expansion:
 
     def _backwards(self, A: Array, F: Array, terms: int) -> Array:
         """The terms ``(k, terms + 1, d, m + mw)`` of ``Psi F`` with ``Psi' = Psi A``, ``Psi(0) = I``, from those of ``A
-        (k, DEGREE + 1, d, own)`` and ``F``; where the states are coefficients of polynomials, as in `_of_ring`."""
+        (k, DEGREE + 1, d, own)`` and ``F``; where the states are coefficients of polynomials, as in `_summed`."""
         count, own = len(A), self.own
         A, F = (one.reshape(count, DEGREE + 1, -1, own, one.shape[3]) for one in (A, F))
         size = A.shape[2]
-        left, right, target = np.zeros((3, 1), dtype=int) if self.spread is None else self.spread.space.products
+        left, right, target = NUMBERS if self.spread is None else self.spread.space.products
         factors = [(left[right == b], target[right == b]) for b in range(size)]
 
         def times(series: Sequence[Array], n: int, other: Array, there: Sequence[tuple[int, int]]) -> Array:
@@ -308,18 +360,20 @@ class Expansion:
     def _recentred(self, segments: np.ndarray, times: Array, steps: Array, length: Array) -> tuple[Array, Array]:
         """The coefficients of ``[A F]`` times a ``length (k,)`` in powers of the share of ``steps (k,)`` that are made
         from ``times (k,)``, ``(k, DEGREE + 1, d, d + m + mw)``; and what they are made of, before anything cancels."""
-        centre = (self.ends[segments] + self.ends[segments + 1]) / 2
-        radius = (self.ends[segments + 1] - self.ends[segments]) / 2
-        at, share = (times - centre) / radius, steps / radius
-        powers = at[:, None] ** np.arange(DEGREE + 1)
-        moved = np.zeros((times.size, DEGREE + 1, DEGREE + 1))
-        for n in range(DEGREE + 1):
-            for k in range(n, DEGREE + 1):
-                moved[:, n, k] = comb(k, n) * powers[:, k - n] * share**n
-        given = self._first
+        moved, given = self._moved(segments, times, steps), self._first
         every = given[segments].reshape(times.size, DEGREE + 1, -1)
         shape, factor = (times.size, *given.shape[1:]), length[:, None, None, None]
         return (moved @ every).reshape(shape) * factor, (np.abs(moved) @ np.abs(every)).reshape(shape) * factor
+
+    def _moved(self, segments: np.ndarray, times: Array, steps: Array) -> Array:
+        """What makes of coefficients on segments those in powers of the share of ``steps (k,)`` that are made from
+        ``times (k,)``, ``(k, DEGREE + 1, DEGREE + 1)``."""
+        centre = (self.ends[segments] + self.ends[segments + 1]) / 2
+        radius = (self.ends[segments + 1] - self.ends[segments]) / 2
+        at, share = (times - centre) / radius, steps / radius
+        orders, binomials = _binomials(DEGREE)
+        beyond = np.maximum(orders - orders[:, None], 0)
+        return np.asarray(binomials * (at[:, None] ** orders)[:, beyond] * (share[:, None] ** orders)[:, :, None])
 
     @property
     def own(self) -> int:
@@ -341,59 +395,43 @@ class Expansion:
             return np.asarray(sums.max(axis=-1))
         return np.asarray(sums.reshape(*sums.shape[:-1], -1, self.own).max(axis=-1).sum(axis=-1))
 
-    def _of_ring(self, A: Array, driven: Array, terms: int, degree: int) -> Array:
-        """The sum of the series in `_within` where the states are coefficients of polynomials: what is multiplied are
-        polynomials whose coefficients are ``(own, own)``."""
-        assert self.spread is not None
-        count, d, size, wide = len(A), self.own, self.spread.space.size, self.own + driven.shape[3]
-        left, right, target = self.spread.space.products
-        law = A.reshape(count, DEGREE + 1, size, d, d)
-        every = np.zeros((count, size, terms + 1, d, wide))
-        every[:, 0, 0, :, :d] = np.eye(d)
-        pushes = driven.reshape(count, DEGREE + 1, size, d, -1)
-        there = [b for b in range(size) if law[:, : degree + 1, b].any()]
+    def _summed(self, A: Array, driven: Array, terms: int, degree: int, size: int) -> Array:
+        """The sum ``(k, size own, own + n)`` of the series of ``x' = A x + driven`` from those of ``A (k, p, size own,
+        own)`` and of what is ``driven (k, p, size own, n)``, as far as ``degree`` of these; of states that are ``size``
+        coefficients of polynomials in the `spread`, by products of polynomials."""
+        count, own, wide = len(A), A.shape[3], A.shape[3] + driven.shape[3]
+        left, right, target = NUMBERS if size == 1 or self.spread is None else self.spread.space.products
+        law = A[:, : degree + 1].reshape(count, degree + 1, size, own, own)
+        pushes = driven[:, : degree + 1].reshape(count, degree + 1, size, own, driven.shape[3]).swapaxes(2, 3)
+        there = [b for b in range(size) if law[:, :, b].any()]
+        factors = [(right[left == b], target[left == b]) for b in there]
+        over = law[:, :, there].transpose(0, 2, 3, 1, 4).reshape(count, len(there) * own, (degree + 1) * own)
+        # the latest term comes first, so that those that meet one another lie side by side
+        every = np.zeros((count, terms + 1, own, size, wide))
+        every[:, terms, :, 0, :own] = np.eye(own)
         for n in range(terms):
             last = min(n, degree) + 1
-            nexts = np.zeros((count, size, d, wide))
-            for b in there:
-                mine = left == b
-                over = law[:, :last, b].swapaxes(1, 2).reshape(count, 1, d, last * d)
-                earlier = every[:, right[mine], n - last + 1 : n + 1][:, :, ::-1]
-                nexts[:, target[mine]] += over @ earlier.reshape(count, -1, last * d, wide)
+            earlier = every[:, terms - n : terms - n + last].reshape(count, last * own, size * wide)
+            made = (over[:, :, : last * own] @ earlier).reshape(count, len(there), own, size, wide)
+            nexts = every[:, terms - n - 1]
+            for b, (mine, place) in enumerate(factors):
+                nexts[:, :, place] += made[:, b][:, :, mine]
             if n <= degree:
-                nexts[..., d:] += pushes[:, n]
-            every[:, :, n + 1] = nexts / (n + 1)
-        total = np.zeros((count, size, d, wide))
-        for n in range(terms, -1, -1):
-            total += every[:, :, n]
-        return total.reshape(count, size * d, wide)
+                nexts[..., own:] += pushes[:, n]
+            nexts /= n + 1
+        total = every.sum(axis=1)  # smallest terms first
+        return total.swapaxes(1, 2).reshape(count, size * own, wide)
 
     def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
         """`flow` of intervals within one segment each, with control and disturbance side by side."""
-        d = self.units.size
         length = stops - starts
         law, bulk = self._recentred(segments, starts, length, length)
-        shape = law.shape
         majorant = self._majorant(segments, law, bulk, length)
-        A, driven, own = law[..., : self.own], law[..., self.own :], self.own
-        if self.spread is not None:
-            total = self._of_ring(A, driven, majorant.terms, majorant.degree)
-            flown = self.spread.filled(total[..., :own])
-            return flown, total[..., own:], majorant.error, majorant.sizes
-        total, terms = np.zeros((starts.size, *shape[2:])), []
-        first = np.zeros((starts.size, *shape[2:]))
-        first[:, :, :d] = np.eye(d)
-        terms.append(first)
-        for n in range(majorant.terms):
-            nexts = np.zeros((starts.size, *shape[2:]))
-            for k in range(min(n, majorant.degree) + 1):
-                nexts += A[:, k] @ terms[n - k]
-            if n <= majorant.degree:
-                nexts[..., d:] += driven[:, n]
-            terms.append(nexts / (n + 1))
-        for term in reversed(terms):
-            total += term
-        return total[..., :d], total[..., d:], majorant.error, majorant.sizes
+        A, driven = law[..., : self.own], law[..., self.own :]
+        size = 1 if self.spread is None else self.spread.space.size
+        total = self._summed(A, driven, majorant.terms, majorant.degree, size)
+        flown = total[..., : self.own] if self.spread is None else self.spread.filled(total[..., : self.own])
+        return flown, total[..., self.own :], majorant.error, majorant.sizes
 
     def _majorant(self, segments: np.ndarray, law: Array, bulk: Array, length: Array) -> Majorant:
         """Of a series whose coefficients are at most those of ``y' = a(s) y + b(s)`` in the norm of largest row sums in
@@ -417,17 +455,7 @@ class Expansion:
         a = sizes.sum(axis=1)
         r = self._norm(rest[..., :own]) + sizes[:, degree + 1 :].sum(axis=1)
         share = (lost / most).max(axis=(1, 2), initial=0.0) + shares[:, degree + 1 :].sum(axis=1)
-        orders = np.arange(1.0, DEGREE + 2)
-        terms, tail = TERMS, np.zeros(length.size)
-        for terms in (*(one for one in FEWER if one < TERMS), TERMS):
-            tail = np.full(length.size, np.inf)
-            for R in CIRCLES:
-                with np.errstate(over="ignore", invalid="ignore"):
-                    y = np.exp((sizes * R**orders / orders).sum(axis=1))
-                    forced = np.maximum(1.0, (shares * R**orders / orders).sum(axis=1))
-                    tail = np.fmin(tail, y * forced * R ** -float(terms) / (R - 1.0))
-            if (tail <= IDLE).all():
-                break
+        terms, tail = _tail(sizes, shares)
         fuller = self._norm(bulk[..., :own].sum(axis=1))
         fuller += (self._driven(bulk[..., own:]).sum(axis=1) / most).max(axis=(1, 2), initial=0.0)
         growth = np.exp(a + r)
@@ -469,6 +497,28 @@ class Expansion:
         """The errors of the flows over all segments, one after another: how much of what is added up to a state at the
         end of the horizon is not resolved."""
         return float(self.flow(self.ends[:-1], self.ends[1:]).error.sum())
+
+
+@cache
+def _binomials(degree: int) -> tuple[np.ndarray, Array]:
+    """The orders up to a degree, and how often each is made of each: ``k`` over ``n``, ``(degree + 1, degree + 1)``."""
+    orders = np.arange(degree + 1)
+    return orders, np.array([[comb(k, n) for k in orders.tolist()] for n in orders.tolist()], dtype=float)
+
+
+def _tail(sizes: Array, shares: Array) -> tuple[int, Array]:
+    """How many terms of a series are summed whose coefficients are at most those of ``y' = a(s) y + b(s)``, with the
+    coefficients ``sizes (k, p)`` and ``shares (k, p)`` of these; and what is left out, ``(k,)``: Cauchy's tail ``y(R)
+    R^-N / (R - 1)`` for the best ``R``."""
+    orders, R = np.arange(1.0, sizes.shape[1] + 1), np.array(CIRCLES)[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        circles = R**orders / orders
+        grown = np.exp(sizes @ circles.T) * np.maximum(1.0, shares @ circles.T) / (R[:, 0] - 1.0)
+        for terms in (*(one for one in FEWER if one < TERMS), TERMS):
+            tail = np.fmin.reduce(grown * R[:, 0] ** -float(terms), axis=1, initial=np.inf)
+            if (tail <= IDLE).all():
+                break
+    return terms, tail
 
 
 def _spread_of(system: VaryingSystem) -> Spread | None:
