@@ -39,6 +39,9 @@ CASES: dict[str, Config] = {
     "stiffness that is no polynomial": {
         "system": {"A": [[0, 1], ["-4 * exp(-p / 4)", -0.3]], "B": B, "parameters": {"p": [-0.2, 0.3]}}
     },
+    "stiffness with a pole, in parts": {
+        "system": {"A": [[0, 1], ["-4 / (1 + p)", -0.3]], "B": B, "parameters": {"p": [-0.1, 0.1]}}
+    },
     "two": {"system": TWO},
     "delay": {"system": {**SPRING, "delay": 0.25}, "initial_control": [0.4, -0.6], "terminal": [{"box": [0.5, 0.7]}]},
     "pieces": {
@@ -64,6 +67,8 @@ def flows_at(name: str, p: float, q: float) -> tuple[np.ndarray, np.ndarray]:
             M[1, 0], M[0, 3] = -4.0 + p + p * np.cos(2.0 * time), 0.4 + p * p
         elif name == "stiffness that is no polynomial":
             M[1, 0] = -4.0 * np.exp(-p / 4.0)
+        elif name == "stiffness with a pole, in parts":
+            M[1, 0] = -4.0 / (1.0 + p)
         elif name == "pieces" and time > 1.5:
             M[:2, :2], M[:2, 2:] = [[0.0, 1.0], [-1.0 - p, -0.4]], [[0.3, 0.1], [0.0, 0.8]]
         known.append(M * step)

@@ -27,7 +27,6 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.flows import Leaps, products
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
@@ -38,6 +37,7 @@ from sparserob_core.control.response.initial_support import InitialSupport, Supp
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
+from sparserob_core.control.response.varying.spread import Parts
 from sparserob_core.control.response.varying_motion import OUTWARD, SpreadMotion, VaryingMotion, VaryingSupport
 from sparserob_core.control.sets.integrals import curved_integral, enclosed
 from sparserob_core.control.sets.sets import Polytope
@@ -806,13 +806,11 @@ class VaryingExecution(Execution):
     """`Execution` of a system that changes with time; ``disturbing``: what is commanded enters through ``E``, all of
     it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do. ``bound``: a flat set of
     what enters by the columns ``through (m,)`` of ``E`` at once, in the place of channels of their own; there is one
-    share of 1 then, and integrals are those of its support function. ``spread``: of which polynomials in parameters the
-    states are the coefficients, where they are, and directions those on all of them (`seen`)."""
+    share of 1 then, and integrals are those of its support function."""
 
     disturbing: bool = False
     bound: ConvexSet | None = None
     through: np.ndarray | None = None
-    spread: Spread | None = None
     _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
     _ways: dict[bytes, tuple[Array, Kernel]] = field(default_factory=dict, repr=False)
     _reaching: dict[bytes, VaryingExecutionCellSupport] = field(default_factory=dict, repr=False)
@@ -821,16 +819,8 @@ class VaryingExecution(Execution):
         """`Execution.none`; what is remembered is of these shares."""
         return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _reaching={})
 
-    def seen(self, directions: Array, parameters: Array) -> Array:
-        """`Execution.seen`: those on all coefficients, where there are any."""
-        if self.spread is None or not self.shares.any():
-            return directions
-        return self.spread.directions(directions, parameters)
-
     def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> Support:
         """`Execution.over`."""
-        if isinstance(leg, SpreadMotion):
-            return SpreadExecutionSupport(self.reaching(control), rows, leg)
         assert isinstance(leg, VaryingMotion)
         return VaryingExecutionCellSupport(self, control, rows, leg)
 
@@ -1027,6 +1017,105 @@ class VaryingExecution(Execution):
         accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes, TINY)
         found = integrated(bound, terms, np.ones(which.size), accuracy)
         return np.asarray(found + OUTWARD * lost[:, None] * [-1.0, 1.0])[:, None]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SpreadExecution(Execution):
+    """`Execution` of a system whose state is a polynomial in its parameters: on each of the ``parts`` of their box that
+    of all coefficients, ``every`` of them. Directions are those on the coefficients, followed by the number of their
+    part (`seen`)."""
+
+    parts: Parts
+    every: tuple[VaryingExecution, ...]
+
+    @staticmethod
+    def of(response: Response, breakpoints: Array, shares: Array, felt: Array) -> SpreadExecution:
+        """That of the response of such a system."""
+        parts, every = response.propagator.parts, []
+        assert parts is not None
+        for spread, one in response.propagator.spread:  # coefficients are followed as states are
+            followed = Response(one.system, one.grid, np.zeros(spread.states), shared=one)
+            every.append(VaryingExecution(followed, breakpoints, shares, np.tile(felt, spread.space.size)))
+        return SpreadExecution(response, breakpoints, shares, felt, parts, tuple(every))
+
+    def none(self) -> SpreadExecution:
+        """`Execution.none`."""
+        return replace(self, shares=np.zeros(self.shares.size), every=tuple(one.none() for one in self.every))
+
+    def seen(self, directions: Array, parameters: Array) -> Array:
+        """`Execution.seen`: those on all coefficients, and the number of the part."""
+        found = np.zeros((len(directions), self.parts.every[0][0].states + 1))
+        if self.shares.any():  # else there may be no parameters
+            found[:, -1] = self.parts.of(parameters)
+            for part, here in self._apart(found):
+                found[here, :-1] = self.parts.every[part][0].directions(directions[here], parameters[here])
+        return found
+
+    @staticmethod
+    def _apart(directions: Array) -> list[tuple[int, np.ndarray]]:
+        """The parts that directions are on, and the numbers of those in each."""
+        which = directions[:, -1]
+        return [(int(part), np.flatnonzero(which == part)) for part in np.unique(which).tolist()]
+
+    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> Support:
+        """`Execution.over`."""
+        assert isinstance(leg, SpreadMotion)
+        part = self.parts.holding(leg.low, leg.high)
+        assert part is not None  # the motion is one within a part
+        return SpreadExecutionSupport(self.every[part].reaching(control), rows, leg)
+
+    @shaped
+    def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
+        """`Execution.lengths`."""
+        found = np.empty((times.size, self.size))
+        for part, here in self._apart(directions):
+            found[here] = self.every[part].lengths(times[here], directions[here, :-1])
+        return found
+
+    def given(self, times: Array, directions: Array) -> Array:
+        """`Execution.given`."""
+        found = np.empty(times.size)
+        for part, here in self._apart(directions):
+            found[here] = self.every[part].given(times[here], directions[here, :-1])
+        return found
+
+    @shaped
+    def added(
+        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
+    ) -> Float[Array, " k"]:
+        """`Execution.added`."""
+        found = np.empty(times.size)
+        for part, here in self._apart(directions):
+            found[here] = self.every[part].added(control, times[here], directions[here, :-1])
+        return found
+
+    def sampled(self, control: Array, times: Array, directions: Array) -> Array:
+        """`Execution.sampled`."""
+        found = np.empty(times.size)
+        for part, here in self._apart(directions):
+            found[here] = self.every[part].sampled(control, times[here], directions[here, :-1])
+        return found
+
+    @shaped
+    def slope(
+        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
+    ) -> Float[Array, " k"]:
+        """`Execution.slope`."""
+        found = np.empty(times.size)
+        for part, here in self._apart(directions):
+            found[here] = self.every[part].slope(control, times[here], directions[here, :-1])
+        return found
+
+    @shaped
+    def enclosed(
+        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
+    ) -> Float[Array, "k 2"]:
+        """`Execution.enclosed`."""
+        found = np.empty((times.size, 2))
+        for part, here in self._apart(directions):
+            found[here] = self.every[part].enclosed(control, times[here], directions[here, :-1])
+        return found
 
 
 @final

@@ -144,22 +144,12 @@ def _functionals(
     response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
     execution: Execution | None = None
     if problem.execution is not None:
-        from sparserob_core.control.response.measurable import Execution, VaryingExecution
+        from sparserob_core.control.response.measurable import Execution, SpreadExecution, VaryingExecution
 
         shares, felt = np.asarray(problem.execution), np.ones(problem.system.states)
         felt[list(problem.commanded)] = 0.0
-        parts = response.propagator.spread
-        if len(parts) > 1:
-            raise InputError(
-                path="execution",
-                expected="none beside parameters over whose box the state is expanded in parts: smaller intervals",
-                got=f"{shares.tolist()}, and {len(parts)} parts",
-            )
-        if parts:  # they are followed as coefficients of polynomials too
-            ((spread, every),) = parts
-            none, felt = np.zeros(spread.states), np.tile(felt, spread.space.size)
-            followed = Response(every.system, every.grid, none, shared=every)
-            execution = VaryingExecution(followed, control.breakpoints, shares, felt, spread=spread)
+        if response.propagator.parts is not None:
+            execution = SpreadExecution.of(response, control.breakpoints, shares, felt)
         elif system.varies:
             execution = VaryingExecution(response, control.breakpoints, shares, felt)
         else:

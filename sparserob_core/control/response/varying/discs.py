@@ -19,7 +19,7 @@ from sparserob_core.control.enclosures.dependence import AnyNumber, Left, Split
 from sparserob_core.control.enclosures.elementary import KEPLER_CIRCLES, eccentric_anomaly
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON
 from sparserob_core.control.problem.expression import ExpressionMatrix
-from sparserob_core.control.problem.system import LinearSystem, SystemInUnits, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -217,8 +217,6 @@ class Cauchy:
 def cauchy(system: VaryingSystem) -> Cauchy:
     """The entries of a system with parameters on discs; raises `InputError`, which names an entry, a time and
     parameters, where one has a pole or is no real number."""
-    if isinstance(system.law, SystemInUnits):
-        return _in_units(system)
     wanted, ends, found, sizes = beyond(system, 0), [0.0], list[Array](), list[Array]()
     for number, (begin, until, _) in enumerate(system.laws):
         count = max(1, int(np.ceil(FIRST * (until - begin) / system.horizon)))
@@ -227,23 +225,6 @@ def cauchy(system: VaryingSystem) -> Cauchy:
             found.append(far)
             sizes.append(size + far[0])
     return Cauchy(system, np.array(ends), np.array(found), np.max(sizes, axis=0))
-
-
-def _in_units(system: VaryingSystem) -> Cauchy:
-    """That of the system that is stated, in its own units."""
-    laws, law = list[tuple[float, LinearSystem]](), system.law
-    assert isinstance(law, SystemInUnits) and system.parameters is not None
-    unit, others = float(law.units[0]), law.units[1:]
-    for begin, _, one in system.laws:
-        assert isinstance(one, SystemInUnits)  # as the first one is
-        laws.append((begin * unit, one.base))
-    box = system.parameters.in_units(1.0 / others)
-    base = VaryingSystem(laws[0][1], system.horizon * unit, 0.0, tuple(laws[1:]), box)
-    found = cauchy(base)
-    names = [name for name in NAMES if law.entry(name) is not None]
-    shapes = [np.ones(law._shape(name)) for name in names]
-    factors = np.hstack([law.factors[name] * one for name, one in zip(names, shapes, strict=True)])
-    return Cauchy(system, found.ends / unit, found.far * np.abs(factors), found.sizes * np.abs(factors))
 
 
 @final

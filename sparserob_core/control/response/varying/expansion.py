@@ -130,6 +130,7 @@ class Expansion:
             self.ratios,
             (system.controls, system.disturbances),
             self.turns,
+            self.spread,
         )
 
     @property
@@ -420,7 +421,7 @@ class Expansion:
                 nexts[..., own:] += pushes[:, n]
             nexts /= n + 1
         total = every.sum(axis=1)  # smallest terms first
-        return total.swapaxes(1, 2).reshape(count, size * own, wide)
+        return np.asarray(total.swapaxes(1, 2).reshape(count, size * own, wide))
 
     def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
         """`flow` of intervals within one segment each, with control and disturbance side by side."""

@@ -4,18 +4,18 @@ parts of their box."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from math import comb
 from typing import NamedTuple, final
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
-from sparserob_core.control.enclosures.dependence import MOST_POWERS, Split, Spread
+from sparserob_core.control.enclosures.dependence import MOST_POWERS, Left, Split, Spread
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.response.varying.discs import Cauchy, beyond, cauchy
+from sparserob_core.control.problem.system import LinearSystem, SystemInUnits, VaryingSystem
+from sparserob_core.control.response.varying.discs import NAMES, Cauchy, beyond, cauchy
 from sparserob_core.control.response.varying.expansion import balanced
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.errors import InputError
@@ -31,7 +31,7 @@ FURTHER = 40  # degrees beyond, of which what is left out is added up: of norms 
 LOOKS = 17  # times at which the coefficients of A are looked at; of an estimate, with which nothing is proven
 FAR = 600.0  # exponents of what is too far in any case, whose exponential is a number
 MOST_PARTS = 64  # of the box: an expansion of each takes as long as one of the whole, and each is proven alone
-_KNOWN: WeakKeyDictionary[VaryingSystem, Parts] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[LinearSystem, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
 
 
 @final
@@ -95,17 +95,48 @@ class Looks(NamedTuple):
 def expanded(system: VaryingSystem) -> Parts:
     """How the state of a system depends on its parameters: parts of their box, as many as take the least work; raises
     `InputError` where too many were needed."""
-    if system not in _KNOWN:
-        edges, looks, degree = _parted(system)
-        every = []
-        for part, look in zip(_boxes(system, edges), looks, strict=True):
-            centre, units = part.deviations
-            assert part.powers is not None
-            left = None if look.analytic is None else look.analytic.left(degree)
-            how = Spread(system.states, TaylorSpace(centre.size, degree), centre, units, part.powers, left)
-            every.append((how, part.superposed(how)))
-        _KNOWN[system] = Parts(edges, tuple(every))
-    return _KNOWN[system]
+    kept, box = _KNOWN.setdefault(system.law, {}), system.parameters
+    assert box is not None
+    key = system.horizon, box.lower.tobytes(), box.upper.tobytes(), *((begin, ref(one)) for begin, one in system.later)
+    if key not in kept:
+        kept[key] = _in_units(system) if isinstance(system.law, SystemInUnits) else _expanded(system)
+    return kept[key]
+
+
+def _expanded(system: VaryingSystem) -> Parts:
+    """`expanded` of a system in the units that it is stated in."""
+    edges, looks, degree = _parted(system)
+    every = []
+    for part, look in zip(_boxes(system, edges), looks, strict=True):
+        centre, units = part.deviations
+        assert part.powers is not None
+        left = None if look.analytic is None else look.analytic.left(degree)
+        how = Spread(system.states, TaylorSpace(centre.size, degree), centre, units, part.powers, left)
+        every.append((how, part.superposed(how)))
+    return Parts(edges, tuple(every))
+
+
+def _in_units(system: VaryingSystem) -> Parts:
+    """`expanded` of one in its own units, which are powers of two: the same polynomials, in these units."""
+    laws, law = list[tuple[float, LinearSystem]](), system.law
+    assert isinstance(law, SystemInUnits) and system.parameters is not None
+    time, units = float(law.units[0]), law.units[1:]
+    for begin, _, one in system.laws:
+        assert isinstance(one, SystemInUnits)  # as the first one is
+        laws.append((begin * time, one.base))
+    box = system.parameters.in_units(1.0 / units)
+    base = VaryingSystem(laws[0][1], system.horizon * time, system.delay * time, tuple(laws[1:]), box)
+    known, every = expanded(base), list[tuple[Spread, VaryingSystem]]()
+    of = {name: law.factors[name] * np.ones(law._shape(name)) for name in NAMES if law.entry(name) is not None}
+    for how, part in known.every:
+        size, left = how.space.size, how.left
+        if left is not None:
+            left = Left(left.ends / time, left.sizes * np.abs(np.hstack(list(of.values()))))
+        whole = [np.tile(of[name], (size, size if name == "A" else 1)) for name in ("A", "B", "E")]
+        drift = np.tile(of["c"], (size, 1)) if "c" in of else 1.0
+        scaled = part.in_units(whole[0], whole[1], whole[2], np.zeros(0), drift, time)
+        every.append((replace(how, centre=how.centre / units, units=how.units / units, left=left), scaled))
+    return Parts(tuple(edges / one for edges, one in zip(known.edges, units, strict=True)), tuple(every))
 
 
 def _boxes(system: VaryingSystem, edges: tuple[Array, ...]) -> list[VaryingSystem]:
