@@ -41,7 +41,11 @@ AT_ONCE = 4_000_000  # numbers of weights that are made at once
 TINY = float(np.finfo(float).tiny)
 TERMS = 40  # of the exponential of norms on a piece, which are at most a few: 4^40 / 40! is 1e-24
 REST = 1e-20  # of the norms, more than what is beyond these terms
+RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""What a degree more counts in the norms that transitions are off by: with the first alone each coefficient of a high
+degree is off by what the constant one is, and what is beyond never falls below rounding times the growth."""
 PATHS_KEPT = 4  # controls whose states are remembered
+WAYS_KEPT = 4  # times of which the way there is: those of cells, and where they begin, of two constraints
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,10 +146,23 @@ class VaryingMotion:
 
     def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
         """`Motion.moved`."""
-        start = self.grid.breakpoints[pieces]
-        flow = self.expansion.flow(start, start + within)
+        flow = self.over(within, pieces)
         found = np.einsum("kij,kj->ki", flow.state, begun[:, 0]) + np.einsum("kim,km->ki", flow.control, inputs)
         return np.asarray(found[:, None])
+
+    def over(self, within: Array, pieces: np.ndarray) -> Flow:
+        """What the first times ``within (k,)`` pieces make of states and inputs; remembered, since a state and all that
+        is uncertain of it are looked at together."""
+        pieces = np.minimum(pieces, self.origin.size - 1)  # beyond the last there is no time
+        key = within.tobytes() + pieces.tobytes()
+        if key not in self._ways:
+            start = self.grid.breakpoints[pieces]
+            remember(self._ways, key, self.expansion.flow(start, start + within), WAYS_KEPT)
+        return self._ways[key]
+
+    @cached_property
+    def _ways(self) -> dict[bytes, Flow]:
+        return {}
 
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
@@ -212,21 +229,11 @@ class VaryingMotion:
         carried = units * self.carries[:-1] * before
         return np.asarray((self.grown(self.every, self.grid.lengths, carried) + units * here) * OUTWARD)
 
-    @property
+    @cached_property
     def carries(self) -> Array:
         """The largest row sums ``(K + 1, d)`` of the transitions from any mark to each one, in own units: of the
         computed ones, and with ``P`` the largest of them and ``e`` the sum of what all steps are off by, ``P^2 e / (1
         - P e)`` more."""
-        return self._products[0]
-
-    @property
-    def carried_off(self) -> float:
-        """What the products of transitions that are computed are off by, in the norm of largest row sums in own
-        units."""
-        return self._products[1]
-
-    @cached_property
-    def _products(self) -> tuple[Array, float]:
         units = self.expansion.units
         steps = self.flow.state / units[:, None] * units
         found, every = np.ones((steps.shape[0] + 1, units.size)), np.empty((steps.shape[0] + 1, *steps.shape[1:]))
@@ -238,8 +245,7 @@ class VaryingMotion:
         largest, ahead = float(found.max()), np.abs(steps).sum(axis=2).max(axis=1)
         off = float((self.flow.error + rounding(units.size) * (ahead + self.flow.error)).sum())
         share = largest * off
-        more = largest * share / (1.0 - share) if share < 0.5 else np.inf
-        return found + more, more
+        return found + (largest * share / (1.0 - share) if share < 0.5 else np.inf)
 
     def grown(self, pieces: np.ndarray, width: Array, sizes: Array) -> Array:
         """What states of at most ``sizes (k, d)`` may become within a ``width (k,)`` of a piece, ``(k, d)``: by the
@@ -455,7 +461,7 @@ class VaryingSupport:
         """What rows ``(k, r, d)`` at times ``(k,)`` give to every part, ``(k, r, P, w)``."""
         motion, place = self.motion, self.motion.place(times)
         parts = self.effect.shape[2:]
-        flow = motion.expansion.flow(motion.grid.breakpoints[place], times)
+        flow = motion.over(times - motion.grid.breakpoints[place], place)
         carried = rows @ flow.state
         found = np.empty((*rows.shape[:2], *parts))
         size = max(1, AT_ONCE // max(1, motion.states * parts[0] * parts[1]))
@@ -547,16 +553,24 @@ class Truncation:
     def _carried(self) -> Array:
         """The norms of the coefficients of every degree of the transitions from any mark to each one, ``(K + 1, D +
         1)``: what the constant coefficient there makes of all of them, as computed, and what steps are off by, carried
-        on as in `VaryingMotion.carries`."""
-        steps, d, marks = self.motion.flow.state, self.spread.d, self.motion.grid.pieces + 1
-        every, found = np.empty((marks, self.motion.states, d)), np.empty((marks, self.spread.space.degree + 1))
-        first = np.eye(self.motion.states, d)
-        for k in range(marks):
+        on as in `VaryingMotion.carries`; in each of several norms, in which a degree ``j`` counts ``ratio^j``, so that
+        it is off by that over this."""
+        motion, space, d = self.motion, self.spread.space, self.spread.d
+        steps, marks, units = motion.flow.state, motion.grid.breakpoints, motion.expansion.units
+        counted = np.array(RATIOS)[:, None] ** np.arange(space.degree + 1)
+        every, found = np.empty((marks.size, motion.states, d)), np.empty((marks.size, space.degree + 1))
+        largest, ahead, first = np.ones(counted.shape[0]), np.zeros((counted.shape[0], marks.size - 1)), np.eye(d)
+        for k in range(marks.size):
             if k:
                 every[:k] = steps[k - 1] @ every[:k]
-            every[k] = first
-            found[k] = self.norms((np.abs(every[: k + 1]) * self.units).sum(axis=2)).max(axis=0)
-        return np.asarray((found + self.norms(self.motion.carried_off * self.motion.expansion.units)) * OUTWARD)
+                ahead[:, k - 1] = counted @ self.norms((np.abs(steps[k - 1][:, :d]) * self.units).sum(axis=1))
+            every[k, :d], every[k, d:] = first, 0.0
+            norms = self.norms((np.abs(every[: k + 1]) * self.units).sum(axis=2))
+            found[k], largest = norms.max(axis=0), np.maximum(largest, (norms @ counted.T).max(axis=0))
+        error = np.array([motion.expansion.off(marks[:-1], marks[1:], ratio) for ratio in RATIOS])
+        share = largest * (error + rounding(units.size) * (ahead + error)).sum(axis=1) * OUTWARD
+        near = np.where(share < 0.5, largest * share / np.where(share < 0.5, 1.0 - share, 1.0), np.inf)
+        return np.asarray((found + (near[:, None] / counted).min(axis=0)) * OUTWARD)
 
     @cached_property
     def growth(self) -> float:
@@ -723,7 +737,7 @@ class SpreadSupport:
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """`Support.at`."""
         return over_faces(
-            self._space, ends, lambda here, face: summed(self.every.set, self._seen(times[here]), face).sum(axis=2)
+            self._space, ends, lambda here, face: summed(self.every.set, self._seen(times)[here], face).sum(axis=2)
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -756,8 +770,16 @@ class SpreadSupport:
         return self.motion.space if self.combination is None else self.combination.space
 
     def _seen(self, times: Array) -> Array:
-        """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block."""
-        rows = np.broadcast_to(self.every.rows, (times.size, *self.every.rows.shape))
-        found = self.every.blocks(self.every.weights(times, rows))
-        found = found.reshape(times.size, len(self.rows), self.motion.space.size, *found.shape[2:])
-        return found if self.combination is None else self.combination.apply(found)
+        """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block; those of the last times
+        are remembered."""
+        if self._asked.get("times") is not times:
+            rows = np.broadcast_to(self.every.rows, (times.size, *self.every.rows.shape))
+            found = self.every.blocks(self.every.weights(times, rows))
+            found = found.reshape(times.size, len(self.rows), self.motion.space.size, *found.shape[2:])
+            found = found if self.combination is None else self.combination.apply(found)
+            self._asked.update(times=times, found=found)
+        return self._asked["found"]
+
+    @cached_property
+    def _asked(self) -> dict[str, Array]:
+        return {}

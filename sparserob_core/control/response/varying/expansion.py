@@ -27,8 +27,8 @@ from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
 DEGREE = 14  # of the system in time; with a tenth segments are a hundred times shorter
-TERMS = 40  # of the solution on an interval; ten times fewer leave more than rounding, more of them cost time
-FEWER = (8, 12, 16, 24)  # terms that are enough where what they leave out is below `IDLE`, as on short intervals
+TERMS = 64  # of the solution on an interval; 40 of them leave 1e-10 where entries turn once in four segments
+FEWER = (8, 12, 16, 24, 40)  # terms that are enough where what they leave out is below `IDLE`, as on short intervals
 IDLE = 2.0**-58  # of what is added up, what does not show; ten times more would be a digit, ten times less cost terms
 CIRCLES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 24.0, 48.0, 96.0)
 """Shares of an interval on which Cauchy's bound is looked at; short intervals need the wide ones."""
@@ -388,13 +388,21 @@ class Expansion:
             return self.coefficients
         return np.concatenate([self.coefficients[..., : self.own], self.coefficients[..., self.units.size :]], axis=3)
 
-    def _norm(self, columns: Array) -> Array:
+    def _norm(self, columns: Array, ratio: float = 1.0) -> Array:
         """At most the norm of largest row sums, in own units, of matrices of which the first columns are these, ``(...,
-        d, own)``."""
+        d, own)``; of coefficients of polynomials a degree more counts ``ratio`` times as much."""
         sums = (np.abs(columns) * self.units[: self.own] / self.units[:, None]).sum(axis=-1)
         if self.spread is None:
             return np.asarray(sums.max(axis=-1))
-        return np.asarray(sums.reshape(*sums.shape[:-1], -1, self.own).max(axis=-1).sum(axis=-1))
+        apart = sums.reshape(*sums.shape[:-1], -1, self.own).max(axis=-1)
+        return np.asarray((apart * ratio**self.spread.space.degrees).sum(axis=-1))
+
+    def off(self, starts: Array, stops: Array, ratio: float) -> Array:
+        """What transitions over intervals within one segment each are off by, ``(k,)``, in the norm in which a degree
+        more counts ``ratio`` times as much."""
+        segments, length = self.segment_of((starts + stops) / 2), stops - starts
+        table = segments, *self._recentred(segments, starts, length, length), length
+        return self._majorant(*table, ratio, self._majorant(*table)).error
 
     def _summed(self, A: Array, driven: Array, terms: int, degree: int, size: int) -> Array:
         """The sum ``(k, size own, own + n)`` of the series of ``x' = A x + driven`` from those of ``A (k, p, size own,
@@ -434,33 +442,43 @@ class Expansion:
         flown = total[..., : self.own] if self.spread is None else self.spread.filled(total[..., : self.own])
         return flown, total[..., self.own :], majorant.error, majorant.sizes
 
-    def _majorant(self, segments: np.ndarray, law: Array, bulk: Array, length: Array) -> Majorant:
+    def _majorant(
+        self,
+        segments: np.ndarray,
+        law: Array,
+        bulk: Array,
+        length: Array,
+        ratio: float = 1.0,
+        summed: Majorant | None = None,
+    ) -> Majorant:
         """Of a series whose coefficients are at most those of ``y' = a(s) y + b(s)`` in the norm of largest row sums in
         own units, with the norms ``a_k`` and ``b_k`` of the coefficients of the system: how many of its terms are
         needed, and of the system's coefficients, which are then left out like the ``remainder``.
 
         What is missed is Cauchy's tail ``y(R) R^-N / (R - 1)`` for the best ``R``; what is left out of the system, by
         variation of constants ``r e^(a + r)``; and rounding, of the coefficients ``bulk`` before anything cancels in
-        them, of every term, and of the sum, whose first term is exact.
+        them, of every term, and of the sum, whose first term is exact. In the norm of a ``ratio`` (`off`) of a series
+        that is ``summed`` as far as in that of another.
         """
         d, own = self.units.size, self.own
         rest = self.remainder[segments] * length[:, None, None]
         inputs = _totals(self._driven(law[..., own:]), self._driven(rest[..., d:]))[0]
         law, bulk, rest = (self._steady(segments, one) for one in (law, bulk, rest))
-        sizes = self._norm(law[..., :own])
+        sizes = self._norm(law[..., :own], ratio)
         pushes, lost = self._driven(law[..., own:]), self._driven(rest[..., d:])
         most = _totals(pushes, lost)[1]
         shares = (pushes / most[:, None]).max(axis=(2, 3), initial=0.0)
         seen = (np.maximum(sizes, shares) > IDLE * np.maximum(sizes.sum(axis=1), 1e-300)[:, None]).any(axis=0)
-        degree = int(np.flatnonzero(seen).max(initial=0))
+        degree = int(np.flatnonzero(seen).max(initial=0)) if summed is None else summed.degree
         a = sizes.sum(axis=1)
-        r = self._norm(rest[..., :own]) + sizes[:, degree + 1 :].sum(axis=1)
+        r = self._norm(rest[..., :own], ratio) + sizes[:, degree + 1 :].sum(axis=1)
         share = (lost / most).max(axis=(1, 2), initial=0.0) + shares[:, degree + 1 :].sum(axis=1)
-        terms, tail = _tail(sizes, shares)
-        fuller = self._norm(bulk[..., :own].sum(axis=1))
+        terms, tail = _tail(sizes, shares, None if summed is None else summed.terms)
+        fuller = self._norm(bulk[..., :own].sum(axis=1), ratio)
         fuller += (self._driven(bulk[..., own:]).sum(axis=1) / most).max(axis=(1, 2), initial=0.0)
         growth = np.exp(a + r)
-        rounded = rounding((degree + 1) * d + terms) * np.minimum(a, 1.0) + rounding(DEGREE) * fuller
+        rounded = rounding((degree + 1) * own * self._there.size + terms) * np.minimum(a, 1.0)
+        rounded += rounding(DEGREE) * fuller
         error = tail + (r + share) * growth + (rounded * (1.0 + a) + EPSILON) * growth
         return Majorant(terms, degree, error * self.ratios[segments].max(axis=1) * (1.0 + 1e-9), inputs)
 
@@ -507,15 +525,15 @@ def _binomials(degree: int) -> tuple[np.ndarray, Array]:
     return orders, np.array([[comb(k, n) for k in orders.tolist()] for n in orders.tolist()], dtype=float)
 
 
-def _tail(sizes: Array, shares: Array) -> tuple[int, Array]:
+def _tail(sizes: Array, shares: Array, summed: int | None = None) -> tuple[int, Array]:
     """How many terms of a series are summed whose coefficients are at most those of ``y' = a(s) y + b(s)``, with the
-    coefficients ``sizes (k, p)`` and ``shares (k, p)`` of these; and what is left out, ``(k,)``: Cauchy's tail ``y(R)
-    R^-N / (R - 1)`` for the best ``R``."""
+    coefficients ``sizes (k, p)`` and ``shares (k, p)`` of these, unless so many are ``summed`` anyway; and what is left
+    out, ``(k,)``: Cauchy's tail ``y(R) R^-N / (R - 1)`` for the best ``R``."""
     orders, R = np.arange(1.0, sizes.shape[1] + 1), np.array(CIRCLES)[:, None]
     with np.errstate(over="ignore", invalid="ignore"):
         circles = R**orders / orders
         grown = np.exp(sizes @ circles.T) * np.maximum(1.0, shares @ circles.T) / (R[:, 0] - 1.0)
-        for terms in (*(one for one in FEWER if one < TERMS), TERMS):
+        for terms in (*(one for one in FEWER if one < TERMS), TERMS) if summed is None else (summed,):
             tail = np.fmin.reduce(grown * R[:, 0] ** -float(terms), axis=1, initial=np.inf)
             if (tail <= IDLE).all():
                 break
