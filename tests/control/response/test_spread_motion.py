@@ -16,6 +16,7 @@ from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.response.response import Outputs, Propagator, Response, merge_grids
 from sparserob_core.control.response.varying import spread as expansions
 from sparserob_core.control.response.varying.discs import cauchy
+from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.response.varying_motion import Truncation, VaryingMotion
 from sparserob_core.control.transcription.transcribe import prepare
 
@@ -212,3 +213,26 @@ def test_rows_and_outputs_at_any_time_and_parameter_are_those_of_an_integrator(
                 assert rows[k] == pytest.approx(c[k] @ states[k], abs=1e-7)
             else:
                 assert outputs[k] == pytest.approx(c @ states.T, abs=1e-7)
+
+
+@pytest.mark.parametrize("off", [0.0, 3e-7])
+def test_norms_of_coefficients_hold_what_transitions_are_off_by(off: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    spread = Spread(1, TaylorSpace(1, 6), *SYSTEM.deviations, powers=2)
+    breaks = np.linspace(0.0, 3.0, 7)
+    every = Propagator(SYSTEM.superposed(spread), merge_grids(breaks, breaks, varying=True))
+    truncation = Truncation(VaryingMotion(every, np.eye(spread.states)[0]), spread)
+    marks, (centre, units) = truncation.motion.grid.breakpoints, SYSTEM.deviations
+    if off:  # in the highest coefficient alone, which counts most in most norms
+        wrong, flow = np.zeros((1, 7, 1)), truncation.motion.flow
+        wrong[0, 6] = off
+        truncation.motion.__dict__["flow"] = flow._replace(state=flow.state - spread.filled(wrong))
+        monkeypatch.setattr(Expansion, "off", lambda _, starts, stops, ratio: np.full(starts.size, off * ratio**6))
+    turned = (np.cos(2 * marks[:, None]) - np.cos(2 * marks)) / 2  # of the integral of p sin(2 t), from one to another
+    still = np.exp(-(marks[:, None] - marks) / 2 + centre[0] * turned)
+    found = truncation._carried
+    for degree in range(7):
+        exact = np.abs(still * (units[0] * turned) ** degree / factorial(degree))
+        for k in range(marks.size):
+            largest = exact[k, : k + 1].max()
+            assert found[k, degree] >= largest * (1.0 - 1e-13)
+            assert off or found[k, degree] <= largest * (1.0 + 1e-9) + 1e-12 / 2.0**degree
