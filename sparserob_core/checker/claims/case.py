@@ -378,8 +378,10 @@ class Case:
     ) -> Beside | None:
         """What stands beside the state in the rows of a constraint, at one parameter where it is given; ``None``:
         nothing."""
-        executed = self.execution if parameter is None else self.delivered_at(parameter)
-        delivered = tuple(one for one in (executed, self.strayed) if one is not None)
+        executed, strayed = self.execution, self.strayed
+        if parameter is not None:
+            executed, strayed = self.delivered_at(parameter), self.strayed_at(parameter)
+        delivered = tuple(one for one in (executed, strayed) if one is not None)
         if window.reference is None and not window.is_mixed and not delivered:
             return None
         ends = self.control.breakpoints.tolist()
@@ -406,33 +408,39 @@ class Case:
         return bound.parts
 
     @cached_property
-    def strayed(self) -> VaryingExecution | None:
+    def strayed(self) -> VaryingExecution | SpreadExecution | None:
         """What measurable disturbances of a system that changes with time do beside the middle of their box: a command
         of 1 through the columns of ``E`` that is missed by half the widths; of a polytope all of it at once, counted
         from its middle. ``None`` where there are none."""
         bound = self.problem.measurable
         if bound is None or self.looped or self.changing is None:
             return None
-        if not isinstance(self.changing, VaryingFlow):
-            raise Unchecked(
-                "the checker knows no measurable disturbances beside parameters that states are expanded in"
-            )
         ends, system = np.array([0.0, self.grid[-1]]), self.problem.system
         first = system.controls + (system.c is not None)
         if not bound.is_box:
             side, *more = Side.of(bound)
             if more:
                 raise Unchecked("of a system that changes with time, the checker knows sets of corners only")
-            return VaryingExecution(self.changing, np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
+            return self._missing(np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
         box, about = bound.bounding_box(), _middle(bound)
         sides, single = np.stack([box.upper - about, about - box.lower]), box.upper == box.lower
         most = np.where(single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
         least = np.where(single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
         half = least + (most - least) / 2.0
         off = np.nextafter(np.maximum(most - half, half - least), np.inf)
-        return VaryingExecution(
-            self.changing, half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off
-        )
+        return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off)
+
+    def _missing(self, *errors: Any, **more: Any) -> VaryingExecution | SpreadExecution:
+        """Errors in a system that changes with time, over all of its parameters."""
+        law = self.varying
+        if isinstance(law, SpreadFlow):
+            return SpreadExecution(law, *errors, **more)
+        return VaryingExecution(law, *errors, **more)
+
+    def strayed_at(self, parameter: Sequence[float]) -> VaryingExecution | None:
+        """`strayed` at one parameter."""
+        found = self.strayed
+        return found.at(parameter) if isinstance(found, SpreadExecution) else found
 
     @cached_property
     def execution(self) -> Execution | VaryingExecution | SpreadExecution | None:
@@ -452,9 +460,7 @@ class Case:
             begins = acts[:-1] + system.delay
             acts = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][: acts.size - 1 if pieces else 0]
-        if isinstance(self.changing, SpreadFlow):
-            return SpreadExecution(self.changing, shares, acts, pieces, self.problem.commanded)
-        return VaryingExecution(self.changing, shares, acts, pieces, numb=self.problem.commanded)
+        return self._missing(shares, acts, pieces, numb=self.problem.commanded)
 
     def delivered_at(self, parameter: Sequence[float]) -> Execution | VaryingExecution | None:
         """`execution` at one parameter."""

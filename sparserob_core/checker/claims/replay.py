@@ -120,7 +120,7 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
             rows = answers.loop.state(case.piece_at(time), time).tolist()
             value = _along(direction, named, rows if piece is None else rows + answers.commands[piece].tolist())
         elif case.strayed is not None:
-            value = _farthest(case, window.split(direction), time, piece)
+            value = _farthest(case, window.split(direction), time, parameter.tolist(), piece)
         elif case.measurable:  # the worst is no signal on pieces: how far all of them reach is enclosed instead
             value = answers.farthest(*window.split(direction), time, piece)
         else:
@@ -134,13 +134,15 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
     return value - limit, slack
 
 
-def _farthest(case: Case, direction: tuple[Array, Array], time: float, piece: int | None) -> arb:
+def _farthest(
+    case: Case, direction: tuple[Array, Array], time: float, parameter: Sequence[float], piece: int | None
+) -> arb:
     """The largest ``c'x(t) + gain'u``, ``u`` the control on a ``piece``, under measurable disturbances of a system that
-    changes with time."""
-    (c, gain), none = direction, balls([0.0])[0]
-    assert case.strayed is not None
-    row = case.duality.row(c, time, [], none)
-    low, high = case.strayed.added(c, time)
+    changes with time, at a parameter."""
+    (c, gain), none, strayed = direction, balls([0.0])[0], case.strayed_at(parameter)
+    assert strayed is not None
+    row = case.duality.row(c, time, parameter, none)
+    low, high = strayed.added(c, time)
     total = row.constant + balls([low])[0].union(balls([high])[0])
     for slope, control in zip(row.slope, case.pieces, strict=True):
         total = total + sum((a * u for a, u in zip(slope, control.entries(), strict=True)), none)

@@ -161,7 +161,8 @@ class Beside:
             off += rounding(8) * float(np.abs(found.ends).sum() + np.abs(rise).sum())
         added = _plus(poly, terms, off)
         turning = added.turning + float(found.wide.sum())
-        return replace(added, kinks=added.kinks + found.over, turning=turning, bent=found.wide)
+        bent = found.wide if added.bent is None else added.bent + found.wide
+        return replace(added, kinks=added.kinks + found.over, turning=turning, bent=bent)
 
     def _stretch(self, start: float, stop: float) -> float:
         """About how long an interval is on the clock of the scene, in times of its length."""

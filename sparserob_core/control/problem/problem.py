@@ -276,18 +276,13 @@ class OptimalControlProblem(Term):
 
     def _check_expanded(self) -> None:
         """The same where the state is no affine function of the parameters."""
-        refused = {
-            "fixed final values": bool(self.terminal_equalities),
-            "measurable disturbances": self.measurable is not None,
-        }
-        for beside, given in refused.items():
-            if given:
-                raise InputError(
-                    path="system.parameters",
-                    expected=f"none beside {beside} and the time t, or such that the state depends on affinely: to the"
-                    " first power in B, E and c, and in A where they multiply what depends on none",
-                    got="others",
-                )
+        if self.terminal_equalities:
+            raise InputError(
+                path="system.parameters",
+                expected="none beside fixed final values and the time t, or such that the state depends on affinely: to"
+                " the first power in B, E and c, and in A where they multiply what depends on none",
+                got="others",
+            )
 
     def _executed(self) -> Array | None:
         """The errors of execution, ``None`` where there are none; raises `InputError` for what they are not proven
@@ -308,8 +303,6 @@ class OptimalControlProblem(Term):
                 self.terminal_equalities
             ),
             "parameters in another set than a box": not self._is_boxed(),
-            "measurable disturbances with parameters that the state does not depend on affinely": self._is_expanded()
-            and self.measurable is not None,
             "measurable disturbances in a curved set where the system has pieces, a delay or parameters": any(
                 one.halfspaces() is None for one in filter(None, [self.measurable])
             )
@@ -330,12 +323,6 @@ class OptimalControlProblem(Term):
         except InputError:
             return False
         return True
-
-    def _is_expanded(self) -> bool:
-        """Whether there are such of which the state is no affine function."""
-        if isinstance(self.system, VaryingSystem) or not self.system.parameter_count or not self._is_boxed():
-            return False
-        return VaryingSystem.made_of(self.system, self.horizon).dependence is None
 
     def _state(self) -> Array:
         d = self.system.states

@@ -36,7 +36,10 @@ if TYPE_CHECKING:
     from sparserob_core.control.response.measurable import Execution, MeasurableSupport, VaryingMeasurable
 
 # said where it is met, and before anything is solved
-WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
+WITHOUT_PROOF = (
+    "measurable disturbances are proven only for sets with flat sides, and parameters in a box over which the state can"
+    " be expanded in them"
+)
 LEGS_KEPT = 256  # cells of parameters whose lifted systems are kept
 Leg: TypeAlias = LiftedSystem | VaryingMotion | SpreadMotion
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
@@ -360,7 +363,7 @@ class WorstCase:
         model, measurable = self.disturbance, self.measurable
         by_block = None if model is None else model.on_blocks
         if measurable is not None:
-            if joined is not None or isinstance(lifted, SpreadMotion) or lifted.space.nu:
+            if joined is not None or (lifted.space.nu and isinstance(lifted, LiftedSystem)):
                 raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
             found += measurable.over(H, lifted)
         if isinstance(lifted, SpreadMotion):

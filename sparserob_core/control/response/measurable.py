@@ -38,7 +38,13 @@ from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.response.varying.spread import Parts
-from sparserob_core.control.response.varying_motion import OUTWARD, SpreadMotion, VaryingMotion, VaryingSupport
+from sparserob_core.control.response.varying_motion import (
+    OUTWARD,
+    SpreadMotion,
+    SpreadSupport,
+    VaryingMotion,
+    VaryingSupport,
+)
 from sparserob_core.control.sets.integrals import curved_integral, enclosed
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.shapes import Float, Int, shaped
@@ -167,12 +173,12 @@ class MeasurableSupport:
         middles = np.broadcast_to(starts + lengths / 2, (A.shape[0], starts.size))
         return starts, lengths, _moved(A, np.eye(A.shape[0]), middles) @ E
 
-    def over(self, rows: Array, leg: LiftedSystem | VaryingMotion) -> list[Support]:
+    def over(self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> list[Support]:
         """What it adds to functionals ``rows (r, d)`` over cells of time, in parts that add up."""
         assert isinstance(leg, LiftedSystem)
         return [MeasurableCellSupport(self, rows, leg)]
 
-    def integrated_sizes(self, times: Array, directions: Array) -> Array:
+    def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
         """The numbers ``(k,)`` that are added up to integrals beside what enters by pieces: none."""
         return np.zeros(times.size)
 
@@ -630,6 +636,10 @@ class Execution:
     shares: Array
     felt: Array
 
+    def followed(self) -> Execution:
+        """The same along what the state is expanded in, where it is: of errors that are stated for the states."""
+        return self
+
     def seen(self, directions: Array, parameters: Array) -> Array:
         """Directions ``(k, d)`` at parameters ``(k, nu)`` as those on the states that errors are followed in."""
         return directions
@@ -804,7 +814,7 @@ class ExecutionCellSupport(KnownCellSupport):
 @dataclass(frozen=True, eq=False)
 class VaryingExecution(Execution):
     """`Execution` of a system that changes with time; ``disturbing``: what is commanded enters through ``E``, all of
-    it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do. ``bound``: a flat set of
+    it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do. ``bound``: a set of
     what enters by the columns ``through (m,)`` of ``E`` at once, in the place of channels of their own; there is one
     share of 1 then, and integrals are those of its support function."""
 
@@ -818,6 +828,17 @@ class VaryingExecution(Execution):
     def none(self) -> VaryingExecution:
         """`Execution.none`; what is remembered is of these shares."""
         return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _reaching={})
+
+    def followed(self) -> VaryingExecution | SpreadExecution:
+        """`Execution.followed`: the errors of all coefficients, which are followed as states are, on every part."""
+        parts, every = self.response.propagator.parts, []
+        if parts is None:
+            return self
+        for spread, of in self.response.propagator.spread:
+            response = Response(of.system, of.grid, np.zeros(spread.states), shared=of)
+            felt = np.tile(self.felt, spread.space.size)
+            every.append(replace(self, response=response, felt=felt, _lengths={}, _ways={}, _reaching={}))
+        return SpreadExecution(self.response, self.breakpoints, self.shares, self.felt, parts, tuple(every))
 
     def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> Support:
         """`Execution.over`."""
@@ -850,6 +871,13 @@ class VaryingExecution(Execution):
             return self.shares
         box = self.bound.bounding_box()
         return np.asarray(np.maximum(np.abs(box.lower), np.abs(box.upper)) * OUTWARD)
+
+    @cached_property
+    def around(self) -> VaryingExecution:
+        """The errors of the box around the set, where there is one."""
+        if self.bound is None:
+            return self
+        return replace(self, shares=self.far, bound=None, _lengths={}, _reaching={})
 
     @cached_property
     def acting(self) -> np.ndarray:
@@ -1029,19 +1057,15 @@ class SpreadExecution(Execution):
     parts: Parts
     every: tuple[VaryingExecution, ...]
 
-    @staticmethod
-    def of(response: Response, breakpoints: Array, shares: Array, felt: Array) -> SpreadExecution:
-        """That of the response of such a system."""
-        parts, every = response.propagator.parts, []
-        assert parts is not None
-        for spread, one in response.propagator.spread:  # coefficients are followed as states are
-            followed = Response(one.system, one.grid, np.zeros(spread.states), shared=one)
-            every.append(VaryingExecution(followed, breakpoints, shares, np.tile(felt, spread.space.size)))
-        return SpreadExecution(response, breakpoints, shares, felt, parts, tuple(every))
-
     def none(self) -> SpreadExecution:
         """`Execution.none`."""
         return replace(self, shares=np.zeros(self.shares.size), every=tuple(one.none() for one in self.every))
+
+    @property
+    def around(self) -> SpreadExecution:
+        """`VaryingExecution.around`."""
+        every = tuple(one.around for one in self.every)
+        return replace(self, shares=every[0].shares, every=every)
 
     def seen(self, directions: Array, parameters: Array) -> Array:
         """`Execution.seen`: those on all coefficients, and the number of the part."""
@@ -1300,9 +1324,10 @@ class SpreadExecutionSupport:
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingMeasurable:
-    """`MeasurableSupport` of a system that changes with time, for a flat set. Of a box: what stays in the middle of the
-    box, and the errors, through the columns of ``E``, of a command that is 1 and may be missed by half the widths. Of
-    another one what all of it does at once takes the place of such errors, and the middle is 0."""
+    """`MeasurableSupport` of a system that changes with time. Of a box: what stays in the middle of the box, and the
+    errors, through the columns of ``E``, of a command that is 1 and may be missed by half the widths. Of another set
+    what all of it does at once takes the place of such errors, and the middle is 0. Where the state is expanded in
+    parameters, the errors are those of all coefficients, on each of the parts of their box."""
 
     response: Response
     bound: ConvexSet
@@ -1311,8 +1336,9 @@ class VaryingMeasurable:
     def __call__(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
-        """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``; there are no parameters."""
-        found = np.array(self.errors.sampled(self.command, times, directions))
+        """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
+        along = self.errors.seen(directions, parameters)
+        found = np.array(self.errors.sampled(self.command, times, along))
         resting = self.resting
         if resting is None:
             return found
@@ -1336,17 +1362,18 @@ class VaryingMeasurable:
         return np.asarray((box.lower + box.upper) / 2)
 
     @cached_property
-    def errors(self) -> VaryingExecution:
+    def errors(self) -> VaryingExecution | SpreadExecution:
         """How far disturbances may be from the middle: rounded outwards where that is not 0."""
-        ends, felt = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
-        if not self.bound.is_box:
+        shares, bound, through = np.ones(1), None, None
+        if self.bound.is_box:
+            box = self.bound.bounding_box()
+            far = np.maximum(box.upper - self.middle, self.middle - box.lower)
+            shares = np.where(self.middle == 0.0, far, np.where(box.upper > box.lower, np.nextafter(far, np.inf), 0.0))
+        else:
             bound, through = _moving(self.bound)
-            one = np.ones(1)
-            return VaryingExecution(self.response, ends, one, felt, disturbing=True, bound=bound, through=through)
-        box = self.bound.bounding_box()
-        far = np.maximum(box.upper - self.middle, self.middle - box.lower)
-        far = np.where(self.middle == 0.0, far, np.where(box.upper > box.lower, np.nextafter(far, np.inf), 0.0))
-        return VaryingExecution(self.response, ends, far, felt, disturbing=True)
+        ends, felt = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
+        one = VaryingExecution(self.response, ends, shares, felt, disturbing=True, bound=bound, through=through)
+        return one.followed()
 
     @property
     def command(self) -> Array:
@@ -1361,25 +1388,20 @@ class VaryingMeasurable:
         point, pieces = Box(self.middle, self.middle), np.arange(self.response.grid.pieces)
         return DisturbanceModel("piecewise_constant", point, point, self.response.grid, starts=pieces)
 
-    def over(self, rows: Array, leg: LiftedSystem | VaryingMotion) -> list[Support]:
-        """`MeasurableSupport.over`."""
-        assert isinstance(leg, VaryingMotion)
-        found: list[Support] = [self.errors.over(self.command, rows, leg)]
-        if self.resting is not None:
+    def over(self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> list[Support]:
+        """`MeasurableSupport.over`, over a cell of parameters too."""
+        assert not isinstance(leg, LiftedSystem)
+        found = [self.errors.over(self.command, rows, leg)]
+        if self.resting is not None and isinstance(leg, SpreadMotion):
+            found.append(SpreadSupport.of_disturbance(leg, self.resting, rows, None))
+        elif self.resting is not None and isinstance(leg, VaryingMotion):
             found.append(VaryingSupport.of_disturbance(leg, self.resting, rows, None))
         return found
 
-    def integrated_sizes(self, times: Array, directions: Array) -> Array:
+    def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
         """`MeasurableSupport.integrated_sizes`: integrals of absolute values."""
-        return np.asarray(self._apart.lengths(times, directions).sum(axis=1))
-
-    @cached_property
-    def _apart(self) -> VaryingExecution:
-        """The errors of the box around the set."""
-        of = self.errors
-        if of.bound is None:
-            return of
-        return VaryingExecution(of.response, of.breakpoints, of.far, of.felt, disturbing=True, through=of.through)
+        along = self.errors.seen(directions, parameters)
+        return np.asarray(self.errors.around.lengths(times, along).sum(axis=1))
 
 
 def _moving(bound: ConvexSet) -> tuple[ConvexSet, np.ndarray]:

@@ -35,15 +35,14 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
     total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
     orders = np.arange(terms.shape[1])
     # in powers of the place from -1 to 1 across the interval
-    terms = np.einsum("kj,ljw->lkw", _moved(terms.shape[1], 0.5, 0.5), terms)
+    terms = _moved(terms.shape[1], 0.5, 0.5) @ terms
     far = bound.reach(np.eye(bound.dimension))
     each, first = 2.0 * orders.size * EPSILON, np.abs(terms).sum(axis=1) @ far
     lost = each + (8.0 * far.size + 64.0) * EPSILON
-    series = np.polynomial.chebyshev
-    to_series = np.array([np.append(series.poly2cheb(row), [0.0] * (orders.size - 1 - k)) for k, row in _units(orders)])
+    to_series = _series(orders.size)
     powers, halves = NODES[:, None] ** orders, [_moved(orders.size, 0.5, side) for side in (-0.5, 0.5)]
     for turn in range(HALVINGS + 1):
-        waves = np.einsum("jk,ljw->lkw", to_series, terms)
+        waves = to_series @ terms
         spread = np.einsum("k,lkw->lw", RADIUS ** orders[1:], np.abs(waves[:, 1:])) * (1.0 + lost)
         most = bound.continued(waves[:, 0], spread)
         assert most is not None
@@ -61,12 +60,17 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
         terms, owner, lengths = terms[open_], np.tile(owner[open_], 2), np.tile(lengths[open_] / 2.0, 2)
         if not owner.size:
             break
-        terms = np.concatenate([np.einsum("kj,ljw->lkw", half, terms) for half in halves])
+        terms = np.concatenate([half @ terms for half in halves])
     return total
 
 
-def _units(orders: np.ndarray) -> list[tuple[int, Array]]:
-    return [(int(k), np.eye(orders.size)[k, : k + 1]) for k in orders]
+@cache
+def _series(count: int) -> Array:
+    """From the coefficients of powers to those of Chebyshev's polynomials, ``(count, count)``."""
+    found = np.zeros((count, count))
+    for k in range(count):
+        found[: k + 1, k] = np.polynomial.chebyshev.poly2cheb(np.eye(count)[k, : k + 1])
+    return found
 
 
 @cache

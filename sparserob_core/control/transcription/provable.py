@@ -8,10 +8,11 @@ import numpy as np
 
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import System
+from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.response.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.integrals import enclosed
+from sparserob_core.control.transcription.terms.in_time import within_reach
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.result import Result
@@ -31,8 +32,9 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     if problem.measurable is not None:
         paths = [entry.set for entry in problem.windows]
         curved = [one for one in (*paths, *problem.terminal_sets) if one.halfspaces() is None]
-        if problem.system.parameter_count or curved:
-            over = "uncertain parameters" if problem.system.parameter_count else "sets with curved sides"
+        far = problem.system.parameter_count > 0 and not isinstance(problem.system, VaryingSystem)
+        if far or curved:
+            over = f"uncertain parameters out of reach ({within_reach(problem)})" if far else "sets with curved sides"
             return (
                 f"{WITHOUT_PROOF}; this problem has {over}. With disturbance_class piecewise_constant it can be proven"
             )

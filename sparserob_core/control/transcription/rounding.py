@@ -148,16 +148,16 @@ def _beside_control(
     if functionals.execution is not None:
         lengths = functionals.execution.lengths(times, functionals.execution.seen(directions, parameters))
         sizes += lengths @ np.repeat(_far(model.problem.control), model.control.pieces)
-    return np.asarray(sizes + _disturbing(model, weights.disturbance, times, directions))
+    return np.asarray(sizes + _disturbing(model, weights.disturbance, times, directions, parameters))
 
 
-def _disturbing(model: Transcription, on_noise: Array, times: Array, directions: Array) -> Array:
+def _disturbing(model: Transcription, on_noise: Array, times: Array, directions: Array, parameters: Array) -> Array:
     """The numbers ``(k,)`` that are added up to what disturbances do, from the weights ``on_noise (k, L, mw)``."""
     if model.problem.disturbance is None:
         return np.zeros(times.size)
     sizes: Array = (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
     measurable = model.functionals.measurable
-    return sizes if measurable is None else sizes + measurable.integrated_sizes(times, directions)
+    return sizes if measurable is None else sizes + measurable.integrated_sizes(times, directions, parameters)
 
 
 def _quadratic(model: Transcription, result: Result) -> float:

@@ -144,16 +144,12 @@ def _functionals(
     response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
     execution: Execution | None = None
     if problem.execution is not None:
-        from sparserob_core.control.response.measurable import Execution, SpreadExecution, VaryingExecution
+        from sparserob_core.control.response.measurable import Execution, VaryingExecution
 
         shares, felt = np.asarray(problem.execution), np.ones(problem.system.states)
         felt[list(problem.commanded)] = 0.0
-        if response.propagator.parts is not None:
-            execution = SpreadExecution.of(response, control.breakpoints, shares, felt)
-        elif system.varies:
-            execution = VaryingExecution(response, control.breakpoints, shares, felt)
-        else:
-            execution = Execution(response, control.breakpoints, shares, felt)
+        kind = VaryingExecution if system.varies else Execution
+        execution = kind(response, control.breakpoints, shares, felt).followed()
     functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)
 

@@ -17,11 +17,15 @@ FLAT = Box([-1.0, -1.0], [1.0, 1.0])
 KNOWN = LinearSystem([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]])
 
 
-def uncertain(A):
-    return LinearSystem(A, [[0.0], [1.0]], parameters=Box([0.5], [1.5]))
+def uncertain(A, most=1.5):
+    return LinearSystem(A, [[0.0], [1.0]], parameters=Box([0.5], [most]))
 
 
-OSCILLATOR = uncertain(lambda p: np.array([[0.0 * p[0], 1.0], [-p[0], 0.0]]))
+def stiff(p):
+    return np.array([[0.0 * p[0], 1.0], [-p[0], 0.0]])
+
+
+OSCILLATOR = uncertain(stiff)
 
 
 def problem(system=KNOWN, kind="measurable", **more):
@@ -39,7 +43,8 @@ def problem(system=KNOWN, kind="measurable", **more):
 @pytest.mark.parametrize(
     ("made", "named"),
     [
-        (lambda: problem(OSCILLATOR), "uncertain parameters"),
+        (lambda: problem(uncertain(stiff, 1e7)), "uncertain parameters out of reach"),
+        (lambda: problem(uncertain(lambda p: np.eye(2) * (p[0] > 1))), "uncertain parameters out of reach"),
         (lambda: problem(terminal=[ROUND]), "curved"),
         (lambda: problem(path=[ROUND]), "curved"),
         (lambda: problem(uncertain(lambda p: np.eye(2) * (p[0] > 1)), "piecewise_constant"), "branch"),
@@ -57,6 +62,7 @@ def test_what_can_never_be_proven_is_known_at_once(made, named):
         problem,
         lambda: problem(KNOWN, "piecewise_constant", terminal=[ROUND]),
         lambda: problem(OSCILLATOR, "piecewise_constant"),
+        lambda: problem(OSCILLATOR),
     ],
 )
 def test_nothing_stands_against_other_proofs(made):

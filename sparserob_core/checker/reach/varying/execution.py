@@ -85,7 +85,7 @@ class VaryingExecution:
         return int(self.shares.size if self.side is None else self.side.dimension)
 
     @cached_property
-    def _far(self) -> Array:
+    def far(self) -> Array:
         """How far from 0 at most what enters by each column is, ``(m,)``, as a multiple of its size."""
         if self.side is None:
             return np.ones(self.shares.size)
@@ -121,7 +121,7 @@ class VaryingExecution:
             factor = 2.0 if n == len(terms) else (n - 1) * n ** (-n / (n - 1))
             total += factor * float((np.abs(found.mid) + found.rad)[0] @ begun)
         place = min(max(0, int(np.searchsorted(self.breakpoints, start, side="right")) - 1), len(self.pieces) - 1)
-        size = (self.sizes.mid[place] + self.sizes.rad[place]) * self._far
+        size = (self.sizes.mid[place] + self.sizes.rad[place]) * self.far
         if size.any():
             (most, slope), units = self.law.most(start, stop), np.array(self.law.units_on(start, stop))
             entering = slice(d + self.first, d + self.first + m)
@@ -233,20 +233,25 @@ class VaryingExecution:
 @final
 @dataclass(eq=False)
 class SpreadExecution:
-    """`VaryingExecution` of a control that enters a system with parameters that its state is no affine function of.
+    """`VaryingExecution` of a control, or of disturbances, in a system with parameters that its state is no affine
+    function of.
 
     At one parameter it is that of the known system there. Over a box: of one parameter alone a function ``f`` is
     nowhere further from its chord than half the largest ``f''`` in shares of half the interval, and the absolute value
     of a chord is not above the chord of the absolute values. So the integrals of ``|f|`` are, one parameter after
     another, at most what is linear in each between those at the corners, and half of those of the second derivatives
-    more; what is beyond the degree of the expansion that these are bounded by counts twice.
+    more; what is beyond the degree of the expansion that these are bounded by counts twice. So it is of any convex
+    function that is 0 at 0 in the place of the absolute value, as the support function of a ``side`` is.
     """
 
     law: SpreadFlow
     shares: Array
     breakpoints: Array
     pieces: Sequence[arb_mat]
+    first: int = 0
+    off: Array | None = None
     numb: Sequence[int] = ()
+    side: Side | Curve | None = None
     _at: dict[tuple[float, ...], VaryingExecution] = field(default_factory=dict, repr=False)
     _parts: dict[SpreadFlow, SpreadExecution] = field(default_factory=dict, repr=False)
 
@@ -256,8 +261,8 @@ class SpreadExecution:
         if point not in self._at:
             if len(self._at) >= PLACES_KEPT:
                 self._at.clear()
-            law = self.law.at(point)
-            self._at[point] = VaryingExecution(law, self.shares, self.breakpoints, self.pieces, numb=self.numb)
+            law, enters = self.law.at(point), (self.first, self.off, self.numb, self.side)
+            self._at[point] = VaryingExecution(law, self.shares, self.breakpoints, self.pieces, *enters)
         return self._at[point]
 
     def over(self, c: Array, times: Sequence[float], box: Corners, flow: Known | Flow) -> Spreading:
@@ -296,9 +301,9 @@ class SpreadExecution:
     def _curved(self, c: Array, times: Sequence[float], radius: Array) -> tuple[Array, float]:
         """How far integrals may be above what is linear between corners whose halves are ``radius (nu,)``, by each
         parameter, but for what is beyond the degree; and in the time above a chord between ``times``."""
-        law, sizes, piece = self.law, self._sizes, np.zeros(self.law.inputs)
+        law, sizes = self.law, self._sizes
         place = min(max(0, int(np.searchsorted(self.breakpoints, times[0], side="right")) - 1), len(sizes) - 1)
-        piece[: self.shares.size] = sizes[place]
+        piece = self._entering(sizes[place])
         felt = np.where(np.isin(np.arange(c.size), list(self.numb)), 0.0, np.abs(c))
         norms, lost = self._reached, self._lost
         degrees = np.arange(float(norms.shape[1]))
@@ -313,15 +318,19 @@ class SpreadExecution:
 
     @cached_property
     def _sizes(self) -> Array:
-        """How large errors may be on every piece, ``(K, m)``, at most."""
-        sizes = self.at(self.law.parts.middle).sizes
-        return (sizes.mid + sizes.rad) * OUTWARD
+        """How large what enters by every column may be on every piece, ``(K, m)``, at most."""
+        known = self.at(self.law.parts.middle)
+        return (known.sizes.mid + known.sizes.rad) * known.far * OUTWARD
 
     @cached_property
     def _inputs(self) -> Array:
         """How large at any time, among all inputs."""
+        return self._entering(self._sizes.max(axis=0, initial=0.0))
+
+    def _entering(self, sizes: Array) -> Array:
+        """All inputs, of which those of its columns are of ``sizes (m,)`` and others 0."""
         found = np.zeros(self.law.inputs)
-        found[: self.shares.size] = self._sizes.max(axis=0, initial=0.0)
+        found[self.first : self.first + sizes.size] = sizes
         return found
 
     @cached_property

@@ -1,5 +1,5 @@
 """Systems that take turns, what acts late, and parameters, as one system whose law is another in every turn: errors of
-execution are followed in the time, not in the age of a command."""
+execution are followed in the time, not in the age of a command; so are measurable disturbances beside parameters."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ class Anytime:
 
 
 def in_turns(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with such a system where it has errors of execution beside turns, a delay or parameters; it itself
-    elsewhere."""
+    """The problem with such a system where it has errors of execution beside turns, a delay or parameters, or
+    measurable disturbances beside a box of parameters; it itself elsewhere."""
     system = problem.system
     late = isinstance(system, SwitchedSystem) or (isinstance(system, LinearSystem) and system.delay > 0.0)
-    if problem.execution is None or isinstance(system, VaryingSystem) or not (late or system.parameter_count):
+    missed = problem.execution is not None and (late or system.parameter_count > 0)
+    pushed = problem.measurable is not None and isinstance(system.parameters, Box)
+    if isinstance(system, VaryingSystem) or not (missed or pushed):
         return problem
     bound, names = system.parameters, tuple(system.names)
     if not (bound is None or isinstance(bound, Box)):

@@ -14,19 +14,17 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.windows import everywhere
 from sparserob_core.control.sets.sets import Equality, cylinder
-from sparserob_core.control.transcription.terms.in_time import in_time
+from sparserob_core.control.transcription.terms.in_time import corners_of_box, in_time
 from sparserob_core.control.transcription.terms.larger import larger
-from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
-
-CORNERS = 64  # of a box of parameters: rows are as many times more, with ten times as many it would take minutes
 
 
 def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same problem without parameters beside the time. The states of one in the middle of their box stay the first
     ones, after which comes what each parameter adds, per half of its interval; both obey known equations. A bound of
     the state holds for all parameters where it holds at the corners; a curved one is one constraint for each of them.
-    Halves of intervals are rounded outwards. Beside errors of execution parameters of any system are such (`in_time`).
+    Halves of intervals are rounded outwards. Beside errors of execution, or measurable disturbances, parameters of any
+    system are such (`in_time`).
     """
     problem = in_time(problem)
     system = problem.system
@@ -61,7 +59,7 @@ def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
     system = in_time(problem).system
     if not isinstance(system, VaryingSystem) or system.parameters is None or system.dependence is None:
         return None
-    return [system.dependence.rows(corner) for corner in _corners(system.dependence)]
+    return [system.dependence.rows(corner) for corner in corners_of_box(system.dependence)]
 
 
 def corners_of(problem: OptimalControlProblem) -> Corners:
@@ -76,17 +74,6 @@ def corners_of(problem: OptimalControlProblem) -> Corners:
         for low, high, one in zip(box.lower.tolist(), box.upper.tolist(), reached, strict=True)
     ]
     return Corners(rows, np.array(list(every_choice(*ends))), system.names)
-
-
-def _corners(depends: Dependence) -> list[Array]:
-    """The corners of the box as shares of what the parameters may deviate from its middle by, of those that reach a
-    state."""
-    moves = depends.reached.any(axis=1) & (depends.units > 0.0)
-    count = 2 ** int(moves.sum())
-    if count > CORNERS:
-        expected = f"a box with at most {CORNERS} corners beside the time t"
-        raise InputError(path="system.parameters", expected=expected, got=f"{count}")
-    return [np.array(one) for one in every_choice(*((-1.0, 1.0) if one else (0.0,) for one in moves.tolist()))]
 
 
 def _names(names: Names, system: VaryingSystem, depends: Dependence) -> Names:
