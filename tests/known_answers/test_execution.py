@@ -202,7 +202,20 @@ def test_a_control_that_is_refuted_shows_by_how_much(tmp_path: Path) -> None:
             },
             "measurable disturbances in a curved set",
         ),
-        ({"terminal": [{"norm": {"p": 2, "radius": 0.3}}]}, "curved sets of states"),
+        (
+            {
+                "system": {"A": [[0, 1], ["-4 - p", -0.3]], "B": B.tolist(), "parameters": {"p": [-0.1, 0.1]}},
+                "terminal": [{"norm": {"p": 2, "radius": 0.3}}],
+            },
+            "curved sets of states with parameters",
+        ),
+        (
+            {
+                "system": {"A": [[0, 1], ["-4 - p*t", -0.3]], "B": B.tolist(), "parameters": {"p": [-0.1, 0.1]}},
+                "terminal": [{"norm": {"p": 2, "radius": 0.3}}],
+            },
+            "curved sets of states with parameters",
+        ),
     ],
 )
 def test_what_is_not_proven_beside_them_is_refused_by_name(changes: dict[str, Any], said: str, tmp_path: Path) -> None:

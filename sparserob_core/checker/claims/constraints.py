@@ -75,8 +75,6 @@ def bounded(case: Case, window: Window) -> str:
     if is_followed(case, window):
         found = _along_rows(case, window)
     else:
-        if case.measurable and window.seen.facets is None:
-            raise Unchecked("the checker knows measurable disturbances with flat sets of states only")
         basis, gains, work = _work(case, window, normals, lower, upper)
         found = prove(
             tubes(case, basis, gains, lower, upper),

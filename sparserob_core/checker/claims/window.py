@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.outcome import Broken
+from sparserob_core.checker.arithmetic.balls import above
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import Execution
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from sparserob_core.checker.reach.flow import Flow
     from sparserob_core.checker.reach.tube import Known
     from sparserob_core.checker.sets.parameters import Corners
+
+DIRECTIONS_KEPT = 4096  # of cells of directions, which are asked for at every time; with a tenth of them some anew
 
 
 @final
@@ -106,6 +110,7 @@ class Beside:
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
     delivered: Sequence[Execution | VaryingExecution | SpreadExecution] = ()
+    _directions: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     def added(
         self,
@@ -134,14 +139,49 @@ class Beside:
         mid = enclosed.mid @ z.T
         lost = (enclosed.rad + rounding(z.shape[1]) * np.abs(enclosed.mid)) @ np.abs(z).T
         found = [_plus(poly, mid[:, i], float(lost[:, i].sum())) for i, poly in enumerate(found)]
+        if not self.delivered:
+            return list(found)
+        directions, off = self.directions(z)
         for one in self.delivered:
-            rows = zip(found, z @ self.basis, strict=True)
+            rows = zip(found, directions, off, strict=True)
             if isinstance(one, SpreadExecution):
+                if off.any():
+                    raise Unchecked("errors of execution over parameters are known along directions that are floats")
                 assert within is not None
-                found = [self._spreading(poly, one, c, start, stop, within) for poly, c in rows]
+                found = [self._spreading(poly, one, c, start, stop, within) for poly, c, _ in rows]
             else:
-                found = [_plus(poly, *self._erring(one, c, start, stop)) for poly, c in rows]
+                found = [
+                    _plus(_plus(poly, *self._erring(one, c, start, stop)), *self._beside(one, missed, start, stop))
+                    for poly, c, missed in rows
+                ]
         return list(found)
+
+    def directions(self, z: Array) -> tuple[Array, Array]:
+        """``c = z'basis`` as floats ``(k, d)``, and how far they are off at most: where nothing is added up, and mostly
+        elsewhere, they are exact."""
+        key = z.tobytes()
+        if key not in self._directions:
+            exact = (exactly(z) * exactly(self.basis)).entries()
+            floats = [float(x.mid()) for x in exact]
+            left = [x - _exact(c) for x, c in zip(exact, floats, strict=True)]
+            off = [0.0 if x.is_zero() else above(abs(x)) for x in left]
+            if len(self._directions) >= DIRECTIONS_KEPT:
+                self._directions.clear()
+            shape = len(z), self.basis.shape[1]
+            self._directions[key] = np.reshape(floats, shape), np.reshape(off, shape)
+        return self._directions[key]
+
+    def _beside(
+        self, delivered: Execution | VaryingExecution, off: Array, start: float, stop: float
+    ) -> tuple[Array, float]:
+        """What errors of execution add at most along a direction that is nowhere larger than ``off (d,)``, as
+        `_erring`: it is sublinear in the direction."""
+        total = 0.0
+        for state in np.flatnonzero(off):
+            axis = np.eye(off.size)[state]
+            ends = [self._erring(delivered, c, start, stop) for c in (axis, -axis)]
+            total += off[state] * max(float(np.abs(terms).sum()) + lost for terms, lost in ends)
+        return np.zeros(1), total * OUTWARD
 
     def _spreading(
         self,

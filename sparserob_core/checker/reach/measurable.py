@@ -170,11 +170,12 @@ class Kernel:
         rad = (high - low) / 2.0 + (lost * self.half + rounding(4) * (np.abs(low) + np.abs(high)))
         return Enclosed((low + high) / 2.0, rad * OUTWARD)
 
-    def steepest(self, a: Array, sides: Sequence[Side | Curve]) -> Array:
-        """How fast the support function of ``K(r)'a`` changes with ``r`` at most, ``a (N, d)`` exact: ``(N,)``."""
+    def steepest(self, a: Enclosed, sides: Sequence[Side | Curve]) -> Array:
+        """How fast the support function of ``K(r)'a`` changes with ``r`` at most, for ``a (N, d)``: ``(N,)``."""
         radii = sum((side.far for side in sides), np.zeros(self.off.shape[2]))
-        large = np.einsum("nd,spdw->npsw", np.abs(a), np.abs(self.coefficients))
-        plain = np.abs(np.einsum("nd,spdw->npsw", a, self.coefficients)) + rounding(a.shape[1]) * large
+        unsure = rounding(a.mid.shape[1]) * np.abs(a.mid) + a.rad * OUTWARD
+        plain = np.abs(np.einsum("nd,spdw->npsw", a.mid, self.coefficients))
+        plain = plain + np.einsum("nd,spdw->npsw", unsure, np.abs(self.coefficients))
         slopes = (np.arange(ORDER + 1)[:, None, None] * plain).sum(axis=1) / self.half
         return np.asarray((slopes @ radii).max(axis=1) * OUTWARD)
 
@@ -391,19 +392,22 @@ class MeasurableLoop(ClosedLoop):
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         from flint import arb
 
-        assert isinstance(rows, np.ndarray)  # curved sets, whose directions are balls, are not followed
         found = super().highest(piece, time, rows, beside)
         if time == self.grid[piece]:
             return found
         share = float(((arb(time) - arb(self.grid[piece])) / (arb(self.grid[piece + 1]) - arb(self.grid[piece]))).mid())
-        added = self.kernel(piece).most(Enclosed(rows, np.zeros_like(rows)), self.sides, min(share, 1.0))
+        added = self.kernel(piece).most(_enclosed(rows), self.sides, min(share, 1.0))
         return [one + arb(m, r) for one, m, r in zip(found, added.mid.tolist(), added.rad.tolist(), strict=True)]
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """As of `ClosedLoop`; what the piece itself adds is the integral of a Lipschitz function."""
-        assert isinstance(rows, np.ndarray)
-        steep = self.kernel(piece).steepest(rows, self.sides)
+        steep = self.kernel(piece).steepest(_enclosed(rows), self.sides)
         return np.asarray(super().bent(piece, start, stop, rows) + (stop - start) ** 2 / 8.0 * steep * OUTWARD)
+
+
+def _enclosed(rows: Array | arb_mat) -> Enclosed:
+    """Rows of floats, or of balls."""
+    return Enclosed(rows, np.zeros_like(rows)) if isinstance(rows, np.ndarray) else Enclosed.of(rows)
 
 
 def _undriven(system: System) -> System:

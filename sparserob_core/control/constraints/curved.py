@@ -151,7 +151,8 @@ class CurvedConstraint(StateConstraint):
         start = np.full(self._b, STEP)
         z, found = climb(height, indices[:, first:], start, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
         turned = np.hstack([indices[:, :first], z])
-        return turned, found if self.functionals.measurable is None else self._height(x, turned)
+        rough = self.functionals.measurable is not None or self.functionals.execution is not None
+        return turned, self._height(x, turned) if rough else found
 
     @shaped
     def _at(self, times: Float[Array, " k"], positions: Int[np.ndarray, "k q"]) -> Float[Array, "k j"]:
@@ -263,12 +264,13 @@ class CurvedConstraint(StateConstraint):
             rhs, looseness = self._minorant(H, joined, nu)
             shortest = self._rooms(low[None, nu:], high[None, nu:])[0]
             lengthening = np.concatenate([np.zeros(nu), self._lengthening(H, shortest / self.unit)])
-            control = self.functionals.dictionary.control(x)
+            control = self.functionals.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
             moving = Moving(self.reference, H) if self.reference.moves else None
 
             def cell(leg: Leg) -> CellEnclosure:
-                sigma = self.functionals.support_over(leg, H, joined)
+                known = self.functionals.support_over(leg, H, joined)
+                sigma = self.functionals.delivered_over(known, x, H, leg, joined)
                 return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, lengthening, cuts, moving)
 
             remember(self._cells, key, over_legs(legs, cell), kept(control))

@@ -404,11 +404,8 @@ class FlatConstraint(StateConstraint):
             moving = Moving(self.reference, H) if self.reference.moves else None
             direct = None if self.gains is None else Direct(self.gains[:rows], self.functionals.dictionary, control)
             known = self.samples.support_over(legs, low, high)
-            if self.functionals.execution is not None:  # of a known system, which has one leg
-                (leg,) = legs
-                errors = self.functionals.execution.over(control, H, leg)
-                known = [Supports((*(() if known[0] is None else known[0].parts), errors))]
-            supports = iter(known)
+            every = zip(known, legs, strict=True)
+            supports = iter([self.functionals.delivered_over(one, x, H, leg) for one, leg in every])
             made = over_legs(
                 legs,
                 lambda leg: CellEnclosure(

@@ -7,6 +7,7 @@ breakpoints.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -158,6 +159,9 @@ class Sensitivity:
             control = self.constraint.functionals.control(x)
             along = execution.seen(at.direction, parameters)
             in_time = in_time + execution.slope(control, times[:, 0], along)[:, None]
+            states = states + self._in_shares(
+                at, lambda c, of: execution.added(control, times[of, 0], execution.seen(c, parameters[of]))
+            )
             if self._nu:
                 box = self.constraint.parameters.box
 
@@ -263,18 +267,21 @@ class Sensitivity:
             low, high = np.clip([times - step, times + step], *ends)
             moved = support(high, at.direction, parameters) - support(low, at.direction, parameters)
             in_time = (moved / (high - low))[:, None]
-        in_parameters, in_shares = np.zeros((times.size, self._nu)), np.zeros(at.shares.shape)
+        in_parameters = np.zeros((times.size, self._nu))
         if self._nu:
             box = self.constraint.parameters.box
             in_parameters = differences(
                 lambda p, of: support(times[of], at.direction[of], p), parameters, box.lower, box.upper
             )
-        if self.constraint.index_set.dimension > 1 + self._nu:
-            normals, wide = at.directions[0], np.full(at.shares.shape[1], 2.0)
-            in_shares = differences(
-                lambda s, of: support(times[of], s @ normals, parameters[of]), at.shares, -wide, wide
-            )
-        return in_time, in_parameters, in_shares
+        return in_time, in_parameters, self._in_shares(at, lambda c, of: support(times[of], c, parameters[of]))
+
+    def _in_shares(self, at: Functional, value: Callable[[Array, np.ndarray], Array]) -> Array:
+        """The derivatives ``(k, b)`` of a value of directions ``(j, d)``, of the indices of these numbers, in the
+        shares of the normals that a direction of a curved set is made of; 0 where it is flat."""
+        if self.constraint.index_set.dimension == 1 + self._nu:
+            return np.zeros(at.shares.shape)
+        normals, wide = at.directions[0], np.full(at.shares.shape[1], 2.0)
+        return differences(lambda shares, of: value(shares @ normals, of), at.shares, -wide, wide)
 
     @property
     def _response(self) -> Response:

@@ -307,7 +307,8 @@ class OptimalControlProblem(Term):
                 one.halfspaces() is None for one in filter(None, [self.measurable])
             )
             and (bool(self.system.switches) or self.system.delay > 0.0 or self.system.parameter_count > 0),
-            "curved sets of states": any(one.halfspaces() is None for one in sets),
+            "curved sets of states with parameters that the state does not depend on affinely": self._is_expanded()
+            and any(one.halfspaces() is None for one in sets),
         }
         for beside, given in refused.items():
             if given:
@@ -323,6 +324,15 @@ class OptimalControlProblem(Term):
         except InputError:
             return False
         return True
+
+    def _is_expanded(self) -> bool:
+        """Whether there are such of which the state is no affine function."""
+        system = self.system
+        if not isinstance(system, VaryingSystem):
+            if not system.parameter_count or not self._is_boxed():
+                return False
+            system = VaryingSystem.made_of(system, self.horizon)
+        return system.parameters is not None and system.dependence is None
 
     def _state(self) -> Array:
         d = self.system.states

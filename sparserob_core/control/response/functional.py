@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = (
-    "measurable disturbances are proven only for sets with flat sides, and parameters in a box over which the state can"
-    " be expanded in them"
+    "measurable disturbances are proven only beside parameters in a box over which the state can be expanded in them,"
+    " and where it is no affine function of these only for sets with flat sides"
 )
 LEGS_KEPT = 256  # cells of parameters whose lifted systems are kept
 Leg: TypeAlias = LiftedSystem | VaryingMotion | SpreadMotion
@@ -271,12 +271,13 @@ class WorstCase:
     def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
         """``max_w c'x(t)`` at a decision as a function of the direction alone, at ``times (k,)`` and ``parameters (k,
         nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, as many at each, ``(j,)``. Weights are
-        linear in the direction, so that those of the axes are computed once. What measurable disturbances add is not,
-        and is only about right."""
+        linear in the direction, so that those of the axes are computed once. What measurable disturbances and errors of
+        execution add is not, and is only about right: of errors it is what those do that are constant on pieces."""
         known, model = self._axes(times, parameters), self.disturbance
         states = known.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", known.control, self.on_grid(theta))
         by_block, measurable = None if model is None else model.on_blocks, self.measurable
         blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(known.disturbance)
+        missed = self._missed(theta, known.control)
 
         def along(directions: Array, which: np.ndarray) -> Array:
             places = which[np.flatnonzero(np.diff(which, prepend=-1))]
@@ -289,11 +290,24 @@ class WorstCase:
                 if by_block is not None:
                     on_blocks = turned @ blocks[at].reshape(*blocks[at].shape[:2], -1)
                     found[part] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
+                if missed.shape[2]:
+                    found[part] += np.abs(turned @ missed[at]).sum(axis=2)
             if measurable is not None:
                 found += measurable.roughly(times[which], directions, parameters[which]).reshape(found.shape)
             return found.reshape(-1)
 
         return along
+
+    def _missed(self, theta: Array, weights: Array) -> Array:
+        """What errors of execution that are constant on pieces may make of every state, ``(k, d, q)``, piece by piece
+        and channel by channel, from the weights ``(k, d, L, m)`` of the axes; ``q`` is 0 where there are none."""
+        if self.execution is None:
+            return np.zeros((*weights.shape[:2], 0))
+        m = self.channels
+        sizes = self.execution.shares[:, None] * np.abs(self.on_grid(theta)[:m])
+        acting = np.flatnonzero(sizes.any(axis=0))
+        found = self.execution.felt[:, None, None] * weights[:, :, acting, :m] * sizes[:, acting].T
+        return np.asarray(found.reshape(*weights.shape[:2], -1))
 
     @shaped
     def profile(
@@ -363,9 +377,11 @@ class WorstCase:
         model, measurable = self.disturbance, self.measurable
         by_block = None if model is None else model.on_blocks
         if measurable is not None:
-            if joined is not None or (lifted.space.nu and isinstance(lifted, LiftedSystem)):
+            if (joined is not None and isinstance(lifted, SpreadMotion)) or (
+                lifted.space.nu and isinstance(lifted, LiftedSystem)
+            ):
                 raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
-            found += measurable.over(H, lifted)
+            found += measurable.over(H, lifted, joined)
         if isinstance(lifted, SpreadMotion):
             found += [] if by_block is None else [SpreadSupport.of_disturbance(lifted, by_block, rows, joined)]
             found += [] if self.initial is None else [SpreadSupport.of_initial(lifted, self.initial, rows, joined)]
@@ -376,6 +392,16 @@ class WorstCase:
             found += [] if by_block is None else [DisturbanceSupport(lifted, by_block, rows, joined)]
             found += [] if self.initial is None else [InitialSupport(lifted, self.initial, rows, joined)]
         return Supports(tuple(found)) if found else None
+
+    def delivered_over(
+        self, known: Supports | None, theta: Array, H: Array, leg: Leg, joined: Combination | None = None
+    ) -> Supports | None:
+        """What is ``known`` of the uncertainty over a cell (`support_over`), with what errors of execution of a
+        decision add."""
+        if self.execution is None:
+            return known
+        errors = self.execution.over(self.control(theta), H, leg, joined)
+        return Supports((*(() if known is None else known.parts), errors))
 
     @shaped
     def offsets(

@@ -16,7 +16,7 @@ nowhere further above its chord than that says.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import product as every_choice
@@ -30,6 +30,7 @@ from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.flows import Leaps, products
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
+from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import Carried, carried
@@ -173,10 +174,13 @@ class MeasurableSupport:
         middles = np.broadcast_to(starts + lengths / 2, (A.shape[0], starts.size))
         return starts, lengths, _moved(A, np.eye(A.shape[0]), middles) @ E
 
-    def over(self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> list[Support]:
-        """What it adds to functionals ``rows (r, d)`` over cells of time, in parts that add up."""
+    def over(
+        self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion, joined: Combination | None = None
+    ) -> list[Support]:
+        """What it adds to functionals ``rows (r, d)`` over cells of time, in parts that add up; with ``joined`` to that
+        of a direction that is made of them."""
         assert isinstance(leg, LiftedSystem)
-        return [MeasurableCellSupport(self, rows, leg)]
+        return [over_directions(lambda every: MeasurableCellSupport(self, every, leg), rows, leg, joined)]
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
         """The numbers ``(k,)`` that are added up to integrals beside what enters by pieces: none."""
@@ -531,6 +535,116 @@ class KnownCellSupport:
         return bounds.mean(axis=2)[..., None], (bounds[..., 1] - bounds[..., 0]) / 2 * (1.0 + rounding(4))
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class DirectionsCellSupport:
+    """A part of the uncertainty of a *known* system on one functional over a cell of directions ``c = rows[0] + sum_j
+    eta_j rows[j]``, ``|eta_j| <= 1``, in the form of `Support`; ``made`` is what it is on given ``rows (r, d)``, and
+    ``joined`` says which monomials there are.
+
+    It is a support function, or a sum of such with factors that are not negative: sublinear in ``c``. So it is, one
+    coordinate after another, at most what is linear in each between the corners. How far it leaves its chord in time is
+    a mean of differences ``h(y(s)) - h(y(r))`` with ``y`` linear in ``c``, each at most the sum of those of the rows:
+    so bounds of these, and of what is left out, add up.
+    """
+
+    made: Callable[[Array], Support]
+    rows: Array
+    leg: LiftedSystem | VaryingMotion
+    joined: Combination
+
+    @shaped
+    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k 1 nu"]:
+        """`Support.steepness`: what is added along a row, or against it, at most."""
+        axes = self.rows[1:]
+        # powers of two of one row are asked for again in every smaller cell
+        sizes = np.exp2(np.frexp(np.abs(axes).max(axis=1, initial=0.0))[1])
+        axes = axes / sizes[:, None]
+        along, off = self._at(times, np.vstack([axes, -axes]))
+        most = np.maximum(along + off, 0.0).reshape(times.size, 2, len(axes)).max(axis=1)
+        return np.asarray((most * sizes * OUTWARD)[:, None])
+
+    @shaped
+    def at(
+        self, times: Float[Array, " k"], ends: Float[Array, "k 1 nu"]
+    ) -> tuple[Float[Array, "k 1 M"], Float[Array, "k 1"]]:
+        """`Support.at`. What is lost in the middle of the cell is a part of the excess, since smaller cells lose
+        less."""
+        coefficients, excess = np.zeros((times.size, 1, self.joined.space.size)), np.zeros((times.size, 1))
+        patterns, which = distinct_patterns(ends)
+        for position, pattern in enumerate(patterns):
+            here = np.flatnonzero(which[:, 0] == position)
+            corners = _corners(pattern)
+            along, off = self._at(times[here], self.rows[0] + np.vstack([pattern, corners]) @ self.rows[1:])
+            found, beyond = between_corners(self.joined.space, pattern, along[:, 1:])
+            lost = np.maximum(along[:, 1:].mean(axis=1) - along[:, 0], 0.0)
+            size = rounding(len(corners) + 4) * np.abs(along).max(axis=1)
+            found[:, 0] -= lost
+            coefficients[here, 0] = found
+            excess[here, 0] = (off[:, 1:].max(axis=1) + beyond + lost + size) * OUTWARD
+        return coefficients, excess
+
+    @shaped
+    def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
+        """`Support.deviation` of every row."""
+        return self._each.deviation(start, widths)
+
+    @cached_property
+    def neglected(self) -> Array:
+        """`Support.neglected` of every row, with what rounding makes of the corners, ``(r, L)``."""
+        sizes = block_norms(np.abs(self.rows) @ np.abs(self.leg.transform), self.leg.starts)
+        return np.asarray(self._each.neglected + rounding(len(self.rows)) * product(sizes, self.reached.T))
+
+    @cached_property
+    def reached(self) -> Array:
+        """`Support.reached`."""
+        return self._each.reached
+
+    @cached_property
+    def _each(self) -> Support:
+        return self.made(self.rows)
+
+    def _at(self, times: Array, rows: Array) -> tuple[Array, Array]:
+        """What is added along ``rows (r, d)``, and how far it may be from that, ``(k, r)`` each."""
+        found, off = self.made(rows).at(times, np.zeros((times.size, len(rows), 0)))
+        return found[..., 0], off
+
+
+def over_directions(
+    made: Callable[[Array], Support], rows: Array, leg: LiftedSystem | VaryingMotion, joined: Combination | None
+) -> Support:
+    """What is ``made`` of functionals ``rows (r, d)``, or of the direction that they make where they are ``joined``."""
+    return made(rows) if joined is None else DirectionsCellSupport(made, rows, leg, joined)
+
+
+def _corners(pattern: Array) -> Array:
+    """The corners ``(n, nu)`` of the face of ``[-1, 1]^nu`` on which the coordinates with an end in ``pattern (nu,)``
+    are at it."""
+    free = np.flatnonzero(pattern == 0.0)
+    signs = np.array(list(every_choice((-1.0, 1.0), repeat=free.size)))
+    corners = np.tile(pattern, (len(signs), 1))
+    corners[:, free] = signs
+    return corners
+
+
+def between_corners(space: TaylorSpace, pattern: Array, values: Array) -> tuple[Array, Array]:
+    """What is linear in every coordinate between ``values (q, n)`` at the `_corners` of a face: coefficients ``(q,
+    M)``, and how far it may be above these, ``(q,)``: of products that the space has not, and by rounding."""
+    corners, free = _corners(pattern), np.flatnonzero(pattern == 0.0)
+    coefficients = np.zeros((len(values), space.size))
+    beyond = len(corners) * rounding(2 * len(corners) + 8) * np.abs(values).max(axis=1)
+    for chosen in every_choice((0, 1), repeat=free.size):
+        found = values @ corners[:, free[np.flatnonzero(chosen)]].prod(axis=1) / len(corners)
+        exponents = np.zeros(space.nu, dtype=int)
+        exponents[free] = chosen
+        place = space.index.get(tuple(exponents.tolist()))
+        if place is None:  # of more coordinates than there are degrees
+            beyond = beyond + np.abs(found)
+        else:
+            coefficients[:, place] = found
+    return coefficients, beyond
+
+
 @dataclass(frozen=True, eq=False)
 class MeasurableCellSupport(KnownCellSupport):
     """The support function of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form
@@ -644,10 +758,17 @@ class Execution:
         """Directions ``(k, d)`` at parameters ``(k, nu)`` as those on the states that errors are followed in."""
         return directions
 
-    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> Support:
-        """What the worst errors of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time."""
+    def over(
+        self,
+        control: Array,
+        rows: Array,
+        leg: LiftedSystem | VaryingMotion | SpreadMotion,
+        joined: Combination | None = None,
+    ) -> Support:
+        """What the worst errors of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time; with
+        ``joined`` to that of a direction that is made of them."""
         assert isinstance(leg, LiftedSystem)
-        return ExecutionCellSupport(self, control, rows, leg)
+        return over_directions(lambda every: ExecutionCellSupport(self, control, every, leg), rows, leg, joined)
 
     def sampled(self, control: Array, times: Array, directions: Array) -> Array:
         """`added` at times and directions that are asked for again and again."""
@@ -840,10 +961,16 @@ class VaryingExecution(Execution):
             every.append(replace(self, response=response, felt=felt, _lengths={}, _ways={}, _reaching={}))
         return SpreadExecution(self.response, self.breakpoints, self.shares, self.felt, parts, tuple(every))
 
-    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> Support:
+    def over(
+        self,
+        control: Array,
+        rows: Array,
+        leg: LiftedSystem | VaryingMotion | SpreadMotion,
+        joined: Combination | None = None,
+    ) -> Support:
         """`Execution.over`."""
         assert isinstance(leg, VaryingMotion)
-        return VaryingExecutionCellSupport(self, control, rows, leg)
+        return over_directions(lambda every: VaryingExecutionCellSupport(self, control, every, leg), rows, leg, joined)
 
     def reaching(self, control: Array) -> VaryingExecutionCellSupport:
         """What errors of a control can have made of all coefficients, whatever the functional; remembered."""
@@ -1082,9 +1209,16 @@ class SpreadExecution(Execution):
         which = directions[:, -1]
         return [(int(part), np.flatnonzero(which == part)) for part in np.unique(which).tolist()]
 
-    def over(self, control: Array, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> Support:
+    def over(
+        self,
+        control: Array,
+        rows: Array,
+        leg: LiftedSystem | VaryingMotion | SpreadMotion,
+        joined: Combination | None = None,
+    ) -> Support:
         """`Execution.over`."""
         assert isinstance(leg, SpreadMotion)
+        assert joined is None  # refused beside curved sets
         part = self.parts.holding(leg.low, leg.high)
         assert part is not None  # the motion is one within a part
         return SpreadExecutionSupport(self.every[part].reaching(control), rows, leg)
@@ -1259,27 +1393,15 @@ class SpreadExecutionSupport:
         patterns, which = distinct_patterns(ends)
         for position, pattern in enumerate(patterns):
             here, row = np.nonzero(which == position)
-            free = np.flatnonzero(pattern == 0.0)
-            signs = np.array(list(every_choice((-1.0, 1.0), repeat=free.size)))
-            corners = np.tile(pattern, (len(signs), 1))
-            corners[:, free] = signs
+            free, corners = np.flatnonzero(pattern == 0.0), _corners(pattern)
             powers = space.monomials(corners) @ self.motion.recentred  # of the coefficients in all parameters
-            directions = (powers[:, :, None] * self.rows[row][:, None, None, :]).reshape(len(row) * len(signs), -1)
-            bounds = of.execution.enclosed(of.control, np.repeat(times[here], len(signs)), directions)
-            bounds = bounds.reshape(len(row), len(signs), 2)
-            middle, off = bounds.mean(axis=2), (bounds[..., 1] - bounds[..., 0]).max(axis=1) / 2
+            directions = (powers[:, :, None] * self.rows[row][:, None, None, :]).reshape(len(row) * len(corners), -1)
+            bounds = of.execution.enclosed(of.control, np.repeat(times[here], len(corners)), directions)
+            bounds = bounds.reshape(len(row), len(corners), 2)
+            off = (bounds[..., 1] - bounds[..., 0]).max(axis=1) / 2
             bent = sizes[here, row] @ (space.exponents[:, free] * (space.exponents[:, free] - 1)).sum(axis=1)
-            lost = rounding(2 * len(signs) + 8) * np.abs(middle).max(axis=1)
-            excess[here, row] = (off + bent / 2 + len(signs) * lost) * OUTWARD
-            for chosen in every_choice((0, 1), repeat=free.size):
-                found = middle @ signs[:, np.flatnonzero(chosen)].prod(axis=1) / len(signs)
-                exponents = np.zeros(space.nu, dtype=int)
-                exponents[free] = chosen
-                place = space.index.get(tuple(exponents.tolist()))
-                if place is None:  # of more parameters than there are degrees
-                    excess[here, row] += np.abs(found)
-                else:
-                    coefficients[here, row, place] = found
+            coefficients[here, row], beyond = between_corners(space, pattern, bounds.mean(axis=2))
+            excess[here, row] = (off + bent / 2 + beyond) * OUTWARD
         return coefficients, excess
 
     @shaped
@@ -1388,14 +1510,16 @@ class VaryingMeasurable:
         point, pieces = Box(self.middle, self.middle), np.arange(self.response.grid.pieces)
         return DisturbanceModel("piecewise_constant", point, point, self.response.grid, starts=pieces)
 
-    def over(self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion) -> list[Support]:
+    def over(
+        self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion, joined: Combination | None = None
+    ) -> list[Support]:
         """`MeasurableSupport.over`, over a cell of parameters too."""
         assert not isinstance(leg, LiftedSystem)
-        found = [self.errors.over(self.command, rows, leg)]
+        found = [self.errors.over(self.command, rows, leg, joined)]
         if self.resting is not None and isinstance(leg, SpreadMotion):
-            found.append(SpreadSupport.of_disturbance(leg, self.resting, rows, None))
+            found.append(SpreadSupport.of_disturbance(leg, self.resting, rows, joined))
         elif self.resting is not None and isinstance(leg, VaryingMotion):
-            found.append(VaryingSupport.of_disturbance(leg, self.resting, rows, None))
+            found.append(VaryingSupport.of_disturbance(leg, self.resting, rows, joined))
         return found
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:

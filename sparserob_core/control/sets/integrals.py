@@ -68,8 +68,8 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
 def _series(count: int) -> Array:
     """From the coefficients of powers to those of Chebyshev's polynomials, ``(count, count)``."""
     found = np.zeros((count, count))
-    for k in range(count):
-        found[: k + 1, k] = np.polynomial.chebyshev.poly2cheb(np.eye(count)[k, : k + 1])
+    for k, power in enumerate(np.eye(count)):
+        found[: k + 1, k] = np.polynomial.chebyshev.poly2cheb(power[: k + 1])
     return found
 
 

@@ -29,11 +29,10 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     Nothing is solved: this takes milliseconds.
     """
     problem = superposed(problem)  # parameters beside the time are no obstacle
-    if problem.measurable is not None:
+    if problem.measurable is not None and problem.system.parameter_count:
         paths = [entry.set for entry in problem.windows]
-        curved = [one for one in (*paths, *problem.terminal_sets) if one.halfspaces() is None]
-        far = problem.system.parameter_count > 0 and not isinstance(problem.system, VaryingSystem)
-        if far or curved:
+        far = not isinstance(problem.system, VaryingSystem)
+        if far or any(one.halfspaces() is None for one in (*paths, *problem.terminal_sets)):
             over = f"uncertain parameters out of reach ({within_reach(problem)})" if far else "sets with curved sides"
             return (
                 f"{WITHOUT_PROOF}; this problem has {over}. With disturbance_class piecewise_constant it can be proven"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sparserob_core.control.constraints.control import ControlConstraint, Places
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope, cylinder
 from sparserob_core.control.transcription.transcribe import transcribe
@@ -181,6 +181,29 @@ def test_measurable_disturbances_have_slopes_in_parameters_and_directions_too(se
     family = family_of(rng, system, "measurable", sets)
     indices = indices_in(rng, family, 2)
     assert_it_is_the_derivative(family, decision(rng, family, system), indices, some_rows(rng, family, indices))
+
+
+@pytest.mark.parametrize("varies", [False, True], ids=["constant", "in time"])
+def test_errors_of_execution_have_slopes_in_directions_too(varies):
+    rng = np.random.default_rng(4)
+    plant = random_system(rng, states=3)
+    if varies:
+        dressed = [[f"{entry} + 0.1*sin(t)" for entry in row] for row in plant.A]
+        plant = VaryingSystem.of(dressed, np.asarray(plant.B).tolist(), HORIZON)
+    m = plant.controls
+    problem = OptimalControlProblem(
+        system=plant,
+        horizon=HORIZON,
+        initial_state=rng.normal(size=3),
+        control=Box([-1] * m, [1] * m),
+        execution=np.full(m, 0.3),
+        path=[PathConstraint(cylinder(CURVED["disc"], 3))],
+    )
+    (family,) = transcribe(problem, GRIDS["uneven"]).families
+    control = rng.normal(size=m * GRIDS["uneven"].pieces)
+    indices = indices_in(rng, family, 4)
+    x = np.concatenate([control, np.abs(control)])
+    assert_it_is_the_derivative(family, x, indices, np.zeros(4, dtype=int))
 
 
 @settings(max_examples=20, deadline=None)

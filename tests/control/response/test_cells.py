@@ -54,6 +54,11 @@ KINDS: dict[str, dict[str, Any]] = {
         "system": VaryingSystem.of([[0, 1], ["cos(3*t)/2 - 2", "-0.3"]], [[0], ["1/(3 - t)"]], HORIZON, E.tolist()),
         "list": ("piecewise_constant", "piecewise_constant"), "own": OWN,
     },
+    "erring": {"execution": [0.1], "disturbance": BOX},
+    "erring and measurable, in time": {
+        "system": VaryingSystem.of([[0, 1], ["cos(3*t)/2 - 2", "-0.3"]], [[0], ["1/(3 - t)"]], HORIZON, E.tolist()),
+        "execution": [0.1], "disturbance": TRIANGLE, "disturbance_class": "measurable",
+    },
     "of two classes": {"list": ("piecewise_constant", "measurable"), "own": (None, None)},
     "of two classes over turns": {"system": TURNS, "list": ("measurable", "piecewise_constant"), "own": (None, None)},
 }  # fmt: skip
@@ -71,8 +76,7 @@ def program(name: str) -> Any:
         names = "system", "disturbance", "disturbance_class", "disturbance_breakpoints"
         more |= dict(zip(names, joined(more.get("system", PLAIN), every, HORIZON), strict=True))
     path = [*FLAT[:2], *([] if "late" in name else [FLAT[2]])]
-    if "measurable" not in name and "classes" not in name:
-        path.append(PathConstraint(Ellipsoid(np.zeros(2), [[3.0, 0.5], [0.5, 4.0]]), 0.15, 1.85, "curved"))
+    path.append(PathConstraint(Ellipsoid(np.zeros(2), [[3.0, 0.5], [0.5, 4.0]]), 0.15, 1.85, "curved"))
     made = OptimalControlProblem(
         **{"system": PLAIN, "horizon": HORIZON, "initial_state": [-1.0, 0.5], "control": Box([-1.0], [1.0]), **more},
         path=path,

@@ -103,7 +103,7 @@ def test_the_worst_signal_attains_it() -> None:
 )
 def test_it_is_nowhere_above_its_chord_by_more_than_is_said_and_hardly_less(plant: tuple[list, list, list]) -> None:
     found, share, ratios = support(plant), np.linspace(0.0, 1.0, 25), []
-    motion = found.errors[0].motion
+    motion = found.errors.motion
     marks, parts = motion.grid.breakpoints, Supports(tuple(found.over(H, motion)))
     starts = np.concatenate([marks[:-1], marks[:-1] + 0.3 * np.diff(marks)])
     widths = np.concatenate([np.diff(marks), 0.01 * np.diff(marks)])
@@ -125,7 +125,7 @@ def test_bounds_hold_what_coarse_transitions_are_off_by(name: str, monkeypatch: 
         monkeypatch.setattr(expansion, rough, 1.0)
     monkeypatch.setattr(expansion, name, 5)
     coarse = support()
-    motion = coarse.errors[0].motion
+    motion = coarse.errors.motion
     piece, low, high = np.minimum(motion.place(times), motion.origin.size - 1), 0.0, 0.0
     for part in coarse.over(H, motion):
         middle, excess = part.at(times, np.zeros((31, 3, 0)))
@@ -143,7 +143,7 @@ def test_a_box_is_within_its_middle_and_half_its_widths() -> None:
             held = model(VaryingSystem.of(*MATHIEU[:2], HORIZON, MATHIEU[2]), sr.Box(lower, upper)).functionals
             found = held.measurable
             assert isinstance(found, VaryingMeasurable)
-            for m, far, low, high in zip(found.middle, found.errors[0].shares, lower, upper, strict=True):
+            for m, far, low, high in zip(found.middle, found.errors.shares, lower, upper, strict=True):
                 assert Fraction(m) - Fraction(far) <= Fraction(low) and Fraction(high) <= Fraction(m) + Fraction(far)
                 assert Fraction(2 * far) <= Fraction(high) - Fraction(low) + Fraction(
                     4 * np.spacing(max(-low, low, high))

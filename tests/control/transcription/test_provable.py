@@ -45,8 +45,8 @@ def problem(system=KNOWN, kind="measurable", **more):
     [
         (lambda: problem(uncertain(stiff, 1e7)), "uncertain parameters out of reach"),
         (lambda: problem(uncertain(lambda p: np.eye(2) * (p[0] > 1))), "uncertain parameters out of reach"),
-        (lambda: problem(terminal=[ROUND]), "curved"),
-        (lambda: problem(path=[ROUND]), "curved"),
+        (lambda: problem(OSCILLATOR, terminal=[ROUND]), "curved"),
+        (lambda: problem(OSCILLATOR, path=[ROUND]), "curved"),
         (lambda: problem(uncertain(lambda p: np.eye(2) * (p[0] > 1)), "piecewise_constant"), "branch"),
     ],
 )
@@ -61,6 +61,7 @@ def test_what_can_never_be_proven_is_known_at_once(made, named):
     [
         problem,
         lambda: problem(KNOWN, "piecewise_constant", terminal=[ROUND]),
+        lambda: problem(terminal=[ROUND], path=[ROUND]),
         lambda: problem(OSCILLATOR, "piecewise_constant"),
         lambda: problem(OSCILLATOR),
     ],
