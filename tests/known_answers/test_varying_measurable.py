@@ -401,15 +401,9 @@ def test_a_constant_plant_costs_the_same_as_a_function_of_time(more: str, tmp_pa
     assert costs[1] == pytest.approx(costs[0], rel=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"policy": {"name": "affine"}}, "a system that stays the same with time under measurable disturbances"),
-    ],
-    ids=["feedback"],
-)
-def test_what_is_not_proven_beside_them_is_refused_by_name(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
-    config = {"dictionaries": {"control": pieces(4)}, "observers": [], **changes}
-    config["problem"] = {**CART, **changes.get("problem", {})}
-    with pytest.raises(sr.InputError, match=said):
+def test_two_classes_are_refused_by_name_where_a_control_answers(tmp_path: Path) -> None:
+    config: Problem = {"dictionaries": {"control": pieces(4)}, "observers": [], "policy": {"name": "affine"}}
+    config["problem"] = {key: value for key, value in CART.items() if key != "disturbance_class"}
+    of_two_classes(config)
+    with pytest.raises(sr.InputError, match="disturbance of one class, piecewise_constant or measurable"):
         sr.run(config, out=tmp_path / "run", figures=False)

@@ -283,8 +283,21 @@ CHANGING = {
         np.array([[0.0, 1.0], [0.0, 0.0]]), FORCE, FORCE, np.linspace(0.0, 2.0, 4), np.linspace(0.0, 2.0, 4),
         np.array([-1.0, 0.5]), None, TRIANGLE, rate="1 + 0*t", factor="1 + 0*t",
     ),
+    "measurable in t": Changing(
+        SLOW, FORCE, GUST, np.array([0.0, 0.5, 0.7, 1.5, 2.0]), np.array([0.0, 1.0, 2.0]), np.array([-1.0, 0.5]),
+        Box(np.array([-0.1, 0.0]), np.array([0.2, 0.1])), Box(np.array([-0.1, -0.05]), np.array([0.05, 0.1])),
+        c=np.array([0.1, -0.3]), measurable=True, fine=20, rate="1 + t", grown="t + t^2/2", factor="cos(3*t)",
+    ),
+    "measurable in a triangle in t": Changing(
+        FAST, FORCE, GUST, np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0, 0.0]), TRIANGLE,
+        measurable=True, fine=40, rate="exp(-t)", grown="1 - exp(-t)", factor="exp(-t)",
+    ),
 }  # fmt: skip
 LOOPS.update(CHANGING)
 STILL = [name for name, loop in LOOPS.items() if not loop.measurable and name not in CHANGING]
 EXACT = [*STILL, "turning", pytest.param("fading", marks=pytest.mark.slow)]
-MEASURABLE = [name for name, loop in LOOPS.items() if loop.measurable]
+STEADY = [name for name, loop in LOOPS.items() if loop.measurable and name not in CHANGING]
+MEASURABLE = [
+    *STEADY,
+    *(pytest.param(name, marks=pytest.mark.slow) for name, loop in CHANGING.items() if loop.measurable),
+]

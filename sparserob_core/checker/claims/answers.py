@@ -22,10 +22,11 @@ from sparserob_core.checker.reach.measurable import LoopBeside, MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
+from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along
 from sparserob_core.control.problem.disturbances import apart
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import SwitchedSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -93,7 +94,7 @@ class Answers:
         if case.problem.system.parameter_count:
             raise Unchecked("the checker knows feedback and measurable disturbances of known systems only")
         system = case.problem.system
-        one = isinstance(system, LinearSystem) and not system.delay
+        one = not isinstance(system, SwitchedSystem) and not system.delay
         if case.answering and case.measurable and not one:
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
         if case.answering and not case.alike:
@@ -122,9 +123,10 @@ class Answers:
             return LoopBeside(
                 *parts, beside=MeasurableLoop.alone(case.problem, parts[4], parts[5], case.control.pieces)
             )
+        measurable = case.measurable and changes is None
         if isinstance(case.changing, VaryingFlow):
-            return VaryingLoop(*parts, law=case.changing)
-        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(*parts)
+            return (VaryingMeasurableLoop if measurable else VaryingLoop)(*parts, law=case.changing)
+        return (MeasurableLoop if measurable else ClosedLoop)(*parts)
 
     @cached_property
     def commands(self) -> list[arb_mat]:

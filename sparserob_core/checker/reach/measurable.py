@@ -157,7 +157,7 @@ class Kernel:
         ends = np.where(np.arange(count) < last, 1.0, 2.0 * min(place - last, 1.0) - 1.0)[: last + 1]
         low, high, lost = np.zeros(len(size)), np.zeros(len(size)), np.zeros(len(size))
         begun = [part[:, : last + 1].reshape(-1, *part.shape[2:]) for part in (plain, off, large)]
-        off = begun[1] + rounding(off.shape[2] + 2 * ORDER + 8) * begun[2]
+        off = begun[1] + rounding(off.shape[2] + 2 * self.coefficients.shape[1] + 6) * begun[2]
         for side in sides:
             every = side.swept(begun[0], off, begun[2], np.tile(ends, len(size)))
             *bounds, tops = (one.reshape(len(size), -1) for one in every)
@@ -274,7 +274,7 @@ class MeasurableLoop(ClosedLoop):
 
     @cached_property
     def starts(self) -> list[int]:
-        d = self.parts["A"].nrows()
+        d = self.system.states
         return [0, *accumulate([d] * (self.blocks + (self.initial is not None)))]
 
     @cached_property
@@ -316,7 +316,7 @@ class MeasurableLoop(ClosedLoop):
             left = later[1] if later[0] == k else self._identity
             if k + 1 < K:
                 found[k + 1][piece] = left
-            later = k, left * self._held(self.grid[piece], self.grid[piece + 1])[0]
+            later = k, left * self._passed(piece)[0]
         return found
 
     def _entered(self, rows: list[list[arb]], block: int, E: arb_mat) -> None:
@@ -333,12 +333,12 @@ class MeasurableLoop(ClosedLoop):
         """The nominal state and every response at a time in a piece of the grid, before what happens in it counts."""
         if time == self.grid[piece]:
             return self.nodes[piece]
-        Phi, Gamma = self._held(self.grid[piece], time)
-        return Phi * self.nodes[piece] + Gamma * self.drives[piece]
+        Phi, added = self._moved(piece, self.grid[piece], time)
+        return Phi * self.nodes[piece] + added
 
     @cached_property
     def radii(self) -> Array:
-        d = self.parts["A"].nrows()
+        d = self.system.states
         axes = np.vstack([np.eye(d), -np.eye(d)])
         exact = Enclosed(axes, np.zeros_like(axes))
         alike: dict[int, Array] = {}
@@ -359,7 +359,7 @@ class MeasurableLoop(ClosedLoop):
         """`support` of several, ``(n, Q)``."""
         from flint import arb
 
-        d, blocks = self.parts["A"].nrows(), self.blocks
+        d, blocks = self.system.states, self.blocks
         table = Enclosed.of(stacked(every))
         mid, rad = (part[:, : blocks * d].reshape(len(every), blocks, d) for part in (table.mid, table.rad))
         rad = np.where(rad > 1e-290, rad, 0.0)  # of exact zeros
@@ -395,17 +395,23 @@ class MeasurableLoop(ClosedLoop):
         found = super().highest(piece, time, rows, beside)
         if time == self.grid[piece]:
             return found
-        share = float(((arb(time) - arb(self.grid[piece])) / (arb(self.grid[piece + 1]) - arb(self.grid[piece]))).mid())
-        added = self.kernel(piece).most(_enclosed(rows), self.sides, min(share, 1.0))
+        added = self.under_way(piece, time, rows)
         return [one + arb(m, r) for one, m, r in zip(found, added.mid.tolist(), added.rad.tolist(), strict=True)]
+
+    def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
+        """What disturbances on a piece make of ``rows (r, d)`` at most until a time in it."""
+        from flint import arb
+
+        share = float(((arb(time) - arb(self.grid[piece])) / (arb(self.grid[piece + 1]) - arb(self.grid[piece]))).mid())
+        return self.kernel(piece).most(as_enclosed(rows), self.sides, min(share, 1.0))
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """As of `ClosedLoop`; what the piece itself adds is the integral of a Lipschitz function."""
-        steep = self.kernel(piece).steepest(_enclosed(rows), self.sides)
+        steep = self.kernel(piece).steepest(as_enclosed(rows), self.sides)
         return np.asarray(super().bent(piece, start, stop, rows) + (stop - start) ** 2 / 8.0 * steep * OUTWARD)
 
 
-def _enclosed(rows: Array | arb_mat) -> Enclosed:
+def as_enclosed(rows: Array | arb_mat) -> Enclosed:
     """Rows of floats, or of balls."""
     return Enclosed(rows, np.zeros_like(rows)) if isinstance(rows, np.ndarray) else Enclosed.of(rows)
 

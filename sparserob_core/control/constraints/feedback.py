@@ -151,7 +151,7 @@ class FeedbackConstraint(Source):
         within = self.loop.measurable
         if within is not None:
             for rows, pieces in self._halves(indices[:, 0]):
-                found[:, rows] += within.within(indices[:, 0], self.flat.H[rows], pieces)
+                found[:, rows] += within.within(indices[:, 0], self.flat.H[rows], self.loop.origin[pieces])
         return found
 
     def _halves(self, times: Array) -> list[tuple[slice, np.ndarray]]:

@@ -100,6 +100,11 @@ class ClosedLoop:
         return self.functionals.response.grid if self.motion is None else self.motion.grid
 
     @cached_property
+    def origin(self) -> np.ndarray:
+        """The piece of the grid of control and disturbance that each of these is in, ``(L,)``."""
+        return np.arange(self.grid.pieces) if self.motion is None else self.motion.origin
+
+    @cached_property
     def steps(self) -> Steps:
         """Matrices and transitions of the system."""
         return self.functionals.response.steps(KNOWN)
@@ -172,8 +177,7 @@ class ClosedLoop:
     def inputs(self, x: Array) -> Array:
         """What acts on the pieces of the grid, nominally and as answers: control, drift and disturbance, ``(L, m + mw,
         1 + Q)``."""
-        grid, m = self.grid, self.answers.shape[1]
-        origin = slice(None) if self.motion is None else self.motion.origin
+        grid, m, origin = self.grid, self.answers.shape[1], self.origin
         nominal = np.concatenate([grid.inputs(self.nominal(x)).T[:, :, None], self.middles[origin, :, None]], axis=1)
         acts, entries = grid.control_piece >= 0, self.entries[origin]
         answered = np.zeros((*nominal.shape[:2], entries.shape[2]))
@@ -201,10 +205,11 @@ class ClosedLoop:
                 Phi, Gamma, which = motion.flow.state, motion.inputs, motion.every
             nodes = np.zeros((drives.shape[0] + 1, self.start.size, drives.shape[2]))
             nodes[0] = np.column_stack([self.start, self.begins])
+            over = np.append(np.diff(self.origin) > 0, True)
             for piece, length in enumerate(which.tolist()):
                 nodes[piece + 1] = Phi[length] @ nodes[piece] + Gamma[length] @ drives[piece]
-                if self.measurable is not None:
-                    place, outward = self.measurable.at(piece)
+                if self.measurable is not None and over[piece]:
+                    place, outward = self.measurable.at(int(self.origin[piece]))
                     nodes[piece + 1, :, 1:][:, place] += outward
             while len(self._paths) > 1:
                 self._paths.pop(next(iter(self._paths)))
@@ -274,9 +279,10 @@ class ClosedLoop:
         if self.motion is not None and not computed:
             lost += (np.abs(H) @ self._left_out(x, self.motion)[pieces][:, :, None])[:, :, 0]
         if self.measurable is not None:
-            inside = (self.measurable.within(end, H, pieces) for end in (lower, upper))
+            under_way = self.origin[pieces]
+            inside = (self.measurable.within(end, H, under_way) for end in (lower, upper))
             found = [value + more for value, more in zip(found, inside, strict=True)]
-            lost += self.measurable.allowance(lower, upper, H, pieces) + MISSED * (size @ radii)
+            lost += self.measurable.allowance(lower, upper, H, under_way) + MISSED * (size @ radii)
         most = np.maximum(*found) + late + lost
         return np.where(np.isnan(most), np.inf, most), late
 
@@ -308,7 +314,11 @@ class ClosedLoop:
         """What the transitions of a system that changes with time may be off by, on every piece, ``(L, d)``."""
         nodes, inputs = self.path(x)
         radii = np.concatenate([[1.0], self.spread.radii])
-        return motion.left_out(np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii)[:, None])
+        begun, pushed = np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii)[:, None]
+        if self.measurable is not None:
+            under_way, driven = self.measurable.reached
+            begun, pushed = begun + under_way, np.concatenate([pushed, driven], axis=2)
+        return motion.left_out(begun, pushed)
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
         """A deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""
@@ -330,7 +340,7 @@ class ClosedLoop:
         on piece ``acting`` may stand beside it."""
         if self.measurable is not None:
             beside = None if acting is None else np.array([acting])
-            over = int(self.seen_from(np.array([time]), beside)[0])
+            over = int(self.origin[self.seen_from(np.array([time]), beside)[0]])
             return self.measurable.signal(deviation, time, direction, over)
         return self.functionals.response.grid.breakpoints, (self.entries @ (self.spread.middle + deviation)).T
 
@@ -364,7 +374,7 @@ class ClosedLoop:
         g = table_of(rows, columns, on_control[rows, columns], (count, self.variables))
         d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
         if self.measurable is not None:
-            pieces = self.seen_from(np.full(count, time), acting)
+            pieces = self.origin[self.seen_from(np.full(count, time), acting)]
             d[:, : self.measurable.size] = self.measurable.weights(time, H[firsts], pieces[firsts])
             for piece in np.unique(pieces):
                 rows = pieces == piece

@@ -62,7 +62,7 @@ def _measurable(response: Response, control: Dictionary, pieces: MeasurablePiece
     """The same of what measurable disturbances make of the state at the end of every piece."""
     grid, K = response.grid, control.pieces
     ends = control.breakpoints[grid.control_piece + 1]
-    flows = response.flows(ends - grid.breakpoints[1:])[0]
+    flows = pieces.carried(np.arange(grid.pieces), ends)
     D = np.zeros((K, response.initial_state.size, pieces.size))
     for piece in range(grid.pieces):
         if grid.control_piece[piece] + 1 < K:

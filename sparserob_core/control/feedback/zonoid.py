@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from math import comb
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -64,35 +65,76 @@ class Arc:
 
 @final
 @dataclass(frozen=True, eq=False)
+class Pushes:
+    """What a disturbance at any time of a piece makes of the state at its end, ``K (d, mw)``: polynomials ``terms (S, p
+    + 1, d, mw)`` of ``u`` from -1 to 1 across each part, between ``ends (S + 1,)``, times that are left of the piece,
+    from 0 on."""
+
+    terms: Array
+    ends: Array
+
+    @staticmethod
+    def of(A: Array, E: Array, length: float) -> Pushes:
+        """``e^{A r} E`` for ``r`` from 0 to a length, on equal parts."""
+        count = _parts(A, length)
+        half, term = length / count / 2.0, E
+        flows = exponential(A * ((np.arange(count) + 0.5) * (2.0 * half))[:, None, None])
+        found = []
+        for order in range(_degree(float(np.linalg.norm(A, 2)) * half) + 1):
+            found.append(flows @ term)
+            term = A @ term * (half / (order + 1))
+        return Pushes(np.stack(found, axis=1), np.linspace(0.0, length, count + 1))
+
+    @staticmethod
+    def joined(kernels: Sequence[Array], ends: Array, counts: Sequence[int]) -> Pushes:
+        """Of polynomials ``(q + 1, d, mw)`` of the share from 0 to 1 of intervals between ``ends (n + 1,)``, which are
+        the pushes times an interval's length: on so many equal parts of each, without terms that do not show."""
+        terms, cuts = [], [ends[:1]]
+        for kernel, low, high, count in zip(kernels, ends[:-1], ends[1:], counts, strict=True):
+            every = np.einsum("skj,jdw->skdw", _across(len(kernel), count), kernel) / (high - low)
+            terms.append(every)
+            cuts.append(low + (high - low) * np.arange(1, count + 1) / count)
+        most = max(len(kernel) for kernel in kernels)
+        found = np.concatenate([np.pad(one, ((0, 0), (0, most - one.shape[1]), (0, 0), (0, 0))) for one in terms])
+        sizes = np.abs(found).max(axis=(0, 2, 3))
+        shown = np.flatnonzero(sizes > REST * sizes.max(initial=0.0))
+        return Pushes(found[:, : 1 + int(shown.max(initial=0))], np.concatenate(cuts))
+
+    @cached_property
+    def halves(self) -> Array:
+        """Half the length of every part, ``(S,)``."""
+        return np.diff(self.ends) / 2.0
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Zonoid(ConvexSet):
-    """``Z`` of a piece of a length in coordinates ``into (r, d)`` of the state: ``K(r) = into e^{A r} E``, with the
-    `corners` of ``W`` in ``parts``. ``outward (d, r)`` brings the coordinates back; the set is about round in them.
+    """``Z`` of a piece in coordinates ``into (r, d)`` of the state, from what a disturbance makes of that (``pushes``),
+    with the `corners` of ``W`` in ``parts``. ``outward (d, r)`` brings the coordinates back; the set is about round in
+    them.
 
     Times count backwards, from the end of the piece.
     """
 
-    A: Array
-    E: Array
-    length: float
+    pushes: Pushes
     parts: tuple[Array, ...]
     into: Array
     outward: Array
 
     @staticmethod
-    def of(A: Array, E: Array, length: float, bound: ConvexSet) -> Zonoid:
+    def of(pushes: Pushes, bound: ConvexSet) -> Zonoid:
         """The set of one piece, in the coordinates in which the ellipsoid of its second moments is a ball."""
-        parts = tuple(corners(bound))
+        parts, (d, mw) = tuple(corners(bound)), pushes.terms.shape[2:]
         nodes, weights = np.polynomial.legendre.leggauss(32)
-        count = _parts(A, length)
-        times = (np.arange(count)[:, None] + (nodes + 1.0) / 2.0).ravel() * (length / count)
-        share = np.tile(weights, count) * (length / count / 2.0)
-        reach = np.zeros(E.shape[1]) if not parts else np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
-        pushes = exponential(A * times[:, None, None]) @ (E * reach)
-        moments = (pushes * np.sqrt(share)[:, None, None]).transpose(1, 0, 2).reshape(A.shape[0], -1)
+        share = weights * pushes.halves[:, None]
+        reach = np.zeros(mw) if not parts else np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
+        powers = nodes[:, None] ** np.arange(pushes.terms.shape[1])
+        pushed = np.einsum("np,spdw->sndw", powers, pushes.terms) * reach
+        moments = (pushed * np.sqrt(share)[:, :, None, None]).reshape(-1, d, mw).transpose(1, 0, 2).reshape(d, -1)
         U, sizes, _ = np.linalg.svd(moments, full_matrices=False)
         kept = sizes > NEGLIGIBLE * sizes.max(initial=0.0)
         U, sizes = U[:, kept], sizes[kept]
-        return Zonoid(A, E, length, parts, (U / sizes).T, U * sizes)
+        return Zonoid(pushes, parts, (U / sizes).T, U * sizes)
 
     @property
     def dimension(self) -> int:
@@ -114,7 +156,10 @@ class Zonoid(ConvexSet):
     def _chords(self) -> tuple[Array, Array]:
         """The chords through 0 along the axes, of which every program asks."""
         axes = np.eye(self.dimension)
-        return super().chord(np.zeros_like(axes), axes)
+        if not self.is_symmetric:
+            return super().chord(np.zeros_like(axes), axes)
+        high = 1.0 / self._boundary(np.zeros_like(axes), axes)[0]
+        return -high, high
 
     @property
     def is_symmetric(self) -> bool:
@@ -124,57 +169,45 @@ class Zonoid(ConvexSet):
     def kind(self) -> str:
         return "set of what a measurable disturbance does on a piece"
 
-    @cached_property
+    @property
     def count(self) -> int:
-        """How many parts the piece is cut into, of equal length."""
-        return _parts(self.A, self.length)
+        """How many parts the piece is cut into."""
+        return int(self.pushes.ends.size - 1)
 
-    @cached_property
-    def degree(self) -> int:
-        """Of the polynomials."""
-        term, reach = 1.0, float(np.linalg.norm(self.A, 2)) * self.length / self.count / 2.0
-        for order in range(1, DEGREE):
-            term *= reach / order
-            if term <= REST:
-                return order
-        return DEGREE
+    @property
+    def channels(self) -> int:
+        """How many entries a disturbance has."""
+        return int(self.pushes.terms.shape[3])
 
     @cached_property
     def coefficients(self) -> Array:
         """``K`` on every part as a polynomial of ``u`` from -1 to 1 across it, ``(S, p + 1, r, mw)``."""
-        half = self.length / self.count / 2.0
-        middles = (np.arange(self.count) + 0.5) * (2.0 * half)
-        flows = exponential(self.A * middles[:, None, None])
-        found, term = [], self.E
-        for order in range(self.degree + 1):
-            found.append(self.into @ flows @ term)
-            term = self.A @ term * (half / (order + 1))
-        return np.stack(found, axis=1)
+        return np.asarray(self.into @ self.pushes.terms)
 
     @cached_property
     def integrals(self) -> Array:
         """The integral of the `coefficients` over time from the middle of a part, ``(S, p + 2, r, mw)``."""
-        half = self.length / self.count / 2.0
-        orders = np.arange(1, self.degree + 2)[:, None, None]
-        return np.concatenate([np.zeros_like(self.coefficients[:, :1]), half * self.coefficients / orders], axis=1)
+        orders, halves = np.arange(1, self.coefficients.shape[1] + 1), self.pushes.halves
+        found = halves[:, None, None, None] * self.coefficients / orders[:, None, None]
+        return np.concatenate([np.zeros_like(self.coefficients[:, :1]), found], axis=1)
 
     @cached_property
     def across(self) -> Array:
         """The integral over every part, ``(S, r, mw)``."""
-        signs = (-1.0) ** np.arange(self.degree + 2)
+        signs = (-1.0) ** np.arange(self.integrals.shape[1])
         return np.asarray((self.integrals * (1.0 - signs)[:, None, None]).sum(axis=1))
 
     @cached_property
     def nodes(self) -> Array:
         """``K`` at the ends of the parts, ``(S + 1, r, mw)``."""
-        signs = (-1.0) ** np.arange(self.degree + 1)
+        signs = (-1.0) ** np.arange(self.coefficients.shape[1])
         first = (self.coefficients[0] * signs[:, None, None]).sum(axis=0)
         return np.concatenate([first[None], self.coefficients.sum(axis=1)])
 
     @cached_property
     def bend(self) -> Array:
         """Bounds of the second derivatives of ``K`` by ``u`` on every part, ``(S, r, mw)``."""
-        orders = np.arange(self.degree + 1)
+        orders = np.arange(self.coefficients.shape[1])
         return np.asarray((np.abs(self.coefficients) * (orders * (orders - 1))[:, None, None]).sum(axis=1))
 
     def support(self, directions: Array) -> Array:
@@ -199,17 +232,17 @@ class Zonoid(ConvexSet):
         functions and of the middle (Caratheodory)."""
         every, shares = self._made_of(points)
         return [
-            _mean([self.best(a) for a in directions[share > 0.0]], share[share > 0.0], self.E.shape[1])
+            _mean([self.best(a) for a in directions[share > 0.0]], share[share > 0.0], self.channels)
             for directions, share in zip(every, shares, strict=True)
         ]
 
     def best(self, direction: Array) -> Arc:
         """The signal that attains the support function of a direction ``(r,)``."""
         made = [self._swept(part, direction[None]).arc() for part in self.parts]
-        return _mean(made, np.ones(len(made)), self.E.shape[1])
+        return _mean(made, np.ones(len(made)), self.channels)
 
     def _chunks(self, size: int, part: Array) -> Iterator[slice]:
-        step = max(1, HELD // ((self.count + 1) * max(self.E.shape[1], part.shape[0])))
+        step = max(1, HELD // ((self.count + 1) * max(self.channels, part.shape[0])))
         return (slice(first, first + step) for first in range(0, size, step))
 
     def _swept(self, part: Array, directions: Array) -> _Sweep:
@@ -309,18 +342,39 @@ class _Sweep:
     def arc(self) -> Arc:
         """The signal of the first direction."""
         _, s, low, high, best = self.cells
-        count = self.zonoid.count
-        clean = np.flatnonzero(self.clean[0])
-        stop = np.concatenate([clean + 1.0, s + (high + 1.0) / 2.0])  # backwards in time
-        start = np.concatenate([clean + 0.0, s + (low + 1.0) / 2.0])
+        ends = self.zonoid.pushes.ends
+        clean, halves, begins = np.flatnonzero(self.clean[0]), np.diff(ends) / 2.0, ends[:-1]
+        stop = np.concatenate([ends[clean + 1], begins[s] + halves[s] * (high + 1.0)])  # backwards in time
+        start = np.concatenate([begins[clean], begins[s] + halves[s] * (low + 1.0)])
         which = np.concatenate([self.best[0, clean], best])
         order = np.argsort(-stop)
-        return Arc(1.0 - start[order] / count, self.part[which[order]])
+        return Arc(1.0 - start[order] / ends[-1], self.part[which[order]])
 
 
 def _parts(A: Array, length: float) -> int:
     speed = min(float(np.linalg.norm(A, 2)), MOST_PARTS / max(length, 1e-300))
     return int(np.clip(np.ceil(speed * length / FAST), PARTS, MOST_PARTS))
+
+
+def _degree(reach: float) -> int:
+    """Of polynomials that stand for an exponential, whose exponent goes from ``-reach`` to ``reach``."""
+    term = 1.0
+    for order in range(1, DEGREE):
+        term *= reach / order
+        if term <= REST:
+            return order
+    return DEGREE
+
+
+def _across(size: int, count: int) -> Array:
+    """From coefficients ``(size,)`` of powers of a share of an interval from 0 to 1 to those of powers of ``u`` from -1
+    to 1 across each of ``count`` equal parts, ``(count, size, size)``."""
+    found, orders = np.zeros((count, size, size)), np.arange(size)
+    for j in range(size):
+        binomials = np.array([comb(j, k) for k in range(j + 1)], dtype=float)
+        middles = (np.arange(count)[:, None] + 0.5) / count
+        found[:, : j + 1, j] = binomials * middles ** (j - orders[: j + 1]) * (0.5 / count) ** orders[: j + 1]
+    return found
 
 
 def _apart(left: Array, right: Array, bent: Array, spare: Array | float) -> np.ndarray:

@@ -103,7 +103,7 @@ class VaryingMotion:
     @cached_property
     def norm(self) -> float:
         """The largest norm of ``A``, in its own units."""
-        return float(self._paces.max())
+        return float(self.paces.max())
 
     @property
     def terms(self) -> int:
@@ -250,7 +250,7 @@ class VaryingMotion:
     def grown(self, pieces: np.ndarray, width: Array, sizes: Array) -> Array:
         """What states of at most ``sizes (k, d)`` may become within a ``width (k,)`` of a piece, ``(k, d)``: by the
         exponential of the largest entries of ``A`` there."""
-        most, pace = self.most[pieces][:, :, : self.states], self._paces[pieces] * width
+        most, pace = self.most[pieces][:, :, : self.states], self.paces[pieces] * width
         units = self.expansion.units * self.expansion.ratios[self._segments[pieces]]
         total, term = sizes.astype(float), sizes.astype(float)
         for n in range(1, GROWN):
@@ -333,7 +333,8 @@ class VaryingMotion:
         return np.asarray(self._bounds[2][self._segments])
 
     @cached_property
-    def _paces(self) -> Array:
+    def paces(self) -> Array:
+        """The norm of ``A`` in own units on every piece, ``(K,)``."""
         return np.asarray(self._bounds[3][self._segments])
 
     @cached_property

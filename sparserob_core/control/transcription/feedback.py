@@ -266,7 +266,6 @@ def refuse(
         and problem.system.delay > 0.0,
         "single linear system under measurable disturbances, without pieces": measurable
         and bool(problem.system.switches),
-        "system that stays the same with time under measurable disturbances": measurable and problem.system.varies,
         "whole state that is measured without noise where a plan with a control_step repeats": bool(problem.repeat)
         and problem.control_step is not None
         and problem.measurements is not None,

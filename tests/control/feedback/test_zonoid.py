@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from sparserob_core.checker.reach.flow import OwnUnits, stacked
 from sparserob_core.checker.reach.measurable import Kernel, Side
 from sparserob_core.checker.sets.polynomials import Enclosed
-from sparserob_core.control.feedback.zonoid import Zonoid, _apart
+from sparserob_core.control.feedback.zonoid import Pushes, Zonoid, _apart
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -41,7 +41,7 @@ def effect(A: Array, E: Array, length: float, ends: Array, values: Array) -> Arr
 
 def test_the_support_of_a_force_on_a_double_integrator_is_in_closed_form() -> None:
     """``int_0^l |a_1 r + a_2| dr`` with a root at ``-a_2 / a_1`` where that is within the piece."""
-    length, found = 0.8, Zonoid.of(DOUBLE, FORCE, 0.8, Box([-1.0], [1.0]))
+    length, found = 0.8, Zonoid.of(Pushes.of(DOUBLE, FORCE, 0.8), Box([-1.0], [1.0]))
     rng = np.random.default_rng(0)
     for a in rng.normal(size=(50, 2)):
         root = float(np.clip(-a[1] / a[0], 0.0, length))
@@ -53,7 +53,7 @@ def test_the_support_of_a_force_on_a_double_integrator_is_in_closed_form() -> No
 @pytest.mark.parametrize("name", CASES)
 def test_the_support_function_is_the_integral_of_that_of_the_disturbance(name: str) -> None:
     A, E, length, bound = CASES[name]
-    found, count = Zonoid.of(A, E, length, bound), 20_000
+    found, count = Zonoid.of(Pushes.of(A, E, length), bound), 20_000
     step, K = expm(A * length / count), [expm(A * length / count / 2) @ E]
     for _ in range(count - 1):
         K.append(step @ K[-1])
@@ -67,7 +67,7 @@ def test_the_support_function_is_the_integral_of_that_of_the_disturbance(name: s
 @pytest.mark.parametrize("name", CASES)
 def test_the_signal_of_a_direction_attains_the_support_function_and_no_sampled_signal_exceeds_it(name: str) -> None:
     A, E, length, bound = CASES[name]
-    found, rng = Zonoid.of(A, E, length, bound), np.random.default_rng(2)
+    found, rng = Zonoid.of(Pushes.of(A, E, length), bound), np.random.default_rng(2)
     for a in rng.normal(size=(3, found.dimension)):
         best = found.best(a)
         assert (bound.violation(best.values + bound.middle()) <= 1e-12).all()
@@ -85,7 +85,7 @@ def test_the_signal_of_a_direction_attains_the_support_function_and_no_sampled_s
 )
 def test_every_point_of_the_set_has_an_admissible_signal(name: str) -> None:
     A, E, length, bound = CASES[name]
-    found, rng = Zonoid.of(A, E, length, bound), np.random.default_rng(3)
+    found, rng = Zonoid.of(Pushes.of(A, E, length), bound), np.random.default_rng(3)
     extreme = found.support_point(rng.normal(size=(6, found.dimension)))
     points = np.vstack([rng.dirichlet(np.ones(6), 3) @ extreme, np.zeros((1, found.dimension)), extreme[:1]])
     for point, made in zip(points, found.signals(points), strict=True):
@@ -95,9 +95,9 @@ def test_every_point_of_the_set_has_an_admissible_signal(name: str) -> None:
 
 
 def test_a_direction_that_nothing_pushes_is_no_coordinate() -> None:
-    found = Zonoid.of(-np.eye(2), np.ones((2, 1)), 1.0, Box([-0.2], [0.2]))
+    found = Zonoid.of(Pushes.of(-np.eye(2), np.ones((2, 1)), 1.0), Box([-0.2], [0.2]))
     assert found.dimension == 1
-    assert Zonoid.of(SPRING, np.eye(2), 1.0, Box([0.5, 0.0], [0.5, 0.0])).dimension == 0
+    assert Zonoid.of(Pushes.of(SPRING, np.eye(2), 1.0), Box([0.5, 0.0], [0.5, 0.0])).dimension == 0
 
 
 def test_a_chord_less_a_parabola_is_the_whole_truth_of_convex_quadratics() -> None:
@@ -121,7 +121,7 @@ def test_a_chord_less_a_parabola_is_the_whole_truth_of_convex_quadratics() -> No
 def test_the_support_function_is_that_of_the_checker_to_all_digits(name: str) -> None:
     """Whose enclosure is another algorithm, in balls: no quadrature is as good."""
     A, E, length, bound = CASES[name]
-    found = Zonoid.of(A, E, length, bound)
+    found = Zonoid.of(Pushes.of(A, E, length), bound)
     a = np.random.default_rng(4).normal(size=(40, found.dimension))
     with ctx.workprec(96):
         balls = [stacked([[arb(float(v)) for v in row] for row in matrix]) for matrix in (A, E)]

@@ -104,33 +104,14 @@ class VaryingExecution:
         return float(low[0]), float(high[0])
 
     def bent(self, c: Array, start: float, stop: float) -> float:
-        """How far `added` may be above its chord on ``[start, stop]``, which lies within one piece and one segment.
-
-        An integrand that began before is ``|c'Phi(t, start) y|``, above its chord by no more than ``c'Phi(t, start) y``
-        is from its own: its terms ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What begins within the
-        cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
-        """
-        d, m, width = c.size, self.columns, (stop - start) * (1.0 + rounding(2))
+        """How far `added` may be above its chord on ``[start, stop]``, which lies within one piece and one segment."""
+        d = c.size
         begun = self._summed(np.eye(d), start)[1]
         if self.side is not None:
             begun = np.maximum(begun, self._summed(-np.eye(d), start)[1])
-        terms, rest = self.law.within(start, stop, ORDER)
-        line, total = stacked([balls(c)]), 0.0
-        for n, term in enumerate([*terms[2:], rest], 2):
-            found = Enclosed.of(line * stacked([row[:d] for row in term.tolist()]))
-            factor = 2.0 if n == len(terms) else (n - 1) * n ** (-n / (n - 1))
-            total += factor * float((np.abs(found.mid) + found.rad)[0] @ begun)
         place = min(max(0, int(np.searchsorted(self.breakpoints, start, side="right")) - 1), len(self.pieces) - 1)
         size = (self.sizes.mid[place] + self.sizes.rad[place]) * self.far
-        if size.any():
-            (most, slope), units = self.law.most(start, stop), np.array(self.law.units_on(start, stop))
-            entering = slice(d + self.first, d + self.first + m)
-            A, B = most[:, :d], most[:, entering]
-            pace = float((A * units / units[:, None]).sum(axis=1).max())
-            grown = np.exp(pace * width) * units * ((B @ size) / units).max()
-            second = (slope[:, entering] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ grown
-            total += width**2 / 8.0 * float(np.abs(c) @ second)
-        return total * OUTWARD * (1.0 + rounding(8 * d * d))
+        return float(above_chord(self.law, c[None], start, stop, begun, size, self.first)[0])
 
     def _summed(self, rows: Array, time: float) -> tuple[Array, Array]:
         """What errors add along ``rows (n, d)`` at a time, at least and at most, ``(n,)``."""
@@ -199,21 +180,10 @@ class VaryingExecution:
     def _kernel(self, start: float, stop: float) -> Enclosed:
         """That of an interval, in powers of ``u`` from -1 to 1 across it, ``(p + 1, d, m)``."""
         if (start, stop) not in self._kernels:
-            from flint import arb, arb_poly
-
-            m, terms = self.columns, self.law.kernel(start, stop)
-            half = arb_poly([arb(1) / 2, arb(1) / 2])
-            d = terms[0].nrows()
-            columns = range(self.first, self.first + m)
-            every = [[arb_poly([one[i, j] for one in terms])(half).coeffs() for j in columns] for i in range(d)]
-            none = arb(0)
-            found = [
-                stacked([[entry[k] if k < len(entry) else none for entry in row] for row in every])
-                for k in range(len(terms))
-            ]
+            terms = pushes(self.law, start, stop, range(self.first, self.first + self.columns))
             if len(self._kernels) >= TIMES_KEPT:
                 self._kernels.clear()
-            self._kernels[start, stop] = Enclosed.all(found, (len(terms), d, m))
+            self._kernels[start, stop] = Enclosed.all(terms, (len(terms), terms[0].nrows(), self.columns))
         return self._kernels[start, stop]
 
     def _onward_to(self, node: int) -> Enclosed:
@@ -228,6 +198,48 @@ class VaryingExecution:
     @cached_property
     def _steps(self) -> list[arb_mat]:
         return [self.law.over(*ends)[0] for ends in pairwise(self.marks)]
+
+
+def pushes(law: VaryingFlow, start: float, stop: float, columns: Sequence[int]) -> list[arb_mat]:
+    """What some ``columns`` of ``[B E]`` make, at any time of an interval within one segment, of the state at its end,
+    times its length: coefficients ``(d, m)`` of powers of ``u`` from -1 to 1 across what is left of it."""
+    from flint import arb, arb_poly
+
+    terms, half, none = law.kernel(start, stop), arb_poly([arb(1) / 2, arb(1) / 2]), arb(0)
+    every = [[arb_poly([one[i, j] for one in terms])(half).coeffs() for j in columns] for i in range(terms[0].nrows())]
+    return [
+        stacked([[entry[k] if k < len(entry) else none for entry in row] for row in every]) for k in range(len(terms))
+    ]
+
+
+def above_chord(
+    law: VaryingFlow, rows: Array, start: float, stop: float, begun: Array, size: Array, first: int
+) -> Array:
+    """How far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to the time may be above their chords on ``[start,
+    stop]``, which lies within one segment, for ``rows (r, d)``: ``(r,)``. Of every state they are at most ``begun
+    (d,)`` at the start, and ``size (m,)`` is what drives them through the columns of ``[B E]`` from the ``first`` one
+    on.
+
+    An integrand that began before is ``|c'Phi(t, start) y|``, above its chord by no more than ``c'Phi(t, start) y``
+    is from its own: its terms ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What begins within the
+    cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
+    """
+    d, width = rows.shape[1], (stop - start) * (1.0 + rounding(2))
+    terms, rest = law.within(start, stop, ORDER)
+    lines, total = stacked([balls(row) for row in rows]), np.zeros(len(rows))
+    for n, term in enumerate([*terms[2:], rest], 2):
+        found = Enclosed.of(lines * stacked([row[:d] for row in term.tolist()]))
+        factor = 2.0 if n == len(terms) else (n - 1) * n ** (-n / (n - 1))
+        total += factor * ((np.abs(found.mid) + found.rad) @ begun)
+    if size.any():
+        (most, slope), units = law.most(start, stop), np.array(law.units_on(start, stop))
+        entering = slice(d + first, d + first + size.size)
+        A, B = most[:, :d], most[:, entering]
+        pace = float((A * units / units[:, None]).sum(axis=1).max())
+        grown = np.exp(pace * width) * units * ((B @ size) / units).max()
+        second = (slope[:, entering] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ grown
+        total += width**2 / 8.0 * (np.abs(rows) @ second)
+    return np.asarray(total * OUTWARD * (1.0 + rounding(8 * d * d)))
 
 
 @final

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 ORDER = 8  # of the states in the time on a cell; what comes after counts twice, half of it takes shorter cells
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class VaryingLoop(ClosedLoop):
     """The same of a system of which ``law`` is the flow."""
@@ -44,12 +43,10 @@ class VaryingLoop(ClosedLoop):
         for piece in range(len(self.grid) - 1):
             k, block = self._places(piece)
             given = [balls([1.0, *none])] if self.system.c is not None else []
-            for b, middle in enumerate(self.middle.tolist()):
-                row = [middle, *none]
-                if self.blocks:
-                    row[1 + block * self.width + b] = 1.0
-                given.append(balls(row))
-            found.append(stacked([*self.inputs(k).tolist(), *given]))
+            entering = [balls([middle, *none]) for middle in self.middle.tolist()]
+            if self.blocks:
+                self._entered(entering, block, exactly(np.eye(self.width)))
+            found.append(stacked([*self.inputs(k).tolist(), *given, *entering]))
         return found
 
     def _moved(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
