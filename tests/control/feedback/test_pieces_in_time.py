@@ -9,17 +9,23 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from flint import arb_mat, ctx
+from scipy.integrate import solve_ivp
 
 import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
+from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
+from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.feedback.measurable import VaryingPieces
 from sparserob_core.control.feedback.zonoid import Pushes
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.closed_loops import CHANGING, Changing, exponentials
 
 H = np.array([[1.0, 0.0], [-1.0, 0.0], [0.6, 0.8]])
-IN_TIME = ["measurable in t", pytest.param("measurable in a triangle in t", marks=pytest.mark.slow)]
+IN_TIME = ["measurable in t", "measurable in a triangle in t"]
 
 
 @cache
@@ -44,6 +50,7 @@ def pushed(case: Changing, low: float, high: float, rows: np.ndarray, parts: int
     return np.asarray(np.repeat(half.ravel(), 2) @ heights)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IN_TIME)
 def test_what_a_piece_does_is_the_integral_of_the_support_function(name: str) -> None:
     """Of its end along coordinates of its set, and of states carried on; of times in it along rows, 0 where it
@@ -64,7 +71,7 @@ def test_what_a_piece_does_is_the_integral_of_the_support_function(name: str) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["measurable in t", "measurable in a triangle in t"])
+@pytest.mark.parametrize("name", IN_TIME)
 def test_what_it_is_at_least_and_at_most_is_as_near_as_rounding(name: str) -> None:
     case, loop, pieces = made(name)
     times = np.linspace(0.0, 2.0, 9)[1:]
@@ -93,6 +100,7 @@ def test_pushes_on_parts_of_an_interval_are_the_polynomials_of_the_whole() -> No
     assert none.terms.shape[1] == 5
 
 
+@pytest.mark.slow
 def test_what_an_expansion_leaves_out_of_what_a_piece_does_is_in_the_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """From 0, without a control, so that nothing moves but what is pushed: on the first piece what is under way, and
     what pieces that are over have done after it."""
@@ -115,7 +123,7 @@ def test_what_an_expansion_leaves_out_of_what_a_piece_does_is_in_the_bounds(monk
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["measurable in t", "measurable in a triangle in t"])
+@pytest.mark.parametrize("name", IN_TIME)
 def test_what_transitions_are_counted_by_is_what_the_piece_under_way_has_made_of_the_states(name: str) -> None:
     """At marks within a piece, either way; nothing where a piece begins. What drives them counts with what kernels are
     off by, in the measure of what flows are."""
@@ -134,3 +142,60 @@ def test_what_transitions_are_counted_by_is_what_the_piece_under_way_has_made_of
         flow.error[:, None, None] * flow.sizes[..., columns] + kernel.error[:, None, None] * kernel.sizes[..., columns]
     )
     assert (both >= alone).all() and both == pytest.approx(alone, rel=1e-9)
+
+
+def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_both_sides_say() -> None:
+    """Driven by an integrator, from 0, to the end of a piece and to a time in it, through three segments and more: what
+    the set of the piece, what the piece under way, and what `check` says of both."""
+    system = VaryingSystem.of(
+        [["0", "1"], ["-2 - 3*sin(4*t)", "-0.5*t"]], [[0.0], [1.0]], 2.0, [["0.3*cos(t)", "0"], ["0.2*t", "1"]]
+    )
+    bound = sr.Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.1, 0.15, 0.2])
+    problem = sr.OptimalControlProblem(
+        system=system,
+        horizon=2.0,
+        initial_state=[0.0, 0.0],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=bound,
+        disturbance_class="measurable",
+        terminal=[sr.Box([-9.0, -9.0], [9.0, 9.0])],
+    )
+    grid = [0.0, 1.1, 2.0]
+    grids = sr.Dictionary.indicators(np.array(grid)), sr.Dictionary.indicators(np.array([0.0, 2.0]))
+    loop = prepare(problem, *grids, policy=sr.AffinePolicy()).answering.loop
+    pieces = loop.measurable
+    assert pieces is not None
+
+    def driven(low: float, ends: np.ndarray, values: np.ndarray) -> np.ndarray:
+        state = np.zeros(2)
+        for end, w in zip(ends, values, strict=True):
+
+            def slope(t: float, x: np.ndarray, w: np.ndarray = w) -> list[float]:
+                A = -(2.0 + 3.0 * np.sin(4.0 * t)) * x[0] - 0.5 * t * x[1]
+                return [x[1] + 0.3 * np.cos(t) * w[0], A + 0.2 * t * w[0] + w[1]]
+
+            state, low = solve_ivp(slope, (low, end), state, rtol=1e-11, atol=1e-13).y[:, -1], end
+        return state
+
+    with ctx.workprec(96):
+        still, none = [arb_mat(1, 1)] * 2, np.zeros((2, 2, 1, 2))
+        law = VaryingFlow(system, 2.0)
+        both = VaryingMeasurableLoop(system, [0.0, 0.0], still, none, grid, grid, [], bound, law=law)
+        assert len([end for end in law.ends if end < 1.1]) > 2
+        for piece, (low, high) in enumerate(pairwise(grid)):
+            zonoid, (_, outward) = pieces.zonoids[piece], pieces.at(piece)
+            for a in np.array([[1.0, 0.2], [-0.7, 1.0]]):
+                arc = zonoid.best(a @ outward)
+                reached = float(a @ driven(low, low + arc.ends * (high - low), arc.values * pieces.disturbances))
+                assert float(zonoid.support(a @ outward)) == pytest.approx(reached, abs=1e-9)
+                told = both.kernel(piece).most(Enclosed(a[None], np.zeros((1, 2))), both.sides)
+                assert told.mid[0] == pytest.approx(reached, abs=1e-9) and told.rad[0] < 1e-12
+                time = 0.3 * low + 0.7 * high
+                ends, signal = pieces.signal(np.zeros(pieces.size), time, a, piece)
+                mine = (ends[:-1] >= low) & (ends[:-1] < time)
+                reached = float(a @ driven(low, ends[1:][mine], signal.T[mine] - bound.middle()))
+                assert pieces.within(np.array([time]), a[None], np.array([piece]))[0, 0] == pytest.approx(
+                    reached, abs=1e-9
+                )
+                told = both.under_way(piece, time, a[None])
+                assert told.mid[0] == pytest.approx(reached, abs=1e-9) and told.rad[0] < 1e-12
