@@ -225,7 +225,11 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
                     assert (moved.mid + moved.rad <= wide.mid + wide.rad + 1e-12).all()
                     assert (moved.mid - moved.rad >= wide.mid - wide.rad - 1e-12).all()
                 assert (wide.rad < 0.1).all()
-            steep = kernel.steepest(a, loop.sides)
+            steep = kernel.steepest(Enclosed(a, np.zeros_like(a)), loop.sides)
+            wide = kernel.steepest(Enclosed(a, np.full_like(a, 1e-3)), loop.sides)
+            for offset in 1e-3 * rng.choice([-1.0, 1.0], size=(3, *a.shape)):
+                moved = kernel.steepest(Enclosed(a + offset, np.zeros_like(a)), loop.sides)
+                assert (moved <= wide).all() and (wide <= steep * (1 + 1e-2) + 1e-2).all()
             times = np.linspace(0.0, length, 60)
             f = np.einsum("rdw,nd->nrw", exponentials(case.A * times[:, None, None]) @ case.E, a)
             h = case.bound.support(f.reshape(-1, f.shape[2])).reshape(f.shape[:2]) - f @ middle

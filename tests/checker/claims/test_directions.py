@@ -1,0 +1,103 @@
+"""Guards checker/claims: directions of a curved set that are sums of coordinates, beside measurable disturbances and
+errors of execution: as floats and by how much these are off, or as balls."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from flint import ctx
+
+from sparserob_core.checker.claims.window import Beside, Window
+from sparserob_core.checker.reach.loop_tube import LoopTube
+from sparserob_core.checker.reach.measurable import MeasurableLoop
+from sparserob_core.checker.reach.tube import Polynomial
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box, Ellipsoid
+
+FAR = np.array([2.0, 0.5, 3.0])
+
+
+class Erring:
+    """What is added is ``FAR'|c|`` and as much again by a time of 1, and a little more for ``c`` below 0."""
+
+    def added(self, c: np.ndarray, time: float) -> tuple[float, float]:
+        size = float(FAR @ (np.abs(c) + 0.1 * np.maximum(-c, 0.0))) * (1.0 + time)
+        return size, size
+
+    def bent(self, c: np.ndarray, start: float, stop: float) -> float:
+        return 0.01 * float(FAR @ np.abs(c))
+
+
+class Ticking:
+    """A clock that is that of the times."""
+
+    def duration(self, ticks: float) -> Any:
+        from flint import arb
+
+        return arb(ticks)
+
+    def ticks(self, start: float, stop: float) -> float:
+        return stop - start
+
+
+@pytest.fixture(autouse=True)
+def precision():
+    with ctx.workprec(96):
+        yield
+
+
+def beside(basis: np.ndarray) -> Beside:
+    window = Window("path", Ellipsoid(np.zeros(3), np.eye(3)), 0.0, 1.0, 3)
+    return Beside(window, basis, np.zeros((len(basis), 0)), cast(Any, Ticking()), [0.0, 1.0], [], cast(Any, [Erring()]))
+
+
+def test_a_direction_is_the_nearest_float_and_off_by_what_is_left() -> None:
+    rng = np.random.default_rng(5)
+    basis, z = rng.normal(size=(3, 3)), rng.normal(size=(4, 3))
+    c, off = beside(basis).directions(z)
+    exact = [[sum(Fraction(a) * Fraction(b) for a, b in zip(row, col, strict=True)) for col in basis.T] for row in z]
+    for i, j in np.ndindex(*c.shape):
+        assert abs(exact[i][j] - Fraction(c[i, j])) <= Fraction(off[i, j])
+        assert off[i, j] <= 1e-15 * (np.abs(z) @ np.abs(basis))[i, j]
+    assert off.any()
+    few = np.round(basis * 64) / 64
+    c, off = beside(few).directions(np.array([[1.0, -0.5, 0.25], [0.0, 1.0, 0.0]]))
+    assert not off.any()
+    np.testing.assert_array_equal(c[1], few[1])
+
+
+def test_what_a_direction_is_off_by_is_added_as_along_the_axes() -> None:
+    basis = np.full((1, 3), 0.1)
+    z, none = np.array([[1.0 / 3.0]]), Polynomial(np.zeros((1, 1)), 0.0, 0.0, 0.0)
+    one = beside(basis)
+    c, off = one.directions(z)
+    for off_by in (off, np.array([[1e-3, 0.0, 2e-3]])):
+        one._directions[z.tobytes()] = c, off_by
+        for stop in (0.0, 1.0):
+            (found,) = one.added([none], 0.0, stop, z)
+            top = found.coefficients.sum() + found.error
+            truth = 0.3 / 3.0 / 3.0 * FAR.sum() * (1.0 + stop) + 1.1 * float(FAR @ off_by[0]) * (1.0 + stop)
+            assert top >= truth * (1.0 - 1e-12)
+            assert top <= truth + 0.01 * FAR.sum() * 0.1 + 1e-2 * float(FAR @ off_by[0]) + 1e-12
+
+
+def test_a_loop_under_measurable_disturbances_is_seen_along_balls_as_along_floats() -> None:
+    A, E = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[1.0, 0.3], [0.0, 1.0]])
+    problem = OptimalControlProblem(
+        system=LinearSystem(A, [[0.0], [1.0]], E), horizon=2.0, initial_state=[0.0, 0.0], control=Box([-1.0], [1.0]),
+        terminal=[Box([-1.0, -1.0], [1.0, 1.0])], disturbance=Box([-0.1, -0.2], [0.1, 0.3]),
+        disturbance_class="measurable",
+    )  # fmt: skip
+    loop = MeasurableLoop.alone(problem, [0.0, 1.0, 2.0], [0.0, 1.0, 2.0], 2)
+    z, axes, normals = np.array([[0.5, 0.25], [-0.75, 0.5]]), np.eye(2), np.array([[1.0, 0.5], [-0.25, 1.0]])
+    summed, alone = (LoopTube(loop, basis, np.zeros((2, 0))) for basis in (normals, z @ normals))
+    for piece, start, stop in ((0, 0.0, 0.0), (0, 0.2, 0.5), (1, 1.3, 1.7), (1, 2.0, 2.0)):
+        for ball, float_ in zip(
+            summed.cells(piece, start, stop, z), alone.cells(piece, start, stop, axes), strict=True
+        ):
+            np.testing.assert_allclose(ball.coefficients, float_.coefficients, rtol=0.0, atol=1e-12)
+            assert ball.error == pytest.approx(float_.error, abs=1e-12)
