@@ -228,19 +228,3 @@ def test_of_a_plant_in_time_whose_end_is_out_of_reach_no_state_is_feasible() -> 
     config["problem"]["disturbance"] = {"box": [0.11, 0.0]}
     found = sr.initial_states(config, values=0, within=5)
     assert found.status == "infeasible"
-
-
-@pytest.mark.parametrize(
-    ("change", "path"),
-    [
-        ({"policy": {"name": "affine"}}, "policy.name"),
-        ({"problem": {"terminal": [{"equals": [None, 0.0]}]}}, "problem.terminal"),
-    ],
-)
-def test_what_is_not_proven_of_a_plant_in_time_is_refused(change: dict[str, Any], path: str) -> None:
-    config = copy.deepcopy(IN_TIME)
-    for key, value in change.items():
-        config[key] = {**config.get(key, {}), **value}
-    config["problem"]["system"]["B"], config["problem"]["system"]["parameters"] = [["2 - t", 0], [0, 1]], {}
-    with pytest.raises(sr.InputError, match=path):
-        sr.initial_states(config)

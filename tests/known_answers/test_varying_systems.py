@@ -129,13 +129,6 @@ def test_what_is_not_proven_yet_is_refused_by_name(changes: dict[str, Any], said
         sr.run(config, out=tmp_path / "run", figures=False)
 
 
-def test_no_set_of_initial_states_before_a_fixed_end_is_told_of_a_plant_that_changes(tmp_path: Path) -> None:
-    config = {"problem": {**FADING, "system": {"A": [["-t", 1], [0, 0]], "B": [[0], [1]]}, "initial_state": [1, 0],
-                          "terminal": [{"equals": [0, 0]}]}, "dictionaries": {"control": pieces(4)}}  # fmt: skip
-    with pytest.raises(sr.InputError, match=r"problem\.terminal: expected a set with an interior, where the system"):
-        sr.initial_states(config)
-
-
 def test_definitions_serve_uncertain_systems_too(tmp_path: Path) -> None:
     problem = {
         **FADING,

@@ -35,6 +35,11 @@ class Source(ABC):
         """The normals of its rows, ``(r, q)``, and what one of each of their coordinates ``(q,)`` is in the user's
         units, where its own are ``units``."""
 
+    @property
+    def of_state(self) -> Source | None:
+        """The same constraint on the state where the control answers nothing; ``None`` for one on controls."""
+        return None
+
     def index_units(self, units: Units) -> Array:
         """What one of the first coordinates of a reduced index is in the user's units; further ones have none."""
         return np.array([units.time])

@@ -128,6 +128,11 @@ class FeedbackConstraint(Source):
         """Those without feedback."""
         return self.flat.normals_in(units)
 
+    @property
+    def of_state(self) -> FlatConstraint:
+        """The one without feedback."""
+        return self.flat
+
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         start, stop = self.flat.start, self.flat.stop

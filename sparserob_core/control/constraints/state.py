@@ -142,6 +142,11 @@ class StateConstraint(Source):
         directions, gains = self.functionals_at(index[None])[1], self.gains
         return directions if gains is None else np.hstack([directions, gains])
 
+    @property
+    def of_state(self) -> StateConstraint:
+        """Itself."""
+        return self
+
     def normals_in(self, units: Units) -> tuple[Array, Array]:
         """Those of any index, and the units of states, and of controls where they are mixed."""
         coordinates = units.states if self.gains is None else np.concatenate([units.states, units.controls])

@@ -16,6 +16,7 @@ import numpy as np
 
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.rounding import SHARE, added_up, rounded_down
 from sparserob_core.control.transcription.transcribe import from_state
@@ -87,16 +88,93 @@ class InitialPlane:
         raise."""
         if self.model.response.propagator.expansion is None:
             return result
-        return rounded_down(from_state(self.centred, self._state(z)), result, None)
+        mu = np.zeros(self._end_units.size)
+        mu[np.flatnonzero(self._needed(z))[: result.dual.mu.size]] = result.dual.mu
+        ends = replace(result, dual=replace(result.dual, mu=mu / self._end_units))  # of the states that are fixed
+        bound = rounded_down(from_state(self.centred, self._state(z)), ends, None).lower_bound
+        return replace(result, lower_bound=bound)
+
+    def weakened(self, result: Result) -> Result:
+        """The result of a `support` with a lower bound, or a proof that nothing is feasible, that holds for the true
+        steps of a system which changes with time.
+
+        Rows say so themselves. An equality of the true steps is one of the computed ones up to what these may be off
+        by, wherever in the plane it begins: two inequalities that are so much wider, of the same multipliers. What is
+        infeasible by more than that of the norm of its rows is so with these too.
+        """
+        if self.model.response.propagator.expansion is None:
+            return result
+        lost = sum(cut.multiplier * self._off_at(cut) for cut in result.dual.cuts)
+        if result.status != "infeasible":
+            lost += float(np.abs(result.dual.mu) @ self._off_at_ends[: result.dual.mu.size])
+            return replace(result, lower_bound=result.lower_bound - lost)
+        if result.dual.bound > max(lost, self._off_at_most):
+            return result
+        message = "nothing seems feasible, by no more than what steps of the system may be off by"
+        return replace(result, status="undecided", message=message, lower_bound=-np.inf)
+
+    def off(self, times: Array, directions: Array, parameters: Array) -> Array:
+        """What rows ``c'x(t)``, ``directions (k, d)``, may be off by, wherever in the plane they begin, ``(k,)``: by
+        rounding, what steps of a system that changes with time are, and what an expansion in the parameters leaves
+        out; 0 for a system that does not change with time."""
+        response = self.centred.response
+        if response.propagator.expansion is None:
+            return np.zeros(times.size)
+        columns = response.weights(times, directions, parameters).free[:, list(self.states)] * self.radius
+        sizes = added_up(self.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
+        return np.asarray((SHARE + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
+
+    def _off_at(self, cut: Cut) -> float:
+        """What a row that holds with equality may be off by, under feedback; 0 for others, which are wider by that."""
+        constraint = self.centred.constraint(self._base.family(cut.family))
+        if constraint is None or any(constraint is one for one in self.centred.constraints):
+            return 0.0
+        times, directions, parameters, _ = constraint.functionals_at(cut.index[None, :1])
+        return float(self.off(times, directions, parameters)[cut.row])
+
+    @cached_property
+    def _off_at_ends(self) -> Array:
+        """What equalities may be off by, in their units, ``(e,)``."""
+        axes, middle = fixed(self.model.held)[0], self.model.parameters.middle
+        times = np.full(axes.shape[0], self.model.problem.horizon)
+        return self.off(times, axes, np.tile(middle, (times.size, 1))) / self._end_units
+
+    @cached_property
+    def _off_at_most(self) -> float:
+        """The largest share of the norm of an equality that it may be off by; of one without entries 0 where it is
+        missed by more."""
+        base, off = self._base.finite, self._off_at_ends
+        if not base.b.size:
+            return 0.0
+        norms = np.linalg.norm(np.hstack([base.A, self._columns]), axis=1)
+        bare = np.where(np.abs(base.b) > off, 0.0, np.inf)
+        return float(np.where(norms > 0.0, off / np.where(norms > 0.0, norms, 1.0), bare).max())
+
+    @cached_property
+    def strip(self) -> float:
+        """The area, in coordinates ``z``, of what is left of the plane by an equality that no control enters, up to
+        what it may be off by; 0 where there is none."""
+        lengths = np.linalg.norm(self._columns, axis=1)
+        pinned = ~self._base.finite.A.any(axis=1) & (lengths > 0.0)
+        across = 2.0 * self._off_at_ends[pinned] / lengths[pinned]
+        return float(2.0 * np.sqrt(2.0) * across.max(initial=0.0))
+
+    @cached_property
+    def _end_units(self) -> Array:
+        """What equalities are divided by, ``(e,)``."""
+        count = fixed(self.model.held)[1].size
+        return np.ones(count) if self.model.rows is None else self.model.rows.fixed[:count]
+
+    def _needed(self, z: Array) -> np.ndarray:
+        """Which equalities ``(e,)`` the program at ``z`` has: not one that no control moves and that holds there but
+        for rounding."""
+        base = self._base.finite
+        return np.asarray(base.A.any(axis=1) | (np.abs(base.b - self._columns @ z) > TOLERANCE))
 
     def _equalities(self, z: Array) -> tuple[Array | None, Array | None]:
-        """Those of the program at ``z``, without any that no control moves and that holds there but for rounding."""
-        base = self._base
-        if base.A is None or base.b is None:
-            return None, None
-        A, b = np.asarray(base.A, dtype=float), np.asarray(base.b, dtype=float) - self._columns @ z
-        needed = A.any(axis=1) | (np.abs(b) > TOLERANCE)
-        return (A[needed], b[needed]) if needed.any() else (None, None)
+        """Those of the program at ``z``."""
+        base, needed = self._base.finite, self._needed(z)
+        return (base.A[needed], (base.b - self._columns @ z)[needed]) if needed.any() else (None, None)
 
     def support(self, direction: Array, known: Sequence[Cut] = ()) -> SemiInfiniteProgram:
         """Minimise ``-direction'z`` over all ``(theta, z)``: its value is minus the support function of the feasible
@@ -270,11 +348,7 @@ class _Joined(_OfPlane):
         times, directions, parameters, _ = constraint.functionals_at(indices)
         free = constraint.functionals.response.weights(times, directions, parameters).free
         columns = free[:, list(self.plane.states)] * self.plane.radius
-        expansion = constraint.functionals.response.propagator.expansion
-        if expansion is not None:
-            sizes = added_up(self.plane.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
-            sizes = (SHARE + expansion.slack) * sizes + np.abs(directions) @ self.plane.beyond
-            h = h + sizes.reshape(h.shape)
+        h = h + self.plane.off(times, directions, parameters).reshape(h.shape)
         return np.concatenate([G, columns.reshape(*G.shape[:2], 2)], axis=2), h
 
 
@@ -310,7 +384,8 @@ class _JoinedUncertain(_OfPlane):
         return family if literal is None else replace(family, literal=replace(literal, explain=self.explain))
 
     def uncertain(self, index: Array) -> UncertainRows:
-        """The rows at the centre, and two columns more."""
+        """The rows at the centre, and two columns more. Of a system that changes with time they are wider by what steps
+        may be off by, as without feedback, but for those that hold with equality (`InitialPlane.weakened`)."""
         from scipy.sparse import csr_array, hstack
 
         one, *others = (
@@ -321,7 +396,10 @@ class _JoinedUncertain(_OfPlane):
         moved = np.stack([rows.h - other(index).h for other in others if other is not None], axis=1)
         n = rows.g.shape[1] + 2
         wider = tuple(csr_array((C.data, C.indices, C.indptr), shape=(C.shape[0], n)) for C in rows.C)
-        return replace(rows, g=csr_array(hstack([rows.g, csr_array(moved)])), C=wider)
+        constraint, h = self.plane.centred.constraint(self.base), rows.h
+        if constraint is not None and not rows.exact:
+            h = h + self.plane.off(*constraint.functionals_at(index[None, : self.base.index_set.dimension])[:3])
+        return replace(rows, g=csr_array(hstack([rows.g, csr_array(moved)])), h=h, C=wider)
 
     def excess(self, x: Array, indices: Array) -> Array:
         """The violations from that initial state."""

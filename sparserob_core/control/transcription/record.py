@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.brief import noun
-from sparserob_core.control.constraints.explanation import TimedExplanation, in_numbers
+from sparserob_core.control.constraints.explanation import Source, TimedExplanation, in_numbers
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -221,6 +221,7 @@ class Transcription(Posed):
         return next(family for family in self.program.families if family.source is constraint)
 
     def constraint(self, family: ConstraintFamily) -> StateConstraint | None:
-        """The constraint on the state that a family was made of, in any formulation; ``None`` for one on the
-        control."""
-        return next((one for one in self.constraints if one is family.source), None)
+        """The constraint on the state that a family was made of, in any formulation, also of an equality that must hold
+        for every deviation; ``None`` for one on the control."""
+        found = family.source.of_state if isinstance(family.source, Source) else None
+        return found if isinstance(found, StateConstraint) else None

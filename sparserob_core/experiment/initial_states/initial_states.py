@@ -10,7 +10,6 @@ import numpy as np
 
 from sparserob_core.arguments import whole
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.studies.initial_states import InitialPlane, check_states
@@ -73,15 +72,6 @@ def initial_states(
             expected="false, since a plan that repeats ends among its initial states, and not from elsewhere",
             got="true",
         )
-    system = model.problem.system
-    if isinstance(system, VaryingSystem):
-        refused = {
-            "policy.name": ("open_loop", model.feedback is not None, "a policy that answers"),
-            "problem.terminal": ("a set with an interior", bool(model.problem.terminal_equalities), "fixed values"),
-        }
-        for path, (expected, given, got) in refused.items():
-            if given:
-                raise InputError(path=path, expected=f"{expected}, where the system changes with time", got=got)
     if about is not None:
         begun = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
         model = from_state(model, np.append(_about(about, model.stated), begun))

@@ -110,7 +110,7 @@ class InitialStatesSearch:
                 found, message="no initial state is proven feasible, and none in the outer polygon is proven infeasible"
             )
         size = polygon_area(outer_polygon(supports))
-        if size <= SLIVER:
+        if size <= max(SLIVER, self.plane.strip):
             return self._finished(found, status="certified", message="proven from both sides; the set has no interior")
         share = 1.0 - polygon_area(inner) / size
         return self._finished(
@@ -211,6 +211,7 @@ class InitialStatesSearch:
         program = self.plane.support(direction, list(known.values()))
         # The cost is linear and the point is all that is wanted: a regulariser of the control would only be in the way.
         result = Exchange(tolerance=self.tolerance).solve(program, replace(self.tools, regulariser=None))
+        result = self.plane.weakened(result)
         self.programs += result.counts.get("relaxed_programs", 0)
         self.tools.deadline.check()
         self.cuts[tuple(direction.tolist())] = result.indices or tuple(known.values())
