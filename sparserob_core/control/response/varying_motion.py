@@ -46,6 +46,7 @@ RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 degree is off by what the constant one is, and what is beyond never falls below rounding times the growth."""
 PATHS_KEPT = 4  # controls whose states are remembered
 WAYS_KEPT = 4  # times of which the way there is: those of cells, and where they begin, of two constraints
+STRETCHES = 256  # of pieces, whose carries count at their largest; a tenth mixes parts of an orbit, ten times are 1 GB
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,34 +219,57 @@ class VaryingMotion:
 
     def _lost(self, sizes: Array, pushed: Array) -> Array:
         """Every step misses a share of what it begins with, and of what drives it, of states that are coupled with one
-        another; that is carried on by the transitions from there, and within the piece."""
-        units, steps = self.expansion.units, self.flow.state
+        another, in the units of its segment; that is carried on by the transitions from there, and within the piece."""
+        units, off = self._steps_off
         begun = self.expansion.over_parts((sizes / units)[:, :, None])[:, :, 0]
-        ahead = (np.abs(steps) / units[:, None] * units).sum(axis=2).max(axis=1)
-        rounded = rounding(self.states + self.inputs.shape[2])
-        here = (self.flow.error + rounded * (ahead + self.flow.error))[:, None] * (begun + pushed)
-        none = np.full((1, units.size), TINY)  # not 0, which times no bound is no number
-        before = np.concatenate([none, np.cumsum(here, axis=0)[:-1]])
-        carried = units * self.carries[:-1] * before
+        here = np.maximum(off[:, None] * (begun + pushed), TINY)  # not 0, which times no bound is no number
+        stretch, first = self._stretches
+        so_far, whole = np.empty_like(here), np.add.reduceat(here, first, axis=0)
+        for begin, end in zip(first, [*first[1:], len(here)], strict=True):
+            so_far[begin:end] = np.cumsum(here[begin:end], axis=0)
+        carried, all_before = np.zeros_like(here), np.arange(first.size) < stretch[:-1, None]
+        carried[1:] = np.einsum("kb,kbi,bi->ki", all_before, self.carries[1:-1], whole)
+        carried[1:] += self.carries[np.arange(1, len(here)), stretch[:-1]] * so_far[:-1]
         return np.asarray((self.grown(self.every, self.grid.lengths, carried) + units * here) * OUTWARD)
 
     @cached_property
+    def _steps_off(self) -> tuple[Array, Array]:
+        """The units ``(K, d)`` of the segment that a piece is in, or of all where it is in several, and what its step
+        is off by in the norm of largest row sums in them, what a product with it rounds included, ``(K,)``."""
+        expansion, marks, flow = self.expansion, self.propagator.marks, self.flow
+        apart = np.searchsorted(expansion.ends, marks[1:], side="left") - 1 > expansion.segment_of(marks[:-1])
+        ratios = np.where(apart[:, None], 1.0, expansion.ratios[self._segments])
+        units = expansion.units * ratios
+        off = flow.error / ratios.max(axis=1)
+        ahead = (np.abs(flow.state) / units[:, :, None] * units[:, None]).sum(axis=2).max(axis=1)
+        return units, off + rounding(self.states + self.inputs.shape[2]) * (ahead + off)
+
+    @cached_property
+    def _stretches(self) -> tuple[np.ndarray, np.ndarray]:
+        """The stretch of the horizon that each piece is in, ``(K,)``, and the first piece of each."""
+        stretch = self.every // -(-self.every.size // STRETCHES)
+        return stretch, np.unique(stretch, return_index=True)[1]
+
+    @cached_property
     def carries(self) -> Array:
-        """The largest row sums ``(K + 1, d)`` of the transitions from any mark to each one, in own units: of the
-        computed ones, and with ``P`` the largest of them and ``e`` the sum of what all steps are off by, ``P^2 e / (1
-        - P e)`` more."""
-        units = self.expansion.units
-        steps = self.flow.state / units[:, None] * units
-        found, every = np.ones((steps.shape[0] + 1, units.size)), np.empty((steps.shape[0] + 1, *steps.shape[1:]))
-        every[0] = np.eye(units.size)
-        for k, step in enumerate(steps):
-            every[: k + 1] = step @ every[: k + 1]
-            every[k + 1] = np.eye(units.size)
-            found[k + 1] = np.abs(every[: k + 2]).sum(axis=2).max(axis=0)
-        largest, ahead = float(found.max()), np.abs(steps).sum(axis=2).max(axis=1)
-        off = float((self.flow.error + rounding(units.size) * (ahead + self.flow.error)).sum())
-        share = largest * off
-        return found + (largest * share / (1.0 - share) if share < 0.5 else np.inf)
+        """What the transitions to every mark from the ends of the pieces of a stretch before it make of a step that
+        is off by 1 in the units of its piece, state by state, at most: ``(K + 1, stretches, d)``. That of the computed
+        ones, and with ``P`` the largest norm of them, each in the units of the pieces that end at both marks, and ``e``
+        the sum of what all steps are off by in these, ``P^2 e / (1 - P e)`` more."""
+        (units, off), first = self._steps_off, self._stretches[1]
+        count, d = units.shape
+        every, found = np.empty((count, d, d)), np.zeros((count + 1, first.size, d))
+        for k, step in enumerate(self.flow.state):
+            every[:k] = step @ every[:k]
+            every[k] = np.diag(units[k])
+            begun = first[first <= k]
+            found[k + 1, : begun.size] = np.maximum.reduceat(np.abs(every[: k + 1]).sum(axis=2), begun, axis=0)
+        before = np.concatenate([units[:1], units[:-1]])
+        ends = np.concatenate([units[:1], units])
+        largest = max(1.0, float((found / ends[:, None]).max()))
+        share = largest * float((off * (before / units).max(axis=1)).sum())
+        more = largest * share / (1.0 - share) if share < 0.5 else np.inf
+        return found + np.where(found > 0.0, more * ends[:, None], 0.0)
 
     def grown(self, pieces: np.ndarray, width: Array, sizes: Array) -> Array:
         """What states of at most ``sizes (k, d)`` may become within a ``width (k,)`` of a piece, ``(k, d)``: by the

@@ -4,6 +4,7 @@ with time: never below a dense maximum, close to it on small cells, and holding 
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sparserob_core.control.response.varying.expansion as expansion
+import sparserob_core.control.response.varying_motion as varying_motion
 from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
@@ -22,6 +24,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Reference
 from sparserob_core.control.response.response import Response, merge_grids
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
+from sparserob_core.control.response.varying_motion import VaryingMotion
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from tests.support.plants import indicators, uniform, walsh
@@ -199,3 +202,102 @@ def test_what_every_step_is_off_by_is_carried_on(monkeypatch):
         lost = legs[0].along(np.zeros((1, 50)), np.ones((1, 1)), np.zeros((1, 1)))[0, -1]
         lost = lost if support is None else support.neglected[0, -1]
         assert (1.0 + off) ** 50 - 1.0 <= lost <= 500 * off
+
+
+FAST_AND_SLOW = VaryingSystem.of([[0, 1], ["-1 / (0.002 + (t - 3)^2)", 0]], [[0], [1]], 8.0)  # twenty times as fast
+
+
+def orbiting(monkeypatch: pytest.MonkeyPatch, off: float) -> VaryingMotion:
+    """A motion whose every step may be off by a share ``off`` in the units of its segment."""
+    flow = Expansion.flow
+
+    def rough(self: Expansion, starts: Array, stops: Array) -> Flow:
+        ratios = self.ratios[self.segment_of((starts + stops) / 2)]
+        return flow(self, starts, stops)._replace(error=off * ratios.max(axis=1) * (stops > starts))
+
+    monkeypatch.setattr(Expansion, "flow", rough)
+    times = uniform(12, 8.0).breakpoints
+    grid = merge_grids(times, times, varying=True)
+    return VaryingMotion(Response(FAST_AND_SLOW, grid, np.array([1.0, 0.5])).propagator, np.array([1.0, 0.5]))
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize("control", [0.0, 3.0])
+@pytest.mark.parametrize("stretches", [1000, 7])
+def test_the_worst_that_steps_may_miss_is_held_and_hardly_more(control, stretches, monkeypatch):
+    monkeypatch.setattr(varying_motion, "STRETCHES", stretches)
+    off = 1e-11
+    motion = orbiting(monkeypatch, off)
+    flow, ratios = motion.flow, motion.expansion.ratios[motion._segments]
+    assert ratios.max() >= 8.0 and ratios.min() == 1.0, "nothing is slow"
+    pushes = control * flow.control[:, :, 0]
+    driven = control * flow.sizes[:, :, 0]
+    path = motion.nodes(np.full((1, 12), control))[:, 0]
+    units = motion.expansion.units * ratios
+    missed = off * ((np.abs(path[:-1]) / units).max(axis=1) + driven.max(axis=1))[:, None] * units
+    lost = motion._lost(np.abs(path[:-1]), driven[:, :, None].sum(axis=2))
+    for mark in (1, 2, len(path) // 3, len(path) // 2, len(path) - 2):
+        deviation = np.empty(2)
+        for state in range(2):
+            back, signs = np.eye(2)[state], []
+            for step in flow.state[:mark][::-1]:
+                signs.append(np.sign(back))
+                back = back @ step
+            worst = path[0]
+            for k, sign in enumerate(signs[::-1]):  # each step misses what it may, where it counts
+                worst = flow.state[k] @ worst + pushes[k] + sign * missed[k]
+            deviation[state] = worst[state] - path[mark, state]
+        on_it = motion.grown(np.array([mark]), motion.grid.lengths[[mark]], deviation[None])[0] + missed[mark]
+        assert (on_it * (1.0 - 1e-6) <= lost[mark]).all()
+        if stretches > len(lost):
+            np.testing.assert_allclose(lost[mark], on_it, rtol=1e-3)
+    assert (lost <= 100.0 * on_it.max() * motion.expansion.units).all()
+
+
+def test_transitions_count_in_the_units_of_what_they_begin_with(monkeypatch):
+    # P e is nearly one half, from a slow part to a fast one
+    motion = orbiting(monkeypatch, 0.0)
+    units = motion.expansion.units * motion.expansion.ratios[motion._segments]
+    ends, steps = np.concatenate([units[:1], units]), motion.flow.state
+    norms, changed = [1.0], [1.0]
+    for k in range(len(steps)):
+        changed.append((ends[k] / units[k]).max())
+        product = np.eye(2)
+        for j in range(k + 1, len(steps)):  # what a step misses is there when it ends
+            product = steps[j] @ product
+            norms.append((np.abs(product) * ends[k + 1] / ends[j + 1, :, None]).sum(axis=1).max())
+    share = 0.49 / (max(norms) * sum(changed[1:]))
+    for off, finite in ((share, True), (share / 0.9, False)):
+        assert np.isfinite(orbiting(monkeypatch, off).carries).all() == finite
+    rough, P = orbiting(monkeypatch, share), max(norms)
+    more = (rough.carries - motion.carries)[motion.carries > 0.0]
+    ends = np.broadcast_to(ends[:, None], motion.carries.shape)[motion.carries > 0.0]
+    np.testing.assert_allclose(more, P * 0.49 / 0.51 * ends, rtol=1e-6)
+
+
+def test_what_products_of_steps_round_is_lost_too(monkeypatch):
+    motion = orbiting(monkeypatch, 0.0)
+    path, exact, off = motion.nodes(np.zeros((1, 12)))[:, 0], [Fraction(1), Fraction(1, 2)], 0.0
+    lost = motion._lost(np.abs(path[:-1]), np.zeros((len(path) - 1, 2)))
+    for k, step in enumerate(motion.flow.state[:-1]):
+        exact = [sum(Fraction(a) * x for a, x in zip(row, exact, strict=True)) for row in step]
+        miss = np.array([abs(float(x - Fraction(one))) for x, one in zip(exact, path[k + 1], strict=True)])
+        assert (miss <= lost[k + 1]).all()
+        off = max(off, float((miss / motion.expansion.units).max()))
+    assert off > 0.0
+
+
+def test_a_piece_in_two_segments_counts_in_the_units_of_all(monkeypatch):
+    # a breakpoint that is the end of a slow segment but for rounding is that end, and what is beyond is in the next one
+    first = orbiting(monkeypatch, 1e-9)
+    slow = first.expansion.ratios.max(axis=1) > 1.0
+    ends = first.expansion.ends[1:-1][slow[:-1] & slow[1:]][:2]
+    times = np.unique([0.0, *(end * (1.0 + 4.0 * np.finfo(float).eps) for end in ends), 8.0])
+    motion = replace(
+        first, propagator=Response(FAST_AND_SLOW, merge_grids(times, times, varying=True), np.ones(2)).propagator
+    )
+    units, off = motion._steps_off
+    apart = np.flatnonzero(np.isin(motion.propagator.marks[1:], times[1:-1]))
+    assert apart.size == 2
+    np.testing.assert_array_equal(units[apart], np.tile(motion.expansion.units, (2, 1)))
+    assert (off[apart] >= motion.flow.error[apart]).all()
