@@ -337,6 +337,19 @@ def test_an_infeasible_run_has_no_empty_panel_and_no_bound(infeasible: sr.Outcom
     assert "violated" not in page and "holds" not in page
 
 
+@pytest.mark.parametrize(("units", "told"), [(["m", "m/s"], "v in m/s over x in m"), ([], "v over x")])
+def test_a_plane_is_in_units_where_they_are_known(units: list[str], told: str, small: sr.Outcome) -> None:
+    names = sr.Names(states=["x", "v"], state_units=units)
+    shown = Shown(replace(small.problem, names=names), 1, False, False, drawn=False)
+    panels = [layout(shown).root_container]
+    said = []
+    while panels:
+        one = panels.pop()
+        said.append(getattr(one, "name", None))
+        panels += getattr(one, "contents", [])
+    assert f"Phase plane: {told}" in said
+
+
 def test_what_is_proven_is_never_called_violated(small: sr.Outcome) -> None:
     event = sr.RunFinished(status=small.status, message="", seconds=1.0, result=small.result)
     assert small.result.worst is not None

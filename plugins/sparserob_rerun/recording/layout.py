@@ -116,7 +116,8 @@ def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     pair = pair_of(problem)
     if pair is not None:
         kind = "Phase plane" if problem.names.in_plane is None else "Plane"
-        across, up = (problem.names.state(one) for one in pair)
+        units = problem.names.state_units or [""] * problem.system.states
+        across, up = (f"{problem.names.state(one)} in {units[one]}".removesuffix(" in ") for one in pair)
         return view("/physics/phase", f"{kind}: {up} over {across}", PHASE)
     states = problem.system.states
     name = (
