@@ -48,6 +48,11 @@ class Monomials:
         return _products(self.count, self.degree)
 
     @property
+    def products_with(self) -> list[list[tuple[int, int]]]:
+        """The same for every monomial ``i``: all ``(j, k)``."""
+        return _products_with(self.count, self.degree)
+
+    @property
     def size(self) -> int:
         return len(self.exponents)
 
@@ -61,6 +66,14 @@ def _exponents(count: int, degree: int) -> list[tuple[int, ...]]:
 @lru_cache(maxsize=64)
 def _places(count: int, degree: int) -> dict[tuple[int, ...], int]:
     return {e: i for i, e in enumerate(_exponents(count, degree))}
+
+
+@lru_cache(maxsize=64)
+def _products_with(count: int, degree: int) -> list[list[tuple[int, int]]]:
+    found: list[list[tuple[int, int]]] = [[] for _ in _exponents(count, degree)]
+    for i, j, k in _products(count, degree):
+        found[i].append((j, k))
+    return found
 
 
 @lru_cache(maxsize=64)

@@ -64,11 +64,12 @@ class Series:
         from flint import arb_mat
 
         total: list[arb_mat | None] = [None] * self.monomials.size
-        left, right, here, there = self.parts, other.parts, self.there, other.there
-        for i, j, k in self.monomials.products:
-            if here[i] and there[j]:
-                term, so_far = left[i] * right[j], total[k]
-                total[k] = term if so_far is None else so_far + term
+        left, right, there, products = self.parts, other.parts, other.there, self.monomials.products_with
+        for factor, pairs, here in zip(left, products, self.there, strict=True):
+            for j, k in pairs if here else ():
+                if there[j]:
+                    term, so_far = factor * right[j], total[k]
+                    total[k] = term if so_far is None else so_far + term
         zero = arb_mat(left[0].nrows(), right[0].ncols())
         return Series(self.monomials, [zero if part is None else part for part in total])
 

@@ -108,6 +108,16 @@ class Segment:
     left: list[list[list[arb]]]
     beyond: Array
 
+    @cached_property
+    def there(self) -> list[int]:
+        """The numbers of the parts that are not exactly 0 in all of this."""
+        entries = enumerate(zip(self.law, self.left, strict=True))
+        return [
+            number
+            for number, (law, left) in entries
+            if any(one.length() for row in law for one in row) or not all(one == 0 for row in left for one in row)
+        ]
+
 
 class Looks(NamedTuple):
     """How large the numbers of a system are at some times, by which nothing is proven: ``units (d,)`` of the states, by
@@ -434,47 +444,75 @@ class SpreadFlow:
 
         d, h, u = self.system.states, arb(stop) - arb(start), [arb(one) for one in self.units.tolist()]
         shifted, none = arb_poly([arb(start) - arb(segment.centre), h]), arb(0)
-        table = [[[(entry(shifted) * h).coeffs() for entry in row] for row in part] for part in segment.law]
-        order = max(1, *(len(entry) for part in table for row in part for entry in row))
-        columns = len(table[0][0])
-        A, driven, a_sizes, b_sizes = [], [], [], []
+        law = [segment.law[number] for number in segment.there] or segment.law[:1]
+        table = [[[(entry(shifted) * h).coeffs() for entry in row] for row in part] for part in law]
+        order, columns = max(1, *(len(entry) for part in table for row in part for entry in row)), len(table[0][0])
+        rows, a_sizes, b_sizes = [], [], []
         for k in range(order):
-            rows = [[[entry[k] if k < len(entry) else none for entry in row] for row in part] for part in table]
-            A.append(Series(self.monomials, [stacked([row[:d] for row in part]) for part in rows]))
-            driven.append(Series(self.monomials, [stacked([[none] * d + row[d:] for row in part]) for part in rows]))
-            a_sizes.append(upper(sum((self._norm(part, d, u) for part in rows), none)))
-            b_sizes.append([
-                upper(sum((_largest([upper(abs(row[j])) / u[i] for i, row in enumerate(part)]) for part in rows), none))
+            rows.append([[[entry[k] if k < len(entry) else none for entry in row] for row in part] for part in table])
+            a_sizes.append(upper(sum((self._norm(part, d, u) for part in rows[k]), none)))
+            pushes = [
+                [_largest([upper(abs(row[j])) / u[i] for i, row in enumerate(part)]) for part in rows[k]]
                 for j in range(d, columns)
-            ])  # fmt: skip
+            ]
+            b_sizes.append([upper(sum(one, none)) for one in pushes])
+        kept = self._kept(a_sizes, b_sizes)
+        A = [self._placed(segment, [stacked([row[:d] for row in part]) for part in one]) for one in rows[:kept]]
+        driven = [
+            self._placed(segment, [stacked([[none] * d + row[d:] for row in part]) for part in one])
+            for one in rows[:kept]
+        ]
         first = stacked([[arb(int(i == j)) for j in range(columns)] for i in range(d)])
         terms, tails = [Series.constant(self.monomials, first)], _Tails(a_sizes)
         count = next((one for one in TERMS if tails.of(one, None) <= arb(SHARP)), TERMS[-1])
         for n in range(count):
             nexts = A[0] * terms[n]
-            for k in range(1, min(n + 1, order)):
+            for k in range(1, min(n + 1, kept)):
                 if any(A[k].there):
                     nexts = nexts + A[k] * terms[n - k]
-            if n < order:
+            if n < kept:
                 nexts = nexts + driven[n]
             terms.append(nexts.scaled(1 / arb(n + 1)))
         far = upper(abs(arb(segment.stop) - arb(segment.centre)).max(abs(arb(segment.start) - arb(segment.centre))))
         rest = [
             [[upper(abs(one)) * far ** (ORDER + 1) * upper(abs(h)) for one in row] for row in part]
-            for part in segment.left
+            for part in (segment.left[number] for number in segment.there)
         ]
-        r, a = upper(sum((self._norm(part, d, u) for part in rest), none)), upper(sum(a_sizes, none))
+        r, a = sum((self._norm(part, d, u) for part in rest), none), upper(sum(a_sizes, none))
+        r = upper(r + sum(a_sizes[kept:], none))
         spread = (a + r).exp() * a.exp()
         state = tails.of(count, None) + r * spread
         errors = [[state * u[i] / u[j] for j in range(d)] for i in range(d)]
         for j in range(d, columns):
             forced = [one[j - d] for one in b_sizes]
             missing = sum((_largest([row[j] / u[i] for i, row in enumerate(part)]) for part in rest), none)
+            missing += sum(forced[kept:], none)
             error = tails.of(count, forced) + spread * (r * sum(forced, none) + missing)
             for i in range(d):
                 errors[i].append(error * u[i])
         around = stacked([[_wider(none, one) for one in row] for row in errors])
         return terms, Series(self.monomials, [around] * self.monomials.size)
+
+    @staticmethod
+    def _kept(states: Sequence[arb], inputs: Sequence[Sequence[arb]]) -> int:
+        """How many coefficients in time are more than is left out anyway, of norms of ``A`` and of the columns of ``[B
+        E]``: over a short interval few."""
+        from flint import arb
+
+        for kept in range(1, len(states)):
+            left = [
+                sum(column[kept:], arb(0)) <= arb(SHARP) * sum(column, arb(0)) for column in zip(*inputs, strict=True)
+            ]
+            if sum(states[kept:], arb(0)) <= arb(SHARP) and all(left):
+                return kept
+        return len(states)
+
+    def _placed(self, segment: Segment, parts: Sequence[arb_mat]) -> Series:
+        """A series of parts of which only those that are in a segment are given."""
+        found = [parts[0] * 0] * self.monomials.size
+        for number, part in zip(segment.there, parts, strict=False):
+            found[number] = part
+        return Series(self.monomials, found)
 
     @staticmethod
     def _norm(part: Sequence[Sequence[arb]], d: int, u: Sequence[arb]) -> arb:

@@ -172,3 +172,42 @@ def test_boxes_are_cut_where_parts_of_the_parameters_end(monkeypatch: pytest.Mon
         assert part.system.parameters is not None
         whole = part.system.parameters.bounding_box()
         assert (whole.lower <= a).all() and (np.array(b) <= whole.upper).all()
+
+
+SQUARED = sr.VaryingSystem.of(
+    [["-0.5 - p^2*sin(2*t)"]], [["(1 + p^2)*exp(-t)"]], 3.0, [[1]], parameters=sr.Box([-0.3], [0.3]), names=["p"]
+)
+
+
+@pytest.mark.parametrize("sharp", [2.0**-100, 1e-2])
+def test_transitions_hold_what_is_left_out_of_a_series_whose_higher_powers_of_the_time_are(
+    sharp: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(expansions, "SHARP", sharp)
+    law, fine = flow(4, SQUARED), flow(4, SQUARED)
+    (unit,) = law.parts.scales
+    found = {ends: law.over(*ends) for ends in ((0.0, 0.05), (0.3, 0.9), (1.0, 2.9))}
+    monkeypatch.undo()
+    for (start, stop), (states, pushed, _) in found.items():
+        turned = (flint.arb(2 * stop).cos() - flint.arb(2 * start).cos()) / 2  # integral of -sin(2 t)
+        still = ((flint.arb(start) - flint.arb(stop)) / 2).exp()
+        for j, part in enumerate(states.parts):
+            exact = still * (flint.arb(unit) ** 2 * turned) ** (j // 2) / factorial(j // 2) if j % 2 == 0 else 0
+            assert part[0, 0].overlaps(flint.arb(exact))
+            assert float(part[0, 0].rad()) < (3.0 if sharp > 1e-9 else 1e-14)
+        for one, other in zip(pushed.parts, fine.over(start, stop)[1].parts, strict=True):
+            assert one[0, 0].overlaps(other[0, 0])
+        exact = still * 2 * (1 - ((flint.arb(start) - flint.arb(stop)) / 2).exp()) * (-flint.arb(start)).exp()
+        assert pushed.parts[0][0, 0].overlaps(exact)  # of e^(-t / 2) and e^-t
+
+
+def test_what_is_left_out_of_what_inputs_do_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    still = sr.VaryingSystem.of(
+        [["0"]], [["p^2 + 2*cos(t)^2"]], 3.0, [[1]], parameters=sr.Box([-0.3], [0.3]), names=["p"]
+    )
+    monkeypatch.setattr(expansions, "SHARP", 0.3)
+    law = flow(2, still)
+    monkeypatch.setattr(law, "_kept", lambda states, inputs: 1)
+    for start, stop in ((0.0, 0.2), (0.3, 0.5), (1.0, 1.2)):
+        exact = flint.arb(stop) - flint.arb(start) + (flint.arb(2 * stop).sin() - flint.arb(2 * start).sin()) / 2
+        assert law.over(start, stop)[1].parts[0][0, 0].contains(exact)
