@@ -233,6 +233,8 @@ FAST = np.array([[0.0, 5.0], [-5.0, -0.1]])
 FORCE = np.array([[0.0], [1.0]])
 GUST = np.array([[0.3, 0.0], [1.0, -0.5]])
 TRIANGLE = Polytope(np.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), np.array([0.2, 0.1, 0.05]))
+# no two corners are opposite
+SKEWED = Polytope(np.array([[-1.0, -1.0], [1.0, -0.5], [0.0, 1.0]]), np.array([0.2, 0.1, 0.05]))
 LOOPS = {
     "box": Loop(
         SLOW, FORCE, GUST, np.array([0.0, 0.5, 0.7, 1.5, 2.0]), np.array([0.0, 0.4, 1.0, 2.0]), np.array([-1.0, 0.5]),
@@ -289,7 +291,7 @@ CHANGING = {
         c=np.array([0.1, -0.3]), measurable=True, fine=20, rate="1 + t", grown="t + t^2/2", factor="cos(3*t)",
     ),
     "measurable in a triangle in t": Changing(
-        FAST, FORCE, GUST, np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0, 0.0]), TRIANGLE,
+        FAST, FORCE, GUST, np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0, 0.0]), SKEWED,
         measurable=True, fine=40, rate="exp(-t)", grown="1 - exp(-t)", factor="exp(-t)",
     ),
 }  # fmt: skip

@@ -120,6 +120,10 @@ def test_what_an_expansion_leaves_out_of_what_a_piece_does_is_in_the_bounds(monk
             continue
         assert np.abs(loop.values(none, times, H) - truths).max(axis=1).min() > 1e-8, "nothing was left out"
         assert (truths <= loop.bounds(none, times, times, H)).all()
+        pieces, every = loop.measurable, loop.functionals.response.grid.locate(times)
+        assert isinstance(pieces, VaryingPieces)
+        off = np.ptp(pieces.enclosed(times, H, every), axis=2) / 2.0
+        assert off.max() > 1e-7 and (pieces.allowance(times, times, H, every) >= off).all()
 
 
 @pytest.mark.slow
