@@ -12,7 +12,7 @@ from flint import ctx
 
 from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.reach.loop_tube import LoopTube
-from sparserob_core.checker.reach.measurable import MeasurableLoop
+from sparserob_core.checker.reach.measurable import MeasurableLoop, _enclosed
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
@@ -80,9 +80,18 @@ def test_what_a_direction_is_off_by_is_added_as_along_the_axes() -> None:
         for stop in (0.0, 1.0):
             (found,) = one.added([none], 0.0, stop, z)
             top = found.coefficients.sum() + found.error
-            truth = 0.3 / 3.0 / 3.0 * FAR.sum() * (1.0 + stop) + 1.1 * float(FAR @ off_by[0]) * (1.0 + stop)
+            bent = 0.01 * float(FAR @ (c[0] + off_by[0])) * stop
+            truth = float(FAR @ (c[0] + 1.1 * off_by[0])) * (1.0 + stop) + bent
             assert top >= truth * (1.0 - 1e-12)
-            assert top <= truth + 0.01 * FAR.sum() * 0.1 + 1e-2 * float(FAR @ off_by[0]) + 1e-12
+            assert top <= truth * (1.0 + 1e-12) + 1e-14
+
+
+def test_rows_of_balls_are_as_wide_as_they_are() -> None:
+    from flint import arb, arb_mat
+
+    found = _enclosed(arb_mat([[arb(0.5, 1e-3), arb(2.0)]]))
+    assert 1e-3 <= found.rad[0, 0] <= 1.001e-3 and found.rad[0, 1] <= 1e-15
+    np.testing.assert_array_equal(_enclosed(np.eye(2)).rad, np.zeros((2, 2)))
 
 
 def test_a_loop_under_measurable_disturbances_is_seen_along_balls_as_along_floats() -> None:

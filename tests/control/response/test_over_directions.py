@@ -4,7 +4,7 @@ bounded wherever a direction of it points, exactly at the corners, and by little
 from __future__ import annotations
 
 from itertools import product as every_choice
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -99,13 +99,17 @@ def test_it_holds_every_direction_and_is_exact_at_corners(free: int, kind: str) 
             moved = np.eye(free)[axis] * 0.7
             sides = [exact(times, np.tile(rows[0] + (side * moved) @ rows[1:], (times.size, 1))) for side in (1, -1)]
             assert (np.abs(sides[0] - sides[1]) <= 1.4 * steep[:, axis]).all()
+            most = [exact(times, np.tile(side * rows[1 + axis], (times.size, 1))) for side in (1, -1)]
+            assert (steep[:, axis] >= np.max(most, axis=0) * (1 - 1e-9)).all()
+            if len(part.parts) == 1:  # two are along a row and against it, each where it adds more
+                assert steep[:, axis] == pytest.approx(np.max(most, axis=0), rel=1e-9)
     assert lost[1] <= 0.03 * lost[0]  # of second order in the width
 
 
 @pytest.mark.parametrize("kind", ["a box", "errors"])
 def test_a_chord_in_time_holds_every_direction(kind: str) -> None:
     rng, start, width = np.random.default_rng(8), np.array([0.1, 0.8, 1.5]), np.full(3, 0.12)
-    rows = np.vstack([rng.normal(size=D), 0.4 * rng.normal(size=(2, D))])
+    rows = np.vstack([0.01 * rng.normal(size=D), 0.4 * rng.normal(size=(2, D))])
     part, exact = made(kind, rows)
     bent = part.deviation(start, width).sum(axis=1)
     for point in rng.uniform(-1.0, 1.0, (10, 2)):
@@ -126,6 +130,29 @@ def test_what_is_left_out_counts_for_every_row_with_what_rounding_makes_of_corne
     assert (part.neglected - alone.neglected <= 1e-14 * size).all()
 
 
+class Linear:
+    """``c_1 + 2 c_2``, off by as much as ``|c_1|``."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        self.rows = rows
+
+    def at(self, times: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = np.tile(self.rows @ [1.0, 2.0], (times.size, 1))
+        return found[..., None], np.tile(np.abs(self.rows[:, 0]), (times.size, 1))
+
+
+def test_what_corners_are_off_by_and_what_is_rounded_is_in_the_excess() -> None:
+    rows, pattern = np.array([[3.0, 1.0], [1.0, 0.0], [0.0, 2.0]]), np.zeros(2)
+    space = TaylorSpace(0, 0)
+    part = DirectionsCellSupport(cast(Any, Linear), rows, cast(Any, None), combination(space, 2))
+    found, excess = part.at(np.array([1.0]), np.zeros((1, 1, 2)))
+    corners = np.array([[5.0 + a + 4.0 * b for a in (-1.0, 1.0) for b in (-1.0, 1.0)]])
+    _, beyond = between_corners(part.joined.space, pattern, corners)
+    assert values(part.joined.space, found, np.array([[-1.0, -1.0], [1.0, 1.0]])) == pytest.approx(np.array([[0.0, 10.0]]))
+    assert (excess[:, 0] - 4.0 - beyond >= 1e-15).all()
+    assert (excess[:, 0] - 4.0 - beyond <= 1e-11).all()
+
+
 def test_between_corners_is_what_they_are_and_products_that_are_missing_are_counted() -> None:
     rng = np.random.default_rng(9)
     for nu in (1, 2, 3, 4):
@@ -134,4 +161,5 @@ def test_between_corners_is_what_they_are_and_products_that_are_missing_are_coun
         found, beyond = between_corners(space, np.zeros(nu), given)
         off = np.abs(found @ space.monomials(corners).T - given)
         assert (off <= beyond[:, None] + 1e-14).all()
+        assert (beyond >= 1e-15 * np.abs(given).max(axis=1)).all()
         assert (beyond <= 1e-12).all() if nu < 3 else (off.max(axis=1) >= 0.05 * beyond).all()
