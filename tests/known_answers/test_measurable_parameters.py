@@ -96,9 +96,9 @@ PLANTS: dict[str, tuple[Config, Law, Callable[[np.ndarray], np.ndarray]]] = {
     ),
     "parts": (
         {
-            "system": {**SPRING, "parameters": {"p": [-1.5, 2.0]}},
+            "system": {**SPRING, "parameters": {"p": [-2.0, 2.5]}},
             "disturbance": {"box": [0.005, 0.005]},
-            "terminal": [{"box": [0.6, 1.2]}],
+            "terminal": [{"box": [0.6, 1.4]}],
         },
         lambda t, p, q: ([[0, 1], [-4 + p, -0.3]], B),
         lambda rows: 0.005 * np.abs(rows).sum(axis=-1),
@@ -293,7 +293,8 @@ def test_the_worst_signal_at_a_parameter_attains_what_is_claimed() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("bound", [BOX, TRIANGLE], ids=["box", "triangle"])
 def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_little(bound: Config) -> None:
-    experiment = of_problem(**PLANTS["two"][0] | {"disturbance": bound})
+    weak = {**PLANTS["two"][0]["system"], "B": [[1e-6, 0], [0, 1e-6]]}  # what is not theirs is not in the bounds
+    experiment = of_problem(system=weak, disturbance=bound)
     control = np.zeros((2, 4)).tolist()
     case = Case(experiment.problem, experiment.control, experiment.disturbance, {"decision": control})
     strayed, c, box = case.strayed, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
@@ -311,6 +312,16 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
             assert high - 1e-15 <= over + found.off
             assert over - low < found.off + found.over + 1e-5
     assert found.off < 2e-3
+    whole = ((-0.05, -0.03), (0.1, 0.05))
+    flow = SpreadTube(case.spread(whole), np.eye(2), whole).flow
+    wide, truth = strayed.over(c, [1.5], whole, flow), strayed.at(flow.centre).added(c, 1.5)[0]
+    assert wide.ends[0, 0] + 1e-6 < truth < wide.ends[0, 0] + wide.off  # there it is concave
+    step, n = 1.5 / 900, 900
+    M = np.array([[0.0, 1.0], [-4.0 + flow.centre[0], -0.3 - flow.centre[1]]])
+    rows = [c @ expm(M * step * (k + 0.5)) @ E for k in range(n)]
+    about = MIDDLE if bound is BOX else np.array([-0.015, -0.025])  # the middle of the box around it, which is in it
+    heights = PLANTS["two" if bound is BOX else "triangle"][2](np.array(rows)) - np.array(rows) @ about
+    assert truth == pytest.approx(float(heights.sum()) * step, rel=1e-5)
     half = ((-0.0175, 0.0025), (-0.0125, 0.0075))
     smaller = strayed.over(c, [start, start + 0.005], half, SpreadTube(case.spread(half), np.eye(2), half).flow)
     assert smaller.off < 0.26 * found.off  # of second order in the widths and in the time
