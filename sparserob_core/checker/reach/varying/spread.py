@@ -432,9 +432,8 @@ class SpreadFlow:
         if not 0.0 <= start <= stop <= segment.stop:
             raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
         terms, rest = self._series(segment, start, stop)
-        for term in terms[order + 1 :]:
-            rest = rest + Series(self.monomials, [_around(part) for part in term.parts])
-        return terms[: order + 1], rest
+        later = [_around(parts) for parts in zip(*(term.parts for term in terms[order + 1 :]), strict=True)]
+        return terms[: order + 1], rest + Series(self.monomials, later) if later else rest
 
     def _series(self, segment: Segment, start: float, stop: float) -> tuple[list[Series], Series]:
         """The terms of the solution of ``Y' = h A Y + [0, h B, h E]``, ``Y(0) = [I, 0, 0]``, in powers of the share of
@@ -880,9 +879,12 @@ def _columns(series: Series, first: int, last: int | None) -> Series:
     return Series(series.monomials, parts)
 
 
-def _around(matrix: arb_mat) -> arb_mat:
-    """Balls around 0 that hold the entries."""
-    return stacked([[_wider(x * 0, abs(x)) for x in row] for row in matrix.tolist()])
+def _around(matrices: Sequence[arb_mat]) -> arb_mat:
+    """Balls around 0 that hold the sums of entries, each times any factor from -1 to 1."""
+    rows = zip(*(one.tolist() for one in matrices), strict=True)
+    return stacked(
+        [[_wider(x[0] * 0, sum(map(abs, x[1:]), abs(x[0]))) for x in zip(*row, strict=True)] for row in rows]
+    )
 
 
 def _row_sums(tables: Array) -> Array:
