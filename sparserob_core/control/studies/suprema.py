@@ -300,7 +300,7 @@ def _of_program(
     middle = (family.index_set.lower + family.index_set.upper) / 2
     times = np.linspace(family.index_set.lower[0], family.index_set.upper[0], LOOKS)
     looked = family.violations(decision, np.hstack([times[:, None], np.tile(middle[1:], (LOOKS, 1))]))
-    parameter = model.parameters.clamp(middle[None, 1:])
+    parameter = model.parameters.clamp((middle * units)[None, 1:])
     added = _added(model.functionals, theta, row.direction[:d], times * units[0], parameter)
     met = float(np.abs(looked).max())
     size = met if max(met, added / unit) > NOTHING else 1.0

@@ -86,6 +86,13 @@ def test_the_worst_parameter_may_be_inside_its_interval(tmp_path: Path) -> None:
     assert sr.check(tmp_path / "out").status == "verified"
 
 
+def test_rows_are_looked_at_in_the_middle_of_parameters_that_are_far_from_1() -> None:
+    """e^(1.1 2), whose parameter in own units would make it e^2000, terms by which both sides were told wider."""
+    system = {"A": [["1000 * k"]], "B": [[1]], "parameters": {"k": [0.0009, 0.0011]}}
+    found = sr.bound(config(system=system, initial_state=[1], terminal=[{"box": [100.0]}]))
+    assert_encloses(found.rows[0], math.exp(2.2))
+
+
 def test_a_window_is_bounded_over_time_and_its_envelope_holds_the_truth(tmp_path: Path) -> None:
     """x' = -x + w from 1: x(t) = e^-t + 0.2 (1 - e^-t) at most."""
     stated = config(
