@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 WELL_CONDITIONED = 1e6
 SWEEPS = 12  # of balancing
+FAINT = 1e-6  # with 1 a state's own source would be overlooked beside others, with 0 its unit may be that of a speck
 LEAST = 2.0**-900  # rate that takes part in it; units end at 2^-500
 ORDER = 6  # of the expansion in time
 
@@ -278,11 +279,18 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
     (Osborne 1960).
 
     The sources take part as one more state, and where one state drives another but not the reverse, a small number
-    stands for the reverse: what makes the two of the size that one reaches through the other within the horizon.
+    stands for the reverse: what makes the two of the size that one reaches through the other within the horizon. A
+    source that moves a state by next to nothing of what it is moved by through others does not count.
     """
     rates = np.zeros((speed.size + 1, speed.size + 1))
     rates[:-1, :-1], rates[:-1, -1] = np.abs(A), speed
     np.fill_diagonal(rates, 0.0)
+    through = reached = speed
+    with np.errstate(over="ignore", invalid="ignore"):
+        for turn in range(1, speed.size):
+            reached = horizon / turn * (rates[:-1, :-1] @ reached)
+            through = through + reached
+        rates[:-1, -1] = np.where(speed < FAINT * through, 0.0, speed)
     rates[rates < LEAST] = 0.0  # such are what outward rounding makes of no drive at all; they have no reciprocal
     driven = np.where(rates > 0.0, rates, np.inf)
     rates = np.maximum(rates, (1.0 / horizon / horizon / driven).T)
