@@ -25,7 +25,7 @@ from sparserob_core.checker.sets import flat
 from sparserob_core.control.policies import policy
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
-from sparserob_core.control.sets.sets import Box, Cylinder, Equality, NormBall, Polytope, Zonotope
+from sparserob_core.control.sets.sets import Box, Cylinder, Equality, NormBall, Polytope
 from tests.checker.claims import test_lists
 from tests.checker.claims.test_windows import case_of
 from tests.checker.reach.test_kernels import kernel_of
@@ -99,14 +99,14 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "of a flat set of initial states, the checker knows boxes only",
     ),
     "no list": (lambda: Case._parts(Box([-1.0], [1.0])), Unchecked, "lists of sets only"),
-    "measurable in a sum of segments, in time": (
+    "measurable in a cylinder, in time": (
         lambda: (
             forced(
-                test_lists.case_of("in time, measurable"), disturbance=Zonotope(np.zeros(2), 0.1 * np.eye(2))
+                test_lists.case_of("in time, measurable"), disturbance=Cylinder(NormBall(3.0, 0.1, dimension=1), 2)
             ).strayed
         ),
         Unchecked,
-        "measurable disturbances in boxes, polytopes, ellipsoids, balls, and products of these",
+        "measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and products of",
     ),
     "errors of execution of a policy": (
         lambda: replace(kind("alone").case(execution=np.array([0.1, 0.2])), policy=AffinePolicy()).execution,

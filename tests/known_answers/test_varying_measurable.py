@@ -266,7 +266,7 @@ def test_a_constant_plant_in_a_curved_set_costs_the_same_as_a_function_of_time(m
 
 
 def test_a_set_of_which_no_integral_is_known_is_refused_by_name() -> None:
-    with pytest.raises(sr.InputError, match="disturbance: expected a box, polytope, ellipsoid or ball where the"):
+    with pytest.raises(sr.InputError, match="disturbance: expected a box, polytope, ellipsoid, ball or zonotope"):
         sr.OptimalControlProblem(
             system=sr.VaryingSystem.of([["-t"]], [[1]], 1.0, E=[[1, "t"]]),
             horizon=1.0,
@@ -275,6 +275,82 @@ def test_a_set_of_which_no_integral_is_known_is_refused_by_name() -> None:
             disturbance=ByItsSupport(sr.NormBall(2.0, 0.1, dimension=2)),
             disturbance_class="measurable",
         )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dressed", [False, True], ids=["constant", "in time"])
+@pytest.mark.parametrize(
+    "generators",
+    [[[0.05, 0.01], [0.01, 0.03], [-0.02, 0.02]], [[0.05, -0.02]], [[0.0, 0.0]], [[0.03, 0.0], [0.06, 0.0]]],
+    ids=["three", "a segment", "a point", "two in line"],
+)
+def test_a_zonotope_is_a_box_through_its_segments(generators: list[list[float]], dressed: bool, tmp_path: Path) -> None:
+    E, G, centre = np.array([[0.5, 0.2], [-0.3, 1.0]]), np.array(generators), [0.01, -0.02]
+    A = [["0*t", 1], [-1, "-0.3 + 0*t"]] if dressed else [[0, 1], [-1, -0.3]]
+    shared = {**CART, "path": [], "disturbance_class": "measurable"}
+    drift = E @ centre
+    zonotope = {
+        **shared,
+        "system": {"A": A, "B": [[0], [1]], "E": E.tolist()},
+        "disturbance": {"zonotope": {"centre": centre, "generators": generators}},
+    }
+    box = {
+        **shared,
+        "system": {"A": A, "B": [[0], [1]], "E": (E @ G.T).tolist(), "c": drift.tolist()},
+        "disturbance": {"box": [1.0] * len(generators)},
+    }
+    costs = [verified(tmp_path / name, one, pieces(6))["cost"] for name, one in (("a", zonotope), ("b", box))]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-7)
+    longer = tampering.problem(disturbance={"zonotope": {"centre": centre, "generators": (1.001 * G).tolist()}})
+    if G.any():
+        assert check(tampering.forged(tmp_path / "a", tmp_path / "copy", longer, consistent=True)).status == "refuted"
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize(
+    "bound",
+    [
+        {"norm": {"p": 3, "radius": 1e-12}},
+        {"box": 1e-13},
+        {"ellipsoid": {"centre": [0, 0], "shape": [[1e-26, 0], [0, 1e-26]]}},
+        {"norm": {"p": 2, "radius": 1e-300}},
+    ],
+)
+def test_disturbances_that_are_next_to_nothing_are_followed(bound: Problem, tmp_path: Path) -> None:
+    """A state that nothing else pushes directly was given their unit, in which the others are fast."""
+    problem = {
+        **{key: value for key, value in CART.items() if key != "path"},
+        "system": {"A": [[0, 1], [-1, -0.2]], "B": [[0], [1]], "E": [[1, 0], [0, 1]]},
+        "disturbance": bound,
+    }
+    still = {**problem, "disturbance": {"box": [0.0, 0.0]}}
+    costs = [verified(tmp_path / name, one, pieces(4))["cost"] for name, one in (("a", problem), ("b", still))]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-8)
+
+
+HONEST: dict[str, Problem] = {
+    "errors": {"execution": [0.3], "system": {"A": [[0]], "B": [["1 + t/3"]]}, "terminal": [{"box": 1.0}]},
+    "a box": {**ANY, "disturbance": {"box": 0.15}, "system": {"A": [["-0.3 - t/9"]], "B": [[1]]}},
+    "a diamond": {
+        **ANY,
+        "disturbance": {"norm": {"p": 1, "radius": 0.1}},
+        "system": {"A": [[0]], "B": [[1]], "E": [["1", "2*t"]]},
+    },
+    "a ball": {
+        **ANY,
+        "disturbance": {"norm": {"p": 2, "radius": 0.1}},
+        "system": {"A": [[0]], "B": [[1]], "E": [["1", "2*t"]]},
+    },
+}
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize("name", HONEST)
+def test_a_bound_that_rests_on_a_large_integral_is_derived_as_closely_as_it_is_written(
+    name: str, tmp_path: Path
+) -> None:
+    """These were refuted: integrals were told 1e-12 of themselves too wide, more than a written bound leaves."""
+    verified(tmp_path / "run", {**STRAIGHT, **HONEST[name]}, pieces(4))
 
 
 def ellipse(square: float = 0.01) -> Problem:
@@ -300,6 +376,7 @@ def rounded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["1", "t - 1"], 2, float(np.sqrt(2.0) + np.arcsinh(1.0))),  # the length of a parabola
         (["t - 1", "2*t - 2"], 2, float(np.sqrt(5.0))),  # which is 0 at 1
         (["t - 1", "2 - 2*t"], 3, float((1.0 + 2.0**1.5) ** (2.0 / 3.0))),
+        (["1", "2*t"], 1.0 + 1e-6, 4.25),  # 1 until 0.5, then 2 t, but for 1e-12
         (["1", "t - 1"], 3, 2.0 * float(quad(lambda s: (1.0 + s**1.5) ** (2.0 / 3.0), 0, 1, epsabs=1e-11)[0])),
     ],
 )

@@ -23,7 +23,7 @@ from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.integrals import Running, integrating, spelt
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
-from sparserob_core.checker.reach.measurable import Execution, Side
+from sparserob_core.checker.reach.measurable import Execution, Side, Together
 from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
@@ -418,9 +418,7 @@ class Case:
         ends, system = np.array([0.0, self.grid[-1]]), self.problem.system
         first = system.controls + (system.c is not None)
         if not bound.is_box:
-            side, *more = Side.of(bound)
-            if more:
-                raise Unchecked("of a system that changes with time, the checker knows sets of corners only")
+            side = Together(Side.of(bound))
             return self._missing(np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
         box, about = bound.bounding_box(), _middle(bound)
         sides, single = np.stack([box.upper - about, about - box.lower]), box.upper == box.lower

@@ -26,7 +26,7 @@ from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
 from sparserob_core.checker.reach.flow import OwnUnits, column, flows, held, middles, stacked
 from sparserob_core.checker.sets.along import Curve
-from sparserob_core.checker.sets.flat import Boxed, Cornered
+from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -55,7 +55,8 @@ class Side:
 
     @staticmethod
     def of(shape: ConvexSet) -> list[Side | Curve]:
-        """Those of a set, counted from its middle: of a box one for every channel, a curved one as it is."""
+        """Those of a set, counted from its middle: of a box one for every channel, of a zonotope one for every segment,
+        a curved one as it is."""
         from flint import arb, fmpq
 
         about, seen = [arb(float(m)) for m in middle(shape)], known(shape)
@@ -65,6 +66,11 @@ class Side:
                 axis = balls(np.eye(seen.dimension)[i])
                 ends = [seen.support(axis) - m, -seen.support([-x for x in axis]) - m]
                 found.append([[end if j == i else arb(0) for j in range(seen.dimension)] for end in ends])
+        elif isinstance(seen, Segments):
+            found = [[[arb(float(c)) - m for c, m in zip(seen.source.centre, about, strict=True)]]]
+            for segment in seen.segments:
+                end = [arb(fmpq(x.numerator, x.denominator)) for x in segment]
+                found.append([end, [-x for x in end]])
         elif isinstance(seen, Cornered):
             exact = [[arb(fmpq(x.numerator, x.denominator)) for x in corner] for corner in seen.corners]
             found = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
@@ -91,6 +97,31 @@ class Side:
         P = np.einsum("npw,vw->npv", plain, self.corners)
         e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
         return *swept(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Together:
+    """The sum of several ``sides``, of which there is at least one: its support function is the sum of theirs."""
+
+    sides: Sequence[Side | Curve]
+
+    @property
+    def dimension(self) -> int:
+        """How many coordinates there are."""
+        return self.sides[0].dimension
+
+    @cached_property
+    def far(self) -> Array:
+        """`Side.far`."""
+        return np.asarray(np.sum([side.far for side in self.sides], axis=0) * OUTWARD)
+
+    def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
+        """`Side.swept`."""
+        every = [side.swept(plain, off, sizes, ends) for side in self.sides]
+        value, more, less, tops = (np.sum(part, axis=0) for part in zip(*every, strict=True))
+        rounded = rounding(len(every)) * 2.0 * tops
+        return value, (more + rounded) * OUTWARD, (less + rounded) * OUTWARD, tops
 
 
 @final
@@ -182,7 +213,8 @@ class Kernel:
 
 def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
     """The integral over ``u`` from -1 to ``ends (M,)`` of the largest of polynomials ``P (M, p + 1, v)``, which are off
-    by at most ``e (M, v)``: values, and by how much more and less it may be, ``(M,)``."""
+    by at most ``e (M, v)``, rounding of what is added up to two values of theirs included: values, and by how much more
+    and less it may be, ``(M,)``."""
     orders = np.arange(P.shape[1])
     here, start, stop = np.arange(len(P)), -np.ones(len(P)), ends.copy()
     value, more, less = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P))
@@ -207,8 +239,10 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
         area = _valued(chosen, stop[done]) * stop[done] - _valued(chosen, start[done]) * start[done]
         own, others = e[at, best[done]], e[at].max(axis=1)
         np.add.at(value, at, area)
-        np.add.at(more, at, (wrong[done] + own + 2.0 * others) * width[done])
-        np.add.at(less, at, own * width[done])
+        # of more parts than two both ends are added up as well
+        rounded = 2.0 * rounding(orders.size + 4) * np.abs(chosen).sum(axis=1) * (turn > 1)
+        np.add.at(more, at, (wrong[done] + own + 2.0 * others) * width[done] + rounded)
+        np.add.at(less, at, own * width[done] + rounded)
         if settled.all():
             break
         rest = rows[~settled]

@@ -20,7 +20,7 @@ import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.curved import Ball, Ellipsoidal, Joint
-from sparserob_core.checker.sets.flat import Boxed, Cornered
+from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, rounding
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.sip.convex_set import Array
@@ -31,6 +31,7 @@ LEFT = 4.0 * DISC ** (-2.0 * NODES) / (1.0 - 1.0 / DISC) * OUTWARD
 ROUNDS = 60  # in which cells are halved
 SETTLED = 2.0**-49  # of the heights: what a cell may be off by before it is halved no more
 ROOM = 0.999  # of a sum of squares or powers, by which it may move: it is away from 0 whatever rounding does
+STEEP = 1e9  # a power of a number that is rounded is off by some 1e-6 of itself, where there is room for 1e-3
 AT_ONCE = 20_000  # cells that are looked at together: some 50 MB
 
 
@@ -164,6 +165,11 @@ def _height(part: Shape, about: Array, c: Array) -> tuple[Array, Array]:
         corners, off = _corners(part, about)
         high = (c @ corners.T).max(axis=1)
         return high, (size @ (off + rounding(c.shape[1] + 2) * np.abs(corners)).T).max(axis=1) * OUTWARD
+    if isinstance(part, Segments):
+        ends, beside = np.abs(part.source.generators).T, part.source.centre - about
+        high = np.abs(c @ part.source.generators.T).sum(axis=1) + c @ beside
+        off = rounding(sum(ends.shape) + 2) * (size @ ends).sum(axis=1)
+        return high, (off + rounding(len(ends) + 4) * (size @ np.abs(beside))) * OUTWARD
     L, share, q = _root(part)
     y = c @ L
     norm = _norm(y, q)
@@ -192,6 +198,12 @@ def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
             other = np.einsum("kvw,kw->kv", np.abs(best[:, None] - corners), apart) < behind
             alone = other | (best[:, None] == corners).all(axis=2)
             most = np.where(alone.all(axis=1), (reach @ (np.abs(corners) + off).T).max(axis=1), np.inf)
+        elif isinstance(part, Segments):
+            ends = np.abs(part.source.generators).T
+            moved = apart @ ends + rounding(len(ends) + 2) * (reach @ ends)
+            fixed = (np.abs(value @ part.source.generators.T) > moved) | (moved == 0.0)
+            heights = (reach @ ends).sum(axis=1) + reach @ (np.abs(part.source.centre - own) * OUTWARD)
+            most = np.where(fixed.all(axis=1), heights, np.inf)
         else:
             L, share, q = _root(part)
             y, b = np.abs(value @ L), apart @ np.abs(L)
@@ -203,12 +215,28 @@ def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
                 analytic = moved < ROOM * least
             else:  # the slope of z^q is at most q (y + b)^(q - 1) on the way
                 least, moved = (y**q).sum(axis=1), (q * b * (y + b) ** (q - 1.0)).sum(axis=1)
-                analytic = (moved < ROOM * least) & ((y * ROOM > b) | (y + b == 0.0)).all(axis=1)
+                analytic = (moved < ROOM * least) & (q < STEEP)
+            found = np.where(analytic, (least + moved) ** (1.0 / q), np.inf)
+            if q != 2.0:
+                away = ((y * ROOM > b) | (y + b == 0.0)).all(axis=1)
+                found = np.where(away, np.minimum(found, _led(y, b, q)), np.inf)
             beside = np.abs(part.centre - own) * OUTWARD
-            root = unit[:, 0] * (least + moved) ** (1.0 / q) * (1.0 + 2.0 * share)
-            most = np.where(analytic, root + reach @ beside, np.inf)
+            most = unit[:, 0] * found * (1.0 + 2.0 * share) + reach @ beside
         total = total + most
     return total * OUTWARD
+
+
+def _led(y: Array, b: Array, q: float) -> Array:
+    """How large the ``q``-norm is within ``b (k, d)`` of ``y (k, d)``, both at least 0, where one entry leads: of
+    quotients with that, the powers of all others add up to less than 1, so that 1 and they are away from 0. For a large
+    ``q`` that is nearly everywhere, while a power changes by its own size where its base does by ``1 / q``."""
+    lead = y.argmax(axis=1)[:, None]
+    low, high = (np.take_along_axis(end, lead, axis=1) for end in (y - b, y + b))
+    quotients = np.where(low > 0.0, (y + b) / np.where(low > 0.0, low, 1.0), 1.0)
+    quotients = np.minimum(quotients * (1.0 + 16.0 * HALF_ULP), 1.0) ** q
+    np.put_along_axis(quotients, lead, 0.0, axis=1)
+    rest = quotients.sum(axis=1)
+    return np.where((low[:, 0] > 0.0) & (rest < ROOM), high[:, 0] * (1.0 + rest) ** (1.0 / q), np.inf)
 
 
 def _norm(y: Array, q: float) -> Array:
@@ -226,7 +254,8 @@ def _root(part: Shape) -> tuple[Array, float, float]:
     if isinstance(part, Ellipsoidal):
         return part.source.factor, part.missed, 2.0
     raise Unchecked(
-        "the checker knows measurable disturbances in boxes, polytopes, ellipsoids, balls, and products of these"
+        "the checker knows measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and products of"
+        " these"
     )
 
 

@@ -257,6 +257,15 @@ class Segments(Flat):
                 found.setdefault(tuple(str(v / lead) for v in minors), [v / size for v in minors])
         return [tuple(Fraction(int(v.p), int(v.q)) for v in normal) for normal in found.values()]
 
+    def contains(self, point: Sequence[float] | Array) -> bool:
+        """Of its middle that is no question."""
+        return np.array_equal(point, self.source.centre) or super().contains(point)
+
+    @property
+    def segments(self) -> list[list[Fraction]]:
+        """The segments ``(q, d)``, exactly."""
+        return [[Fraction(float(v)) for v in row] for row in self.source.generators if row.any()]
+
     def holds(self, point: Sequence[arb]) -> bool:
         if self.facets is None:
             raise Unchecked(

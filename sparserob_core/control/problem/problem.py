@@ -172,8 +172,8 @@ class OptimalControlProblem(Term):
         if self.system.varies and bound is not None and not enclosed(bound):
             raise InputError(
                 path="disturbance",
-                expected="a box, polytope, ellipsoid or ball where the system changes with time and disturbances are"
-                " measurable",
+                expected="a box, polytope, ellipsoid, ball or zonotope where the system changes with time and"
+                " disturbances are measurable",
                 got=bound.kind,
             )
         self._set("measurements", self._measured())

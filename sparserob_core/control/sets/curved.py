@@ -28,6 +28,7 @@ from sparserob_core.sip.convex_set import (
 )
 
 _SIGN_DIMENSIONS = 10
+STEEP = 1e10  # powers up to which a rounding of the base is no more than there is room for in the power
 ROOM = 0.999  # of a sum of powers, by which it may move: it is away from 0 whatever rounding does
 
 
@@ -470,16 +471,30 @@ def _continued_root(a: Array, b: Array, q: float) -> Array:
     """How large ``(sum_i z_i^q)^(1/q)`` is at most where every ``z_i`` is within ``b_i`` of ``|a_i|``; ``inf`` where
     the sum may leave the right half-plane, or for ``q`` other than 2 an entry may be 0 without being 0 everywhere.
 
-    ``z^q`` is off by at most ``q b (|a| + b)^(q - 1)``, the integral of its slope; ``a, b (k, d)``; returns ``(k,)``.
+    ``z^q`` is off by at most ``q b (|a| + b)^(q - 1)``, the integral of its slope, or less where one entry is larger
+    than the others (`_beside_largest`); ``a, b (k, d)``; returns ``(k,)``.
     """
     largest = (np.abs(a) + b).max(axis=1, keepdims=True)
     unit = np.where(largest > 0.0, largest, 1.0)
     a, b = np.abs(a) / unit, b / unit
     total, off = (a**q).sum(axis=1), (q * b * (a + b) ** (q - 1.0)).sum(axis=1)
     analytic = off < ROOM * total
-    if q != 2.0:
-        analytic &= ((a > b) | (b == 0.0)).all(axis=1)
-    return np.where(analytic, unit[:, 0] * (total + off) ** (1.0 / q), np.inf)
+    if q == 2.0:
+        return np.where(analytic, unit[:, 0] * np.sqrt(total + off), np.inf)
+    away = ((a > b) | (b == 0.0)).all(axis=1)
+    found = np.where(analytic & away & (q < STEEP), (total + off) ** (1.0 / q), np.inf)
+    return np.asarray(unit[:, 0] * np.minimum(found, np.where(away, _beside_largest(a, b, q), np.inf)))
+
+
+def _beside_largest(a: Array, b: Array, q: float) -> Array:
+    """The same of entries ``a >= 0`` that are not 0 within ``b``, as ``z (1 + sum (z_i / z)^q)^(1/q)``, ``z`` the
+    largest: where the others are smaller by more than ``1 / q`` of it that says something of intervals of any length,
+    and the sum of powers itself of those that are shorter than ``1 / q`` alone."""
+    first = np.arange(a.shape[1]) == a.argmax(axis=1)[:, None]
+    least, most = (np.where(first, end, 0.0).sum(axis=1) for end in (a - b, a + b))
+    shares = (a + b) / np.where(least > 0.0, least, 1.0)[:, None] * (1.0 + 8.0 * np.finfo(float).eps)
+    others = np.where(first, 0.0, np.minimum(shares, 1.0) ** q).sum(axis=1)
+    return np.where((least > 0.0) & (others < ROOM), most * (1.0 + others) ** (1.0 / q), np.inf)
 
 
 def _norm(vectors: Array, q: float) -> Array:

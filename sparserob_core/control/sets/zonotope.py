@@ -12,9 +12,10 @@ import numpy as np
 
 from sparserob_core.brief import noun
 from sparserob_core.shapes import sealed
-from sparserob_core.sip.convex_set import Array, ConvexSet, chords
+from sparserob_core.sip.convex_set import Array, ConvexSet, chords, continued_by_signs
 
 MOST_SIDES = 500  # pairs of half-spaces that are listed; beyond, the set is left to its support function
+ROUNDED = 1e-14  # of what is added up along a generator
 PARALLEL = 1e-10  # of its generators' size, a normal that is none
 
 
@@ -43,6 +44,17 @@ class Zonotope(ConvexSet):
         directions = np.asarray(directions, dtype=float)
         height: Array = directions @ self.centre + np.abs(directions @ self.generators.T).sum(axis=-1)
         return height
+
+    def continued(self, centre: Array, spread: Array) -> Array:
+        """Where no ``c'g_j`` may be 0, as rounding leaves it."""
+        each = np.abs(self.generators).T
+        along = continued_by_signs(
+            np.zeros(len(self.generators)),
+            np.ones(len(self.generators)),
+            centre @ self.generators.T,
+            (spread + ROUNDED * np.abs(centre)) @ each,
+        )
+        return np.asarray(along + (np.abs(centre) + spread) @ np.abs(self.centre))
 
     def support_point(self, directions: Array) -> Array:
         signs = np.sign(np.asarray(directions, dtype=float) @ self.generators.T)

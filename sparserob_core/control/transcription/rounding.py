@@ -18,7 +18,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.result import Result
 
 SHARE = 64 * 2.0**-52  # of the numbers that are added up to a row: products of a few matrices and sums of many terms
-
+INTEGRATED = 8.0  # as often do integrals of absolute values count: whoever encloses them adds up many parts of each
 SMALL_GAP = 1e-11  # by which the gap may be wider then than it was to be
 
 
@@ -147,7 +147,7 @@ def _beside_control(
     sizes += np.einsum("klm,ml->k", np.abs(weights.control), np.abs(functionals.known))
     if functionals.execution is not None:
         lengths = functionals.execution.lengths(times, functionals.execution.seen(directions, parameters))
-        sizes += lengths @ np.repeat(_far(model.problem.control), model.control.pieces)
+        sizes += INTEGRATED * (lengths @ np.repeat(_far(model.problem.control), model.control.pieces))
     return np.asarray(sizes + _disturbing(model, weights.disturbance, times, directions, parameters))
 
 
@@ -157,7 +157,9 @@ def _disturbing(model: Transcription, on_noise: Array, times: Array, directions:
         return np.zeros(times.size)
     sizes: Array = (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
     measurable = model.functionals.measurable
-    return sizes if measurable is None else sizes + measurable.integrated_sizes(times, directions, parameters)
+    if measurable is None:
+        return sizes
+    return sizes + INTEGRATED * measurable.integrated_sizes(times, directions, parameters)
 
 
 def _quadratic(model: Transcription, result: Result) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from flint import arb, ctx
@@ -11,8 +13,10 @@ from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.sets.along import LEFT, NODES, Curve, _heights, _most, rule
 from sparserob_core.checker.sets.known import known
-from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope, Zonotope, product
+from sparserob_core.checker.sets.shape import Shape
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope, product
 
+SEGMENTS = np.array([[0.3, 0.04], [-0.03, 0.4]])
 SETS: dict[str, ConvexSet] = {
     "ellipsoid": Ellipsoid([0.1, -0.3], [[0.04, 0.01], [0.01, 0.09]]),
     "long ellipsoid": Ellipsoid([5.0, 0.0], [[1.0, 1.9999], [1.9999, 4.0]]),
@@ -20,6 +24,7 @@ SETS: dict[str, ConvexSet] = {
     "3-norm": NormBall(3.0, 0.7, dimension=2),
     "1.3-norm": NormBall(1.3, 0.7, dimension=2),
     "product": product([NormBall(2.0, 0.5, dimension=2), Box([-1.0], [2.0])]),
+    "with segments": product([NormBall(2.0, 0.5, [0.1, 0.0]), Zonotope(np.array([0.2, 0.1]), SEGMENTS)]),
     "with a triangle": product([Polytope([[-1, 0], [0, -1], [1, 1]], [0.4, -0.1, 1.0]), NormBall(2.0, 0.5, [1, 0])]),
 }
 
@@ -109,8 +114,10 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> Non
     assert not analytic(third, [1.0, 0.1], [0.0, 0.1]) and analytic(third, [1.0, 0.0], [0.1, 0.0])
     assert analytic(Box([-1.0], [1.0]), [1.0], [0.99]) and not analytic(Box([-1.0], [1.0]), [1.0], [1.0])
     assert analytic(corners, [1.0, 0.5], [0.24, 0.24]) and not analytic(corners, [1.0, 0.5], [0.26, 0.26])
+    segments = Zonotope(np.zeros(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
+    assert analytic(segments, [1.0, 0.5], [0.2, 0.2]) and not analytic(segments, [1.0, -0.5], [0.3, 0.3])
     with pytest.raises(Unchecked, match="boxes, polytopes, ellipsoids"):
-        analytic(product([ball, Zonotope(np.zeros(1), np.ones((1, 1)))]), [1.0, 0.0, 1.0], [0.0, 0.0, 0.0])
+        _most(known(Cylinder(ball, 3)), np.zeros(3), np.ones((1, 3)), np.zeros((1, 3)))
 
 
 @pytest.mark.first(1)
@@ -124,3 +131,51 @@ def test_what_is_said_of_complex_directions_holds_of_those_that_are_real(name: s
     for sign in rng.uniform(-1.0, 1.0, size=(20, bound.dimension)):
         inside, _ = _heights(some.shape, some.about, centre + sign * spread)
         assert (np.abs(inside) <= most).all()
+
+
+@pytest.mark.parametrize("p", [1.5, 1.01, 1.0 + 1e-5, 1.0 + 1e-12])
+def test_a_norm_is_no_larger_at_complex_directions_than_is_said(p: float) -> None:
+    """In complex numbers: ``z_1 (1 + sum (z_i / z_1)^q)^(1/q)``, ``z_1`` the largest."""
+    some, rng = curve(NormBall(p, 1.0, dimension=2)), np.random.default_rng(4)
+    q = p / (p - 1.0)
+    centre = np.sort(np.abs(rng.normal(size=(600, 2))), axis=1)
+    spread = centre * rng.uniform(0.0, 1.0, size=(600, 1)) ** 3
+    most = _most(some.shape, some.about, centre, spread)
+    finite = np.isfinite(most)
+    assert finite.sum() > 200
+    z, apart = centre[finite], spread[finite]
+    for _ in range(40):
+        turns = np.exp(2j * np.pi * rng.uniform(size=z.shape))
+        small, lead = (z + apart * rng.uniform(0.5, 1.0, size=z.shape) * turns).T
+        root = lead * np.exp(np.log1p(np.exp(q * np.log(small / lead))) / q)
+        assert (np.abs(root) <= most[finite] * (1 + 1e-12)).all()
+    near = z[:, 0] + apart[:, 0] >= z[:, 1] - apart[:, 1]
+    assert not (near & (q * apart.max(axis=1) > z[:, 1] + apart[:, 1])).any()
+
+
+@pytest.mark.parametrize("p", [1.01, 1.0 + 1e-6, 1.0 + 1e-12])
+def test_balls_that_are_nearly_those_of_the_1_norm_take_few_cells(p: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two entries that change places, of which one goes through 0, against a rule on cells that narrow to where they
+    are the same."""
+    cells = [0]
+
+    def most(shape: Shape, about: np.ndarray, c: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        cells.append(len(c))
+        return _most(shape, about, c, spread)
+
+    monkeypatch.setattr("sparserob_core.checker.sets.along._most", most)
+    zero, plain = np.zeros((1, 2)), np.array([[[0.45, 0.25], [-0.35, 0.55]]])
+    value, more, less, _ = curve(NormBall(p, 0.7, dimension=2)).swept(plain, zero, zero, np.ones(1))
+    q, edge = p / (p - 1.0), 0.2 / 0.9
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    apart = np.concatenate([[0.0], np.geomspace(1e-4 / q, 0.6, 60)])
+    cuts = np.unique(np.concatenate([[-1.0, -0.25 / 0.55, 1.0], edge - apart, edge + apart]))
+    exact = 0.0
+    for low, high in pairwise(cuts):
+        s = (low + high) / 2 + (high - low) / 2 * nodes
+        a, b = np.abs(0.45 - 0.35 * s), np.abs(0.25 + 0.55 * s)
+        power = np.exp(q * np.log(np.minimum(a, b) / np.maximum(a, b)))
+        exact += 0.7 * float(np.maximum(a, b) * np.exp(np.log1p(power) / q) @ weights) * (high - low) / 2
+    assert -less[0] - 1e-15 <= exact - value[0] <= more[0] + 1e-15
+    assert more[0] + less[0] <= 1e-12
+    assert sum(cells) < 1500

@@ -148,7 +148,9 @@ def test_what_corners_are_off_by_and_what_is_rounded_is_in_the_excess() -> None:
     found, excess = part.at(np.array([1.0]), np.zeros((1, 1, 2)))
     corners = np.array([[5.0 + a + 4.0 * b for a in (-1.0, 1.0) for b in (-1.0, 1.0)]])
     _, beyond = between_corners(part.joined.space, pattern, corners)
-    assert values(part.joined.space, found, np.array([[-1.0, -1.0], [1.0, 1.0]])) == pytest.approx(np.array([[0.0, 10.0]]))
+    assert values(part.joined.space, found, np.array([[-1.0, -1.0], [1.0, 1.0]])) == pytest.approx(
+        np.array([[0.0, 10.0]])
+    )
     assert (excess[:, 0] - 4.0 - beyond >= 1e-15).all()
     assert (excess[:, 0] - 4.0 - beyond <= 1e-11).all()
 

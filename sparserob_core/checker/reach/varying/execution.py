@@ -19,7 +19,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.measurable import Side, signed, swept
+from sparserob_core.checker.reach.measurable import Side, Together, signed, swept
 from sparserob_core.checker.reach.varying.flow import VaryingFlow, products
 from sparserob_core.checker.reach.varying.loop import ORDER
 from sparserob_core.checker.reach.varying.spread import SpreadFlow
@@ -55,7 +55,7 @@ class VaryingExecution:
     first: int = 0
     off: Array | None = None
     numb: Sequence[int] = ()
-    side: Side | Curve | None = None
+    side: Side | Curve | Together | None = None
     _kernels: dict[tuple[float, float], Enclosed] = field(default_factory=dict, repr=False)
     _onward: dict[int, Enclosed] = field(default_factory=dict, repr=False)
     _added: dict[tuple[float, bytes], tuple[Array, Array]] = field(default_factory=dict, repr=False)
@@ -164,10 +164,11 @@ class VaryingExecution:
             return *self._together(self.side, plain, off), which
         flat = signed(plain.reshape(-1, *plain.shape[2:]), off.reshape(-1, m))
         value, more, less = (one.reshape(off.shape) / 2.0 for one in swept(*flat, np.ones(off.size)))
-        return (value - less) / OUTWARD, (value + more) * OUTWARD, which
+        ends = rounding(4) * (np.abs(value) + more)
+        return value - less - ends, value + more + ends, which
 
     @staticmethod
-    def _together(side: Side | Curve, plain: Array, off: Array) -> tuple[Array, Array]:
+    def _together(side: Side | Curve | Together, plain: Array, off: Array) -> tuple[Array, Array]:
         """Bounds ``(q, n, 1)`` of the integrals of the support function of a set at polynomials ``(q, n, p + 1, m)``
         that are off by ``off (q, n, m)``."""
         q, n, order, m = plain.shape
@@ -175,7 +176,8 @@ class VaryingExecution:
         lost = off.reshape(q * n, m) + rounding(4 * order + 32 + m) * sizes
         found = side.swept(plain.reshape(q * n, order, m), lost, sizes, np.ones(q * n))
         value, more, less, _ = (one.reshape(q, n, 1) / 2.0 for one in found)
-        return np.minimum(value - less, (value - less) / OUTWARD), np.maximum(value + more, 0.0) * OUTWARD
+        ends = rounding(4) * (np.abs(value) + more)
+        return value - less - ends, np.maximum(value + more, 0.0) + ends
 
     def _kernel(self, start: float, stop: float) -> Enclosed:
         """That of an interval, in powers of ``u`` from -1 to 1 across it, ``(p + 1, d, m)``."""
@@ -263,7 +265,7 @@ class SpreadExecution:
     first: int = 0
     off: Array | None = None
     numb: Sequence[int] = ()
-    side: Side | Curve | None = None
+    side: Side | Curve | Together | None = None
     _at: dict[tuple[float, ...], VaryingExecution] = field(default_factory=dict, repr=False)
     _parts: dict[SpreadFlow, SpreadExecution] = field(default_factory=dict, repr=False)
 

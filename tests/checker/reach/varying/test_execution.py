@@ -14,7 +14,7 @@ from flint import arb, arb_mat, ctx
 import sparserob_core as sr
 import sparserob_core.checker.reach.varying.flow as varying
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.measurable import Execution
+from sparserob_core.checker.reach.measurable import Execution, Side
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.control.problem.system import VaryingSystem
@@ -69,6 +69,19 @@ def test_a_falling_mass_is_between_the_bounds_of_the_closed_form(time: float) ->
     np.testing.assert_allclose(least[:, 0], 0.1 * truth, atol=1e-12)
     whole = float(0.1 * np.abs(CONTROL[0]) @ truth)
     assert low <= whole + 1e-15 and whole - 1e-15 <= high <= low + 1e-12
+
+
+@pytest.mark.parametrize("side", [None, sr.NormBall(1.0, 1.0, dimension=2), sr.NormBall(2.0, 1.0, dimension=2)])
+def test_what_is_large_is_not_enclosed_more_coarsely_than_rounding_does(side: sr.ConvexSet | None) -> None:
+    """A lower bound is written with what rounding may do to the numbers that are added up to it: bounds that are 1e-12
+    of an integral apart would refute honest runs."""
+    with ctx.workprec(128):
+        found = made(ROCKET)
+        if side is not None:
+            (form,), one = Side.of(side), [stacked([[arb(1)]])] * 6
+            found = VaryingExecution(VaryingFlow(ROCKET, 3.0), np.ones(1), POINTS, one, side=form)
+        low, high = found.added(np.array([1.0, 0.0]), 3.0)
+    assert 0.0 < high - low <= 3e-13 * high
 
 
 @pytest.mark.parametrize(
