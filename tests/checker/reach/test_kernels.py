@@ -12,9 +12,9 @@ from flint import arb, ctx
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.reach.disturbance_support import Operator
 from sparserob_core.checker.reach.flow import OwnUnits, stacked
-from sparserob_core.checker.reach.measurable import APART, Kernel, Side, _equal, _valued, swept
+from sparserob_core.checker.reach.measurable import APART, Kernel, Side, Together, _equal, _valued, swept
 from sparserob_core.checker.sets.polynomials import Enclosed
-from sparserob_core.control.sets.sets import Box, NormBall
+from sparserob_core.control.sets.sets import Box, NormBall, Zonotope
 
 
 def largest(P, end, count=8_001):
@@ -54,6 +54,19 @@ def test_many_parts_are_added_up_with_what_rounding_does_to_them():
     truth = float(np.abs(np.diff(whole)).sum())
     assert value[0] - less[0] <= truth <= value[0] + more[0]
     assert 1e-14 < less[0] < 1e-10
+
+
+def test_segments_together_reach_as_far_as_all_of_them():
+    generators = np.array([[0.5, -0.25], [0.25, 1.0], [-0.125, 0.5]])
+    together = Together(Side.of(Zonotope(np.array([3.0, -2.0]), generators)))
+    assert together.dimension == 2
+    np.testing.assert_allclose(together.far, np.abs(generators).sum(axis=0), rtol=1e-11)
+    assert (together.far >= np.abs(generators).sum(axis=0)).all()
+    plain, zero = np.array([[[1.0, 0.5], [0.2, -0.3]]]), np.zeros((1, 2))
+    value, more, less, tops = together.swept(plain, zero, np.abs(plain).sum(axis=1), np.ones(1))
+    u = np.linspace(-1.0, 1.0, 20_001)
+    true = float(np.trapezoid(np.abs((plain[0, 0] + u[:, None] * plain[0, 1]) @ generators.T).sum(axis=1), u))
+    assert abs(value[0] - true) < 1e-7 and 0.0 < less[0] <= more[0] < 1e-13 and tops[0] > 0.0
 
 
 def test_errors_of_polynomials_are_errors_of_the_integral():

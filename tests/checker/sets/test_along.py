@@ -24,6 +24,7 @@ SETS: dict[str, ConvexSet] = {
     "3-norm": NormBall(3.0, 0.7, dimension=2),
     "1.3-norm": NormBall(1.3, 0.7, dimension=2),
     "product": product([NormBall(2.0, 0.5, dimension=2), Box([-1.0], [2.0])]),
+    "segments": Zonotope(np.array([0.2, 0.1]), SEGMENTS),
     "with segments": product([NormBall(2.0, 0.5, [0.1, 0.0]), Zonotope(np.array([0.2, 0.1]), SEGMENTS)]),
     "with a triangle": product([Polytope([[-1, 0], [0, -1], [1, 1]], [0.4, -0.1, 1.0]), NormBall(2.0, 0.5, [1, 0])]),
 }
@@ -82,7 +83,9 @@ def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, e
 def test_heights_count_from_any_point_and_allow_for_what_the_factor_of_a_long_ellipsoid_misses() -> None:
     long = Ellipsoid([0.0, 0.0], [[1.0, 1.99999999], [1.99999999, 4.0]])
     values = np.array([[-1.99999999, 1.0], [-2.0, 1.0], [0.3, -0.2]])  # the first two along the shorter axis
-    for bound, about in ((long, np.zeros(2)), (SETS["ball"], np.array([0.3, -0.2])), (SETS["ellipsoid"], np.ones(2))):
+    segments = Zonotope(np.array([0.2, 0.1]), SEGMENTS)
+    away = ((SETS["ball"], np.array([0.3, -0.2])), (SETS["ellipsoid"], np.ones(2)), (segments, np.array([1.0, -2.0])))
+    for bound, about in ((long, np.zeros(2)), *away):
         heights, off = _heights(known(bound), about, values)
         with ctx.workprec(300):
             for c, height, wrong in zip(values, heights, off, strict=True):
