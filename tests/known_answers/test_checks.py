@@ -214,3 +214,19 @@ def test_every_limit_of_a_problem_is_verified(name: str, tmp_path: Path) -> None
     summary = verified(tmp_path / "run", problem, control, disturbance)
     assert summary["lower_bound"] <= summary["cost"] + 1e-9
     assert summary["cost"] - summary["lower_bound"] <= 1e-6
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize("entry", ["0*t", 0], ids=["in time", "constant"])
+def test_thrusters_that_push_against_one_another_are_one_whose_bound_is_derived(
+    entry: float | str, tmp_path: Path
+) -> None:
+    """``u_2 = -u_1``: multipliers of both sides of a set without interior may be as large as they like, and what they
+    round raised the bound that was written."""
+    system = {"A": [[entry, 1], [-1, -0.2]], "B": [[0, 1], [1, 0]]}
+    sides = {"H": [[1, 1], [-1, -1], [1, 0], [-1, 0]], "h": [0, 0, 1, 1]}
+    shared = {"name": "linear", "horizon": 2.0, "initial_state": [1.0, 0.0], "terminal": [{"box": [0.5, 0.5]}]}
+    both = {**shared, "system": system, "control": {"polytope": sides}}
+    alone = {**shared, "system": {**system, "B": [[-1], [1]]}, "control": {"box": 1.0}}
+    costs = [verified(tmp_path / name, one, pieces(4))["cost"] for name, one in (("a", both), ("b", alone))]
+    assert costs[0] == pytest.approx(2.0 * costs[1], rel=1e-7)

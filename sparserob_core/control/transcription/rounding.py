@@ -178,7 +178,7 @@ def _quadratic(model: Transcription, result: Result) -> float:
 
 def _neglected(model: Transcription, result: Result) -> float:
     """What multipliers of the wrong sign cost on slanted sides ``H u <= h`` of the controls' set, and of that of their
-    steps, at most; of steps with the rounding of what is added up to them.
+    steps, at most, with the rounding of what is added up to them.
 
     To the program ``s = H u`` has no lower bound, so that only ``z >= 0`` proves anything of ``-z s``; a negative ``z``
     within its own rounding counts as 0 there. On the set ``-z s`` is at least ``z`` times the largest ``-H u``.
@@ -189,6 +189,8 @@ def _neglected(model: Transcription, result: Result) -> float:
     controls, pieces = model.problem.system.controls, model.control.pieces
     sides, others = np.split(result.dual.z[controls * pieces :], [h.size * pieces])
     lost = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))
+    # of opposite sides of a set without interior multipliers may be as large as they like
+    lost += SHARE * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ _far(bound)))
     steps = Steps.of(model.problem, model.control)
     if steps.count:
         own = others[: steps.upper.size * steps.times.size]  # what follows bounds sizes from both sides
