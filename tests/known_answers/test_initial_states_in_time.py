@@ -297,6 +297,7 @@ def test_a_dressed_constant_plant_has_the_set_and_the_costs_that_it_has_plain(na
     np.testing.assert_allclose(other.costs, one.costs, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_coordinate_that_an_equality_pins_makes_a_segment_in_closed_form() -> None:
     """The second state keeps exp(-1/2) of what it is; the first gains its integral and at most 1 by the control."""
     config = changed(
