@@ -200,12 +200,26 @@ class VaryingMotion:
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
         """`Motion.along`."""
-        inputs, path = np.abs(self.grid.inputs(control)), np.abs(self.nodes(control)[:-1, 0])
-        m = inputs.shape[0]
-        left_out = self.left_out(path, self.flow.sizes[:, :, :m] * inputs.T[:, None])
-        begun = path + self.grid.lengths[:, None] * np.einsum("kim,mk->ki", self.most[:, :, self._columns(m)], inputs)
-        sizes = self.grown(self.every, self.grid.lengths, begun)
+        left_out, sizes = self.under(control)
         return np.asarray(product(rows, left_out.T) + product(others, sizes.T))
+
+    def under(self, control: Array) -> tuple[Array, Array]:
+        """What states under a control may be off by on every piece, and how large they are at most, ``(K, d)`` each;
+        remembered, since it is the same for all rows."""
+        key = control.tobytes()
+        if key not in self._under:
+            inputs, path = np.abs(self.grid.inputs(control)), np.abs(self.nodes(control)[:-1, 0])
+            m = inputs.shape[0]
+            left_out = self.left_out(path, self.flow.sizes[:, :, :m] * inputs.T[:, None])
+            pushed = np.einsum("kim,mk->ki", self.most[:, :, self._columns(m)], inputs)
+            begun = path + self.grid.lengths[:, None] * pushed
+            found = left_out, self.grown(self.every, self.grid.lengths, begun)
+            remember(self._under, key, found, PATHS_KEPT)
+        return self._under[key]
+
+    @cached_property
+    def _under(self) -> dict[bytes, tuple[Array, Array]]:
+        return {}
 
     def left_out(self, sizes: Array, pushed: Array) -> Array:
         """What states that are at most ``sizes (K, d)`` at the beginning of every piece, and are driven by at most
@@ -614,6 +628,21 @@ class Truncation:
         added = np.cumsum(self._added(self.norms(sizes), self.driven(inputs), off))
         return np.asarray(self.growth * added[:, None] * self.units * OUTWARD)
 
+    def under(self, control: Array) -> Array:
+        """The same of the states under a control, ``(K, d)``; remembered."""
+        key = control.tobytes()
+        if key not in self._under:
+            motion, inputs = self.motion, np.abs(self.motion.grid.inputs(control)).T
+            every = np.zeros((len(inputs), motion.most.shape[2] - motion.states))
+            every[:, : inputs.shape[1]] = inputs
+            begun = np.abs(motion.nodes(control)[:-1, 0]) + motion.under(control)[0]
+            remember(self._under, key, self.lost(begun, every), PATHS_KEPT)
+        return self._under[key]
+
+    @cached_property
+    def _under(self) -> dict[bytes, Array]:
+        return {}
+
     def at_most(self, begun: Array, inputs: Array) -> Array:
         """The same at the end of the horizon of whatever begins at no more than ``begun (d,)`` and is driven so all the
         time, ``inputs (m + mw,)``: ``(d,)``."""
@@ -702,13 +731,8 @@ class SpreadMotion:
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
         """`Motion.along`; what coefficients are multiplied by and added up is rounded too."""
-        path = np.abs(self.motion.nodes(control)[:-1, 0])
-        inputs = np.abs(self.motion.grid.inputs(control)).T
-        unpushed = np.zeros((len(inputs), self.motion.most.shape[2] - self.motion.states - inputs.shape[1]))
-        off = self.motion.left_out(path, self.motion.flow.sizes[:, :, : inputs.shape[1]] * inputs[:, None])
-        lost = self.truncation.lost(path + off, np.hstack([inputs, unpushed]))
         found = self.motion.along(control, self.sizes(rows), (1.0 + self.space.size) * self.sizes(others))
-        return np.asarray(found + rows @ lost.T * OUTWARD)
+        return np.asarray(found + rows @ self.truncation.under(control).T * OUTWARD)
 
     def along_cell(self, rows: Array) -> Array:
         """Rows ``(r, d)`` as those of every coefficient on the cell, on all coefficients, ``(r M, states)``."""
