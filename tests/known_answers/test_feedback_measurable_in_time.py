@@ -293,3 +293,24 @@ ATV: Problem = {
     "path": [{"name": "corridor", "polytope": {"H": [[0.15, 1, 0, 0], [0.15, -1, 0, 0]], "h": [50, 50]}, "from": 6600}],
     "terminal": [{"box": {"lower": [-700, -60, -0.1, -0.1], "upper": [-100, 60, 0.1, 0.1]}}],
 }
+
+
+@pytest.mark.slow
+def test_a_law_that_takes_over_within_a_piece_changes_nothing_if_it_is_the_same(tmp_path: Path) -> None:
+    law = FADING["system"]
+    turns = {**FADING, "system": {"pieces": [{"until": 1.3, **law}, {"until": 3.0, **law}]}}
+    found = [run(one, tmp_path / str(k), "peak", **pieces(3)) for k, one in enumerate((FADING, turns))]
+    assert found[1].result.cost == pytest.approx(found[0].result.cost, rel=1e-8)
+    assert check(found[1].directory).status == "verified"
+
+
+@pytest.mark.slow
+def test_a_rendezvous_about_an_ellipse_is_proven_against_accelerations_that_may_change_at_any_time(
+    tmp_path: Path,
+) -> None:
+    outcome = run(ATV, tmp_path / "run", **pieces(6))
+    proven(outcome)
+    held = {**ATV, "disturbance_class": "piecewise_constant"}
+    lower = run(held, tmp_path / "held", **pieces(6), causal_signals=0)
+    assert lower.status == "certified"
+    assert lower.result.lower_bound <= outcome.result.cost
