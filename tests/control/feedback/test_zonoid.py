@@ -18,6 +18,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]])
 SPRING = np.array([[0.0, 1.0], [-2.0, -0.5]])
 FORCE = np.array([[0.0], [1.0]])
+PLANE = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 1.36], [0, 1.39, -1.36, 0]])
 TRIANGLE = Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.1, 0.1, 0.3])
 
 CASES: dict[str, tuple[Array, Array, float, ConvexSet]] = {
@@ -26,6 +27,7 @@ CASES: dict[str, tuple[Array, Array, float, ConvexSet]] = {
     "a triangle": (SPRING, np.eye(2), 2.5, TRIANGLE),
     "many oscillations within a piece": (np.array([[0.0, 8.0], [-8.0, -0.5]]), np.eye(2), 2.5, TRIANGLE),
     "four integrators": (np.diag([1.0, 1.0, 1.0], 1), np.eye(4)[:, 3:], 0.3, Box([-0.2], [0.2])),
+    "two forces on a motion in a plane": (PLANE, np.eye(4)[:, 2:], 1.0, Box([-1e-5, -1e-5], [1e-5, 1e-5])),
     "one direction of two": (-np.eye(2), np.ones((2, 1)), 1.0, Box([-0.2], [0.2])),
 }
 
