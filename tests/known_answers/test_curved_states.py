@@ -3,6 +3,7 @@ inside and around them, against an independent linear program; forgeries; what i
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
+from sparserob_core.experiment.config.reader import read_source
 from tests.known_answers.test_checks import pieces, verified
 from tests.support import tampering
+from tests.support.places import CONFIGS
 
 Problem = dict[str, Any]
 HORIZON, PIECES, BEGIN, SIDES = 3.0, 6, 1.0, 48
@@ -174,3 +177,59 @@ def test_the_cost_is_that_of_an_independent_linear_program(tmp_path: Path) -> No
 )
 def test_what_is_changed_afterwards_is_found(change: tampering.Change, finished: Path, tmp_path: Path) -> None:
     assert check(tampering.forged(finished, tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
+CUBED: Problem = {"norm": {"p": 3, "radius": 0.3, "dimension": 2}}
+ASTRAY: Problem = {"relative_to": [[0, -0.2, 0], [HORIZON, 0.1, 0.05]]}
+
+
+def tangents(bound: str, count: int = 96) -> Problem:
+    """Those of a ball of the 3-norm, or of the ellipse, at equal angles."""
+    angles = 2 * np.pi * np.arange(count) / count
+    H = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    heights = np.sqrt(np.einsum("ki,ij,kj->k", H, SHAPE, H))
+    if bound == "cubed":
+        heights = 0.3 * (np.abs(H) ** 1.5).sum(axis=1) ** (2.0 / 3.0)
+    return {"polytope": {"H": H.tolist(), "h": heights.tolist()}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", [CONSTANT, IN_TIME], ids=["constant", "in t"])
+def test_a_ball_at_the_end_and_an_ellipse_that_moves_cost_what_their_tangents_do(
+    plant: Problem, tmp_path: Path
+) -> None:
+    def made(path: Problem, end: Problem) -> Problem:
+        return {**problem({**BOX, **ERRING}, plant, {**path, **ASTRAY}), "terminal": [end]}
+
+    curved = verified(tmp_path / "run", made(ROUND, CUBED), pieces(PIECES))
+    flat = {"problem": made(tangents("ellipse"), tangents("cubed")), "dictionaries": {"control": pieces(PIECES)}}
+    around = sr.run(flat, quiet=True, figures=False).result
+    assert around.status == "certified"
+    assert around.lower_bound <= curved["cost"] <= around.cost * (1.0 + 1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("time", "length"), [(1e3, 1e-3), (1e-3, 1e3), (1e4, 1e2)])
+def test_in_other_units_it_costs_the_same(time: float, length: float, tmp_path: Path) -> None:
+    plain = problem({**BOX, **ERRING})
+    scaled = {
+        **plain,
+        "system": {"A": (A / time).tolist(), "B": (B * length / time).tolist(), "E": (E * length / time).tolist()},
+        "horizon": HORIZON * time,
+        "initial_state": [-1.0 * length, 0.6 * length],
+        "path": [{"ellipsoid": {"shape": (SHAPE * length**2).tolist()}, "from": BEGIN * time}],
+        "terminal": [{"box": [0.3 * length, 0.3 * length]}],
+    }
+    costs = [verified(tmp_path / str(k), one, pieces(PIECES))["cost"] for k, one in enumerate((plain, scaled))]
+    assert costs[1] / time == pytest.approx(costs[0], rel=1e-7)
+
+
+@pytest.mark.slow
+def test_a_mission_ends_in_an_ellipsoid_of_places_and_speeds_with_an_engine_that_errs(tmp_path: Path) -> None:
+    mission = copy.deepcopy(read_source(CONFIGS / "atv_execution.yaml").data["problem"])
+    shape = np.diag(np.square([300.0, 60.0, 0.1, 0.1]))
+    ends = [{"ellipsoid": {"centre": [-400.0, 0.0, 0.0, 0.0], "shape": shape.tolist()}}]
+    costs = []
+    for k, end in enumerate((mission["terminal"], ends)):
+        costs.append(verified(tmp_path / str(k), {**mission, "terminal": end}, pieces(30))["cost"])
+    assert costs[0] < costs[1] < 1.01 * costs[0]  # the ellipsoid is inside the box

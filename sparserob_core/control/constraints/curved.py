@@ -89,8 +89,7 @@ class CurvedConstraint(StateConstraint):
     def violations(
         self, x: Float[Array, " n"], indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
     ) -> Float[Array, " k"]:
-        times, directions, parameters, rhs = self.functionals_at(indices)
-        return self.functionals.values(x, times, directions, parameters) - rhs
+        return self._height(x, indices)
 
     @shaped
     def worst(self, x: Float[Array, " n"]) -> Separation:
@@ -112,7 +111,8 @@ class CurvedConstraint(StateConstraint):
 
         def climbed(points: Array) -> tuple[Array, Array]:
             every = np.vstack([points, others])
-            return climb(lambda at, _: self._height(x, at), every, step, self._inside)
+            reached, found = climb(lambda at, _: self._height(x, at, self._rough), every, step, self._inside)
+            return reached, self._height(x, reached) if self._rough else found
 
         indices, found = ridden(held, heights, flat.pieces, flat.kinks, lambda points: self._turned(x, points), climbed)
         return Separation(indices, np.zeros(found.size, dtype=int), found)
@@ -151,8 +151,7 @@ class CurvedConstraint(StateConstraint):
         start = np.full(self._b, STEP)
         z, found = climb(height, indices[:, first:], start, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
         turned = np.hstack([indices[:, :first], z])
-        rough = self.functionals.measurable is not None or self.functionals.execution is not None
-        return turned, self._height(x, turned) if rough else found
+        return turned, self._height(x, turned) if self._rough else found
 
     @shaped
     def _at(self, times: Float[Array, " k"], positions: Int[np.ndarray, "k q"]) -> Float[Array, "k j"]:
@@ -160,8 +159,15 @@ class CurvedConstraint(StateConstraint):
         return np.hstack([times[:, None], self._flat.lattice[0][positions[:, 0]], sampled(self._b)[positions[:, 1]]])
 
     @shaped
-    def _height(self, x: Float[Array, " n"], indices: Float[Array, "k j"]) -> Float[Array, " k"]:
-        return self.violations(x, indices, np.zeros(len(indices), dtype=int))
+    def _height(self, x: Float[Array, " n"], indices: Float[Array, "k j"], roughly: bool = False) -> Float[Array, " k"]:
+        times, directions, parameters, rhs = self.functionals_at(indices)
+        return self.functionals.values(x, times, directions, parameters, roughly) - rhs
+
+    @property
+    def _rough(self) -> bool:
+        """Whether there is what of a direction is an integral, so that directions are only about right that are climbed
+        to; what is found is looked at again."""
+        return self.functionals.measurable is not None or self.functionals.execution is not None
 
     @shaped
     def _inside(self, points: Float[Array, "k j"]) -> Float[Array, "k j"]:

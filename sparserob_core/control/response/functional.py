@@ -254,16 +254,22 @@ class WorstCase:
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
+        roughly: bool = False,
     ) -> Float[Array, " k"]:
-        """``max_w c'x(t)`` at a decision, ``(k,)``, without building the rows."""
+        """``max_w c'x(t)`` at a decision, ``(k,)``, without building the rows; ``roughly`` where directions are many
+        and each is asked for once: with measurable disturbances and errors as in `turning`."""
         control = self.on_grid(theta)
         result = np.empty(times.size)
         for part in self._chunks(parameters):
             known = self.response.weights(times[part], directions[part], parameters[part])
             driven = np.einsum("klm,ml->k", known.control, control)
-            support = self._support(known, times[part], directions[part], parameters[part])
+            support = self._support(known, times[part], directions[part], parameters[part], roughly)
             result[part] = known.free @ self.response.initial_state + driven + support
-            if self.execution is not None:
+            if roughly:
+                result[part] += np.einsum(
+                    "klm,ml->k", np.abs(known.control[..., : self.channels]), self._missed(control)
+                )
+            elif self.execution is not None:
                 along = self.execution.seen(directions[part], parameters[part])
                 result[part] += self.execution.added(self.control(theta), times[part], along)
         return result
@@ -273,11 +279,13 @@ class WorstCase:
         nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, as many at each, ``(j,)``. Weights are
         linear in the direction, so that those of the axes are computed once. What measurable disturbances and errors of
         execution add is not, and is only about right: of errors it is what those do that are constant on pieces."""
-        known, model = self._axes(times, parameters), self.disturbance
-        states = known.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", known.control, self.on_grid(theta))
+        known, model, control = self._axes(times, parameters), self.disturbance, self.on_grid(theta)
+        states = known.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", known.control, control)
         by_block, measurable = None if model is None else model.on_blocks, self.measurable
         blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(known.disturbance)
-        missed = self._missed(theta, known.control)
+        missed = self._missed(control)
+        missing = np.flatnonzero(missed.any(axis=0))
+        errors = (known.control[:, :, missing, : self.channels] * missed[:, missing].T).reshape(*states.shape, -1)
 
         def along(directions: Array, which: np.ndarray) -> Array:
             places = which[np.flatnonzero(np.diff(which, prepend=-1))]
@@ -290,24 +298,18 @@ class WorstCase:
                 if by_block is not None:
                     on_blocks = turned @ blocks[at].reshape(*blocks[at].shape[:2], -1)
                     found[part] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
-                if missed.shape[2]:
-                    found[part] += np.abs(turned @ missed[at]).sum(axis=2)
+                if errors.shape[2]:
+                    found[part] += np.abs(turned @ errors[at]).sum(axis=2)
             if measurable is not None:
                 found += measurable.roughly(times[which], directions, parameters[which]).reshape(found.shape)
             return found.reshape(-1)
 
         return along
 
-    def _missed(self, theta: Array, weights: Array) -> Array:
-        """What errors of execution that are constant on pieces may make of every state, ``(k, d, q)``, piece by piece
-        and channel by channel, from the weights ``(k, d, L, m)`` of the axes; ``q`` is 0 where there are none."""
-        if self.execution is None:
-            return np.zeros((*weights.shape[:2], 0))
-        m = self.channels
-        sizes = self.execution.shares[:, None] * np.abs(self.on_grid(theta)[:m])
-        acting = np.flatnonzero(sizes.any(axis=0))
-        found = self.execution.felt[:, None, None] * weights[:, :, acting, :m] * sizes[:, acting].T
-        return np.asarray(found.reshape(*weights.shape[:2], -1))
+    def _missed(self, control: Array) -> Array:
+        """By how much every channel of a control on the pieces of the merged grid may be missed, ``(m, L)``."""
+        commanded = np.abs(control[: self.channels])
+        return 0.0 * commanded if self.execution is None else self.execution.shares[:, None] * commanded
 
     @shaped
     def profile(
@@ -563,11 +565,15 @@ class WorstCase:
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
+        roughly: bool = False,
     ) -> Float[Array, " k"]:
         found, by_block = self._begun(known.free), None if self.disturbance is None else self.disturbance.on_blocks
         if by_block is not None:
             found = found + by_block.support(known.disturbance)
-        return found if self.measurable is None else found + self.measurable(times, directions, parameters)
+        if self.measurable is None:
+            return found
+        added = self.measurable.roughly if roughly else self.measurable
+        return found + np.asarray(added(times, directions, parameters))
 
     @shaped
     def _begun(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:

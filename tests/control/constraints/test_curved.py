@@ -45,6 +45,30 @@ def test_the_worst_violation_is_not_below_that_of_dense_samples(curved: CurvedCo
         np.testing.assert_allclose(found.violations, curved.violations(x, found.indices, rows), rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.first(1)
+@pytest.mark.parametrize(
+    "beside",
+    [{"disturbance": {"box": [0.1, 0.05]}, "disturbance_class": "measurable"}, {"execution": [0.1, 0.2]}],
+    ids=["measurable", "errors"],
+)
+def test_what_is_climbed_to_roughly_is_told_exactly_and_is_hardly_below_dense_samples(beside: Any) -> None:
+    config = problem("curved", 16)
+    plant = {"A": [[-0.5, 1.0], [-1.0, -0.5]], "B": [[1.0, 0.2], [0.0, 1.0]]}
+    config["problem"] = {**config["problem"], "system": plant, **beside}
+    constraint = family_of(config, "path").source
+    control = np.random.default_rng(3).uniform(0.0, 1.2, constraint.functionals.coefficients)
+    x = np.concatenate([control, np.abs(control)])[: constraint.functionals.variables]
+    found = constraint.worst(x)
+    rows, top = np.zeros(found.violations.size, dtype=int), dense(constraint, x, np.linspace(0.25, 4.0, 9)).max()
+    np.testing.assert_allclose(found.violations, constraint.violations(x, found.indices, rows), rtol=0.0, atol=1e-12)
+    assert found.violations[0] >= top - 1e-3
+    at = constraint.functionals_at(found.indices)[:3]
+    exact, rough = (constraint.functionals.values(x, *at, how) for how in (False, True))
+    np.testing.assert_allclose(rough, exact, rtol=0.0, atol=1e-2)
+    if "execution" in beside:  # what is constant on pieces is among all errors
+        assert (rough <= exact + 1e-12).all() and (rough < exact - 1e-4).any()
+
+
 def test_a_set_that_is_left_is_imposed_all_along(curved: CurvedConstraint) -> None:
     x = np.zeros(curved.functionals.variables)  # the state falls to 0, and the ellipse is left for good
     found = curved.worst(x)
