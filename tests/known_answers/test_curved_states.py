@@ -179,7 +179,7 @@ def test_what_is_changed_afterwards_is_found(change: tampering.Change, finished:
     assert check(tampering.forged(finished, tmp_path / "copy", change, consistent=True)).status == "refuted"
 
 
-CUBED: Problem = {"norm": {"p": 3, "radius": 0.3, "dimension": 2}}
+CUBED: Problem = {"norm": {"p": 3, "radius": 0.3, "centre": [0.0, 0.0]}}
 ASTRAY: Problem = {"relative_to": [[0, -0.2, 0], [HORIZON, 0.1, 0.05]]}
 
 

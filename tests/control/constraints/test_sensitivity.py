@@ -183,6 +183,7 @@ def test_measurable_disturbances_have_slopes_in_parameters_and_directions_too(se
     assert_it_is_the_derivative(family, decision(rng, family, system), indices, some_rows(rng, family, indices))
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("varies", [False, True], ids=["constant", "in time"])
 def test_errors_of_execution_have_slopes_in_directions_too(varies):
     rng = np.random.default_rng(4)

@@ -71,7 +71,7 @@ def values(space: TaylorSpace, coefficients: np.ndarray, points: np.ndarray) -> 
     return np.asarray(coefficients[:, 0] @ space.monomials(points).T)
 
 
-@pytest.mark.first(2)
+@pytest.mark.first(1)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("free", [1, 3])
 def test_it_holds_every_direction_and_is_exact_at_corners(free: int, kind: str) -> None:
@@ -106,6 +106,7 @@ def test_it_holds_every_direction_and_is_exact_at_corners(free: int, kind: str) 
     assert lost[1] <= 0.03 * lost[0]  # of second order in the width
 
 
+@pytest.mark.first(1)
 @pytest.mark.parametrize("kind", ["a box", "errors"])
 def test_a_chord_in_time_holds_every_direction(kind: str) -> None:
     rng, start, width = np.random.default_rng(8), np.array([0.1, 0.8, 1.5]), np.full(3, 0.12)
