@@ -98,7 +98,7 @@ PLANTS: dict[str, tuple[Config, Law, Callable[[np.ndarray], np.ndarray]]] = {
         {
             "system": {**SPRING, "parameters": {"p": [-2.0, 2.5]}},
             "disturbance": {"box": [0.005, 0.005]},
-            "terminal": [{"box": [0.6, 1.4]}],
+            "terminal": [{"box": [0.4, 0.7]}],
         },
         lambda t, p, q: ([[0, 1], [-4 + p, -0.3]], B),
         lambda rows: 0.005 * np.abs(rows).sum(axis=-1),

@@ -19,6 +19,7 @@ import numpy as np
 from sparserob_core.control.enclosures.elementary import eccentric_anomaly
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON
 from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 Value: TypeAlias = Any
@@ -304,6 +305,10 @@ class Split:
                 slope = {single(nu, j): nothing + unit} if unit and degree else {}
                 p[1 + j] = Dependent(nothing + middle, slope, degree, bool(unit) and not degree)
             table = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
+        if table.ndim != 2:
+            raise InputError(
+                path="system", expected="matrices of arithmetic in single parameters", got="a whole matrix"
+            )
         parts: dict[Exponents, Table] = {(0,) * nu: np.zeros(table.shape, dtype=object)}
         beyond = list[tuple[int, int]]()
         for place, found in np.ndenumerate(table):

@@ -254,8 +254,8 @@ class SpreadExecution:
     nowhere further from its chord than half the largest ``f''`` in shares of half the interval, and the absolute value
     of a chord is not above the chord of the absolute values. So the integrals of ``|f|`` are, one parameter after
     another, at most what is linear in each between those at the corners, and half of those of the second derivatives
-    more; what is beyond the degree of the expansion that these are bounded by counts twice. So it is of any convex
-    function that is 0 at 0 in the place of the absolute value, as the support function of a ``side`` is.
+    more; what is beyond the degree of the expansion that these are bounded by counts twice. So it is with the
+    support function of a ``side`` in the place of the absolute value: of a sum it is not above the sum of both.
     """
 
     law: SpreadFlow
