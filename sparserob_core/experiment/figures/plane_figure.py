@@ -19,24 +19,40 @@ if TYPE_CHECKING:
 
 PALE = "#BEE1F6"  # SKY at 45 % on white
 POINT = 0.01  # of the larger side: a smaller goal is drawn as a mark; at a tenth boxes that one sees become marks
-BESIDE = 0.08  # of the width: a mark nearer to an earlier one has its time below; of a tenth of it both are one blot
+BESIDE = 0.08  # of the width: of nearer marks one has its time above, the lower one below; of a tenth all are one blot
 MARKS = 4  # parts of the horizon whose ends are marked
 
 
 def draw_plane(data: FigureData) -> Figure:
     """The nominal path with the places that the worst case brings the system to. What is forbidden all the time is
-    hatched; a set that holds for a part of it, or moves, is outlined beside the part of the path that it is about."""
+    hatched; a set that holds for a part of it, or moves, is outlined beside the part of the path that it is about.
+    Where the goal is a small part of all this, what is around it is shown below once more."""
     from matplotlib.figure import Figure
-    from matplotlib.patches import Polygon
 
     plane = data.plane
     assert plane is not None
-    path, places = data.path, plane.places
-    low, high = plane.view(path)
+    views = [plane.view(data.path)]
+    if (close := plane.goal(data.path)) is not None:
+        views.append(close)
+    talls = [float(np.clip(look.WIDTH * (high - low)[1] / (high - low)[0], 2.0, 7.0)) for low, high in views]
+    figure = Figure(figsize=(look.WIDTH, sum(talls) + 0.6 + 0.5 * len(talls)), layout="constrained")
+    axes = figure.subplots(len(views), squeeze=False, height_ratios=talls)[:, 0].tolist()
+    for ax, (low, high) in zip(axes, views, strict=True):
+        _draw(ax, data, low, high)
+    axes[0].set_title(data.title)
+    if close is not None:
+        axes[1].set_title("the same around the terminal set", fontsize="medium", color=look.GREY)
+    draw_legend(figure, axes)
+    return figure
+
+
+def _draw(ax: Axes, data: FigureData, low: Array, high: Array) -> None:
+    """All that is in the plane, as far as it is between two corners."""
+    from matplotlib.patches import Polygon
+
+    plane, path = data.plane, data.path
+    assert plane is not None
     sides = high - low
-    tall = float(np.clip(look.WIDTH * sides[1] / sides[0], 2.0, 7.0))
-    figure = Figure(figsize=(look.WIDTH, tall + 1.1), layout="constrained")
-    ax = figure.subplots()
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     frame, colour = framed(low, high), iter((look.GREEN, look.PURPLE, look.INK))
     _hatched(ax, frame, plane.walls)
@@ -54,18 +70,15 @@ def draw_plane(data: FigureData) -> Figure:
     pair = list(plane.states)
     if (data.tube_upper[pair] > data.tube_lower[pair]).any():
         said = "worst case" if data.gains is None else "worst case, with feedback"
-        for number, place in enumerate(places):  # they overlap: one opaque colour, that of the tube of a state
+        for number, place in enumerate(plane.places):  # they overlap: one opaque colour, that of the tube of a state
             ax.fill(*place.T, color=PALE, linewidth=0.4, zorder=2, label="" if number else said)
     ax.plot(*path.T, color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
     for number, arc in enumerate(data.arcs):
         ax.plot(*arc.T, color=look.ORANGE, linewidth=4.0, zorder=3.5, solid_capstyle="round",
                 label="" if number else "the control acts")  # fmt: skip
-    _marks(ax, data, path)
+    _marks(ax, data, path, frame)
     ax.set_xlabel(data.state_label(plane.states[0]))
     ax.set_ylabel(data.state_label(plane.states[1]))
-    ax.set_title(data.title)
-    draw_legend(figure, [ax])
-    return figure
 
 
 def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
@@ -107,21 +120,28 @@ def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, allowed: Array,
         ax.plot(*beside.T, color=colour, linewidth=1.1, zorder=1.5)
 
 
-def _marks(ax: Axes, data: FigureData, path: Array) -> None:
-    """Times along the path, and those of the active constraints."""
+def _marks(ax: Axes, data: FigureData, path: Array, frame: Array) -> None:
+    """Times along the path from where it is in the ``frame (4, 2)`` for good, and those of the active constraints."""
     from matplotlib.patheffects import withStroke
 
-    at = np.linspace(data.times[0], data.times[-1], MARKS + 1)
+    outside = np.flatnonzero(((path < frame[0]) | (path > frame[2])).any(axis=1))
+    since = data.times[min(outside[-1] + 1, path.shape[0] - 1)] if outside.size else data.times[0]
+    at = np.linspace(since, data.times[-1], MARKS + 1)
     marked = np.stack([np.interp(at, data.times, coordinate) for coordinate in path.T], axis=1)
     ax.plot(*marked.T, "o", color="white", markeredgecolor=look.BLUE, markersize=4.5, zorder=5)
     unit = f" {plain(data.names.time)}" if data.names.time else ""
     near = BESIDE * (ax.get_xlim()[1] - ax.get_xlim()[0])
-    for number, (time, place) in enumerate(zip(at, marked, strict=True)):
-        crowded = (np.abs(marked[:number] - place).max(axis=1) < near).any()
+    crowded = np.abs(marked[:, None] - marked).max(axis=2) < near
+    said: list[int] = []
+    for number in range(MARKS, -1, -1):  # of marks that crowd, the last ones have their times
+        if crowded[number, said].sum() < 2:
+            said.append(number)
+    for number in said:
+        higher = crowded[number, said] & (marked[said, 1] > marked[number, 1])
         ax.annotate(
-            f"{time:.6g}{unit}",
-            place,
-            xytext=(5, -13) if crowded else (5, 5),
+            f"{at[number]:.6g}{unit}",
+            marked[number],
+            xytext=(5, -13) if higher.any() else (5, 5),
             textcoords="offset points",
             fontsize=8.5,
             color=look.GREY,

@@ -13,7 +13,7 @@ import sparserob_core as sr
 from sparserob_core.control.studies.answer import supports
 from sparserob_core.experiment.figures.active import Active
 from sparserob_core.experiment.figures.drawing import CORNERS, figure_data
-from sparserob_core.experiment.figures.plane import Limit, clipped
+from sparserob_core.experiment.figures.plane import Limit, Plane, clipped
 from sparserob_core.experiment.figures.style import ORANGE
 from sparserob_core.experiment.run.drawing import switching
 
@@ -153,3 +153,32 @@ def test_a_figure_shows_why_the_control_acts_where_it_acts() -> None:
     assert (np.abs(push[acts]) > 1.0 - 1e-6).all() and (np.abs(push[~acts]) < 1.0 + 1e-6).all()
     drawn = result.plot("switching").axes
     assert len(drawn) == 2 and drawn[0].get_ylabel() == "push on u1"
+
+
+@pytest.mark.parametrize(("side", "seen"), [(0.1, True), (0.6, False), (0.0, False)])
+def test_a_goal_that_is_a_small_part_of_the_plane_is_shown_larger(side: float, seen: bool) -> None:
+    path = np.stack([np.linspace(0.0, 4.0, 9), np.zeros(9)], axis=1)
+    bounds = np.array([[4.0 + side / 2, -4.0 + side / 2, side / 4, side / 4]])
+    normals = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    goal = Limit(name="goal", normals=normals, times=np.array([2.0]), bounds=bounds, is_final=True)
+    plane = Plane(states=(0, 1), places=path[:, None], limits=(goal,))
+    found = plane.goal(path)
+    assert (found is not None) == seen
+    if found is not None:
+        np.testing.assert_allclose(found, [[4.0 - 0.15, -0.075], [4.0 + 0.15, 0.075]], atol=1e-12)
+    free = Limit(name="goal", normals=normals[2:], times=np.array([2.0]), bounds=bounds[:, 2:], is_final=True)
+    assert Plane(states=(0, 1), places=path[:, None], limits=(free,)).goal(path) is None
+    assert Plane(states=(0, 1), places=path[:, None]).goal(path) is None
+
+
+def test_what_is_around_a_small_goal_is_drawn_below_with_its_own_times() -> None:
+    pytest.importorskip("matplotlib")
+    small = sr.Box([0.98, 0.49, -0.05, -0.05], [1.02, 0.51, 0.05, 0.05])
+    result = sr.solve(
+        puck(disturbance=None, path=[], terminal=[small]), control={"name": "piecewise_constant", "pieces": 10}
+    )
+    whole, close = result.plot("plane").axes
+    assert close.get_xlim() == pytest.approx((0.94, 1.06)) and close.get_ylim() == pytest.approx((0.47, 0.53))
+    assert whole.get_xlim()[0] < 0.0 and len(close.patches) == 1
+    first = [float(ax.texts[-1].get_text()) for ax in (whole, close)]
+    assert first[0] == 0.0 and first[1] > 1.0 and [ax.texts[0].get_text() for ax in (whole, close)] == ["2", "2"]
