@@ -12,7 +12,7 @@ from flint import ctx
 
 from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.reach.loop_tube import LoopTube
-from sparserob_core.checker.reach.measurable import MeasurableLoop, _enclosed
+from sparserob_core.checker.reach.measurable import MeasurableLoop, as_enclosed
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
@@ -89,9 +89,9 @@ def test_what_a_direction_is_off_by_is_added_as_along_the_axes() -> None:
 def test_rows_of_balls_are_as_wide_as_they_are() -> None:
     from flint import arb, arb_mat
 
-    found = _enclosed(arb_mat([[arb(0.5, 1e-3), arb(2.0)]]))
+    found = as_enclosed(arb_mat([[arb(0.5, 1e-3), arb(2.0)]]))
     assert 1e-3 <= found.rad[0, 0] <= 1.001e-3 and found.rad[0, 1] <= 1e-15
-    np.testing.assert_array_equal(_enclosed(np.eye(2)).rad, np.zeros((2, 2)))
+    np.testing.assert_array_equal(as_enclosed(np.eye(2)).rad, np.zeros((2, 2)))
 
 
 def test_a_loop_under_measurable_disturbances_is_seen_along_balls_as_along_floats() -> None:

@@ -189,7 +189,7 @@ def test_what_can_never_be_certified_is_said_before_anything_is_solved(
 ) -> None:
     ball = sr.Ellipsoid([0.0, 0.0], [[0.25, 0.0], [0.0, 0.25]])
     problem = sr.OptimalControlProblem(
-        system=sr.LinearSystem([[0, 1], [0, 0]], [[0.0], [1.0]]),
+        system=sr.LinearSystem(lambda p: [[0, 1], [-p[0], 0]], [[0.0], [1.0]], parameters=sr.Box([0.5], [1.5])),
         horizon=2.0,
         initial_state=[0.4, 0.0],
         control=sr.Box([-1.0], [1.0]),
