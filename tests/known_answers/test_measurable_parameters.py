@@ -279,9 +279,10 @@ def test_what_they_add_at_one_parameter_and_over_cells_is_that_of_the_plant_ther
 
 
 @pytest.mark.slow
-def test_the_worst_signal_at_a_parameter_attains_what_is_claimed() -> None:
-    functionals = of_problem().transcription.functionals
-    for time, p in ((1.37, -0.2), (HORIZON, 0.11)):
+@pytest.mark.parametrize(("name", "places"), [("stiffness", (-0.2, 0.11)), ("parts", (-1.9, 2.4))])
+def test_the_worst_signal_at_a_parameter_attains_what_is_claimed(name: str, places: tuple[float, float]) -> None:
+    functionals = of_problem(**PLANTS[name][0]).transcription.functionals
+    for time, p in zip((1.37, HORIZON), places, strict=True):
         parameter = np.array([p])
         ends, signal = worst_signal(functionals, time, ROWS[1], parameter)
         assert signal is not None
