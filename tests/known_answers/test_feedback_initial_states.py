@@ -100,6 +100,7 @@ def test_a_symmetric_problem_has_a_symmetric_set(spring: sr.InitialStates) -> No
     np.testing.assert_allclose(spring.outer.max(axis=0), -spring.outer.min(axis=0), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_whoever_measures_starts_from_more_states_than_one_who_plans(spring: sr.InitialStates) -> None:
     plan = sr.initial_states(config(SPRING, OFF), directions=16, values=0)
     assert within(spring, plan.inner)

@@ -332,6 +332,7 @@ def test_the_margin_is_bracketed_and_lies_below_what_any_causal_policy_withstand
     assert not np.isfinite(found.causal_upper) or found.causal_upper >= found.lower
 
 
+@pytest.mark.slow
 def test_a_controller_takes_a_force_that_switches_within_its_pieces_for_one_of_the_set(certified: Path) -> None:
     A, B, step = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([0.0, 1.0]), 4.0 / PIECES
     controller, rng = sr.controller(certified), np.random.default_rng(0)

@@ -78,6 +78,7 @@ def test_the_area_between_the_polygons_is_small_and_the_polygons_enclose(cart: s
     assert (cart.outer @ cart.directions.T <= cart.bounds + 1e-8).all()
 
 
+@pytest.mark.slow
 def test_just_inside_is_certified_and_just_outside_has_a_farkas_certificate(cart: sr.InitialStates) -> None:
     for vertex in cart.inner[::8]:
         assert cart.where(0.999 * vertex) == "inside"

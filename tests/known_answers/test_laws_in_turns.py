@@ -134,7 +134,7 @@ ALIKE: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-@pytest.mark.first(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("more", list(ALIKE))
 def test_laws_that_stay_the_same_cost_what_pieces_of_a_system_do(more: str, tmp_path: Path) -> None:
     policy = {key: value for key, value in ALIKE[more].items() if key == "policy"}
