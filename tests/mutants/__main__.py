@@ -27,8 +27,8 @@ from tests.mutants.sites import KINDS, Mutant, mutants
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (
-    "checker", "sip/proof", "control/feedback", "control/constraints", "control/response", "control/enclosures",
-    "control/sets", "sip/inner",
+    "checker", "sip/proof", "control/feedback", "control/constraints", "control/reach", "control/response",
+    "control/enclosures", "control/sets", "sip/inner",
 )  # fmt: skip
 COPIED = (
     "sparserob_core",

@@ -10,8 +10,8 @@ from scipy.linalg import expm
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.response.disturbance import disturbance_model
-from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.response import Response, merge_grids
 
 

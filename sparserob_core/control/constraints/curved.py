@@ -22,8 +22,8 @@ from sparserob_core.control.constraints.local_maxima import (
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.taylor import Combination, combination
-from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
-from sparserob_core.control.response.functional import Leg, WorstCase
+from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
+from sparserob_core.control.reach.functional import Leg, WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Moving, Reference
 from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit

@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.brief import ENTRIES, brief
 from sparserob_core.control.problem.names import UNNAMED, Names, measured_in
 from sparserob_core.control.problem.units import Units
-from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import (
     Explanation,

@@ -23,9 +23,9 @@ from sparserob_core.control.constraints.local_maxima import (
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.terms.windows import Flat
-from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
-from sparserob_core.control.response.functional import LEGS_KEPT, Leg, WorstCase
-from sparserob_core.control.response.initial_support import Supports
+from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
+from sparserob_core.control.reach.functional import LEGS_KEPT, Leg, WorstCase
+from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Direct, Moving, Reference
 from sparserob_core.control.response.response import Outputs, Response, distinct_times
@@ -34,7 +34,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Separation
 
 if TYPE_CHECKING:
-    from sparserob_core.control.response.measurable import Execution
+    from sparserob_core.control.reach.execution import Execution
 
 SURE = 1e-8  # a vertex that is predicted to this accuracy is one
 NEARER, LOOKS = 8, 4  # an unsure vertex is predicted from samples so many times nearer, and so often

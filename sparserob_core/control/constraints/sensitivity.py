@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.response.functional import CHUNK
+from sparserob_core.control.reach.functional import CHUNK
 from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.control.response.sensitivity_system import tangent
 from sparserob_core.control.response.varying.expansion import Expansion
@@ -261,7 +261,7 @@ class Sensitivity:
         if grid.mode is None:
             in_time = support.bound.support((at.free[:, :1] @ at.W[:, 0])[:, 0])[:, None]
         else:  # of what earlier systems did there is no closed form
-            from sparserob_core.control.response.measurable import STEP
+            from sparserob_core.control.reach.varying_execution import STEP
 
             ends, step = grid.breakpoints[[at.now, at.now + 1]], STEP * float(grid.breakpoints[-1])
             low, high = np.clip([times - step, times + step], *ends)

@@ -9,7 +9,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import SAME, Source, TimedExplanation
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.units import Units
-from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Reference
 from sparserob_core.shapes import Float, Int, shaped

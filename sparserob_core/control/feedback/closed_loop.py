@@ -17,9 +17,9 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.feedback.innovations import KNOWN, Answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces
 from sparserob_core.control.feedback.observer import Observer, innovations_of
-from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.measurable import MISSED
-from sparserob_core.control.response.varying_motion import VaryingMotion
+from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.measurable import MISSED
+from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread, UncertainRows, table_of
 

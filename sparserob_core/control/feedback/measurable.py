@@ -18,14 +18,11 @@ import numpy as np
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.feedback.zonoid import FAST, PARTS, Arc, Pushes, Zonoid, corners
-from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.measurable import (
-    MISSED,
-    VaryingExecution,
-    VaryingExecutionCellSupport,
-    VaryingMeasurable,
-)
-from sparserob_core.control.response.varying_motion import OUTWARD, VaryingMotion
+from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.measurable import MISSED
+from sparserob_core.control.reach.varying_execution import VaryingExecution, VaryingExecutionCellSupport
+from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
+from sparserob_core.control.reach.varying_motion import OUTWARD, VaryingMotion
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.sip.convex_set import Array, ConvexSet
 

@@ -1,1 +1,1 @@
-"""What the state does: responses to control and disturbance, and their enclosures over cells of time and parameter."""
+"""What the state does: responses to control and disturbance, of known, uncertain and changing systems."""

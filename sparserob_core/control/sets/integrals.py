@@ -10,6 +10,7 @@ their length.
 from __future__ import annotations
 
 from functools import cache
+from math import comb
 
 import numpy as np
 
@@ -20,6 +21,9 @@ HALVINGS = 48  # of an interval: what is left of it is below rounding
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(17)  # with 9 of them intervals would be halved four times more
 RADIUS = 3.0  # of the ellipse: with 2 the rule is off by 1e-9, with 4 every interval is halved once more
 MISSED = 64.0 / 15.0 * RADIUS ** (2.0 - 2.0 * NODES.size) / (1.0 - RADIUS**-2.0)  # 3e-15 of the largest value
+CUTS = 3  # at changes of a sign, before an interval is halved: a polynomial across a piece changes it once or twice
+SECANTS = 10  # steps to where a sign changes; with half of them what is left of a part is halved some times
+NEAR_END = 1e-9  # of an interval, from its ends: where a sign changes nearer to one, it is halved
 
 
 def enclosed(bound: ConvexSet) -> bool:
@@ -82,3 +86,88 @@ def _moved(count: int, share: float, begin: float) -> Array:
         found[: power.size, j] = power
         power = np.convolve(power, [begin, share])
     return found
+
+
+def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) -> Array:
+    """Lower and upper bounds ``(l, 2)`` of the integrals of the support function of ``bound`` over intervals of
+    ``lengths (l,)``, on which its argument is a polynomial with ``terms (l, p + 1, w)`` in the share of the
+    interval that has passed; intervals across a kink are halved until their bounds are within ``accuracy (l,)``."""
+    if bound.halfspaces() is None:
+        return curved_integral(bound, terms, lengths, accuracy)
+    total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
+    order = terms.shape[1] - 1
+    points = np.einsum("kj,ljw->lkw", bezier(order), terms)
+    for turn in range(HALVINGS + 1):
+        best = bound.support_point(points[:, order // 2])
+        low = (points @ best[:, :, None])[..., 0].mean(axis=1) * lengths
+        high = bound.support(points).mean(axis=1) * lengths
+        open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
+        np.add.at(total, owner[~open_], np.stack([low, high], axis=1)[~open_])
+        points, owner = _halved(points[open_]), np.tile(owner[open_], 2)
+        lengths = np.tile(lengths[open_] / 2, 2)
+        if not owner.size:
+            break
+    return total
+
+
+def absolute(terms: Array, accuracy: Array) -> Array:
+    """Lower and upper bounds ``(l, 2)`` of the integrals over ``[0, 1]`` of absolute values of polynomials with ``terms
+    (l, p + 1)``, as those of `integrated`, but cut where they change their signs: what is left of both parts is settled
+    at once, where halves would be cut some twenty times. Wherever they are cut, the bounds hold."""
+    total, owner = np.zeros((len(terms), 2)), np.arange(len(terms))
+    order = terms.shape[1] - 1
+    points, lengths = terms @ bezier(order).T, np.ones(len(terms))
+    for turn in range(HALVINGS + 1):
+        low, high = np.abs(points.mean(axis=1)) * lengths, np.abs(points).mean(axis=1) * lengths
+        open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
+        np.add.at(total, owner[~open_], np.stack([low, high], axis=1)[~open_])
+        points, owner, lengths = points[open_], np.tile(owner[open_], 2), lengths[open_]
+        if not owner.size:
+            break
+        at = _sign_changes(points) if turn < CUTS else np.full(len(points), 0.5)
+        points, lengths = _cut(points, at), np.concatenate([lengths * at, lengths * (1.0 - at)])
+    return total
+
+
+def _sign_changes(points: Array) -> Array:
+    """About where polynomials with Bernstein's coefficients ``points (l, p + 1)`` change their signs, ``(l,)``, by
+    secants of which the older end counts half (Illinois); the middle where both ends have one sign."""
+    order = points.shape[1] - 1
+    weights, powers = np.array([comb(order, k) for k in range(order + 1)]) * points, np.arange(order + 1)
+    a, b, fa, fb = np.zeros(len(points)), np.ones(len(points)), points[:, 0], points[:, -1]
+    crossing, at = fa * fb < 0.0, np.full(len(points), 0.5)
+    for _ in range(SECANTS):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = b - fb * (b - a) / (fb - fa)
+        at = np.where(crossing & (found > NEAR_END) & (found < 1.0 - NEAR_END), found, 0.5)
+        value = (weights * at[:, None] ** powers * (1.0 - at[:, None]) ** powers[::-1]).sum(axis=1)
+        turned = value * fb < 0.0
+        a, fa = np.where(turned, b, a), np.where(turned, fb, fa / 2.0)
+        b, fb = at, value
+    return at
+
+
+def _cut(points: Array, at: Array) -> Array:
+    """Bernstein's coefficients ``(l, p + 1)`` on both sides of ``at (l,)``, the first parts first (de Casteljau)."""
+    left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
+    share, rest = at[:, None], 1.0 - at[:, None]
+    for order in range(last + 1):
+        left[:, order], right[:, last - order] = row[:, 0], row[:, -1]
+        row = rest * row[:, :-1] + share * row[:, 1:]
+    return np.concatenate([left, right])
+
+
+@cache
+def bezier(order: int) -> Array:
+    """From powers on ``[0, 1]`` to the coefficients of Bernstein's form, ``(order + 1, order + 1)``."""
+    return np.array([[comb(k, j) / comb(order, j) for j in range(order + 1)] for k in range(order + 1)])
+
+
+def _halved(points: Array) -> Array:
+    """Bernstein's coefficients ``(l, p + 1, w)`` on both halves of an interval, the first halves first: averages of
+    neighbours (de Casteljau)."""
+    left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
+    for order in range(last + 1):
+        left[:, order], right[:, last - order] = row[:, 0], row[:, -1]
+        row = (row[:, :-1] + row[:, 1:]) / 2
+    return np.concatenate([left, right])

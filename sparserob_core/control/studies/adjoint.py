@@ -17,7 +17,8 @@ import numpy as np
 
 from sparserob_core.control.enclosures.flows import products
 from sparserob_core.control.enclosures.matrix_exponential import exponential, rounding
-from sparserob_core.control.response.measurable import ORDER, integrated
+from sparserob_core.control.reach.measurable import ORDER
+from sparserob_core.control.sets.integrals import integrated
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 

@@ -15,9 +15,9 @@ from sparserob_core.brief import brief
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.flows import Leaps
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.response.response import Response
-from sparserob_core.control.response.varying_motion import VaryingMotion
 from sparserob_core.control.transcription.record import Feedback, Transcription
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.program import OwnUnits, Separation

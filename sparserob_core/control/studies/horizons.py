@@ -21,9 +21,9 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.units import Units
+from sparserob_core.control.reach.disturbance_support import DisturbanceSupport, summed
+from sparserob_core.control.reach.support import InitialSupport
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
-from sparserob_core.control.response.disturbance_support import DisturbanceSupport, summed
-from sparserob_core.control.response.initial_support import InitialSupport
 from sparserob_core.control.response.lifted import LiftedSystem, lift
 from sparserob_core.control.response.reference import STILL, Reference
 from sparserob_core.control.response.response import TimeGrid, merge_grids

@@ -14,8 +14,8 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.dependence import Dependence
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.studies.simulate import worst_errors
 from sparserob_core.control.transcription.terms.in_time import in_time

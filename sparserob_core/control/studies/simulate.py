@@ -16,7 +16,7 @@ from sparserob_core.control.response.response import Response, TimeGrid, distinc
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from sparserob_core.control.response.measurable import Execution
+    from sparserob_core.control.reach.execution import Execution
 
 MANY = 10_000  # pieces, from which no times inside are looked at where the system hardly moves on one
 HELD = 2_000_000  # numbers of signals, or of transition matrices, that are held at once

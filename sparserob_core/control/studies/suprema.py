@@ -16,7 +16,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
-from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal

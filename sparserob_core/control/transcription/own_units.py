@@ -9,7 +9,7 @@ import numpy as np
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
-from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Moving
 from sparserob_core.control.sets.directions import sampled

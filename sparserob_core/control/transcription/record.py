@@ -14,7 +14,7 @@ from sparserob_core.control.constraints.explanation import Source, TimedExplanat
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array, ConvexSet

@@ -16,8 +16,8 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.representable import require_representable
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.problem.units import Units, ratios
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
-from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
@@ -144,7 +144,8 @@ def _functionals(
     response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
     execution: Execution | None = None
     if problem.execution is not None:
-        from sparserob_core.control.response.measurable import Execution, VaryingExecution
+        from sparserob_core.control.reach.execution import Execution
+        from sparserob_core.control.reach.varying_execution import VaryingExecution
 
         shares, felt = np.asarray(problem.execution), np.ones(problem.system.states)
         felt[list(problem.commanded)] = 0.0

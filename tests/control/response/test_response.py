@@ -16,8 +16,8 @@ from scipy.linalg import expm
 from sparserob_core.control.enclosures.matrix_exponential import exponential, transitions
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response import functional
-from sparserob_core.control.response.disturbance_support import DisturbanceSupport
+from sparserob_core.control.reach import functional
+from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import lift
 from sparserob_core.control.response.response import Propagator, Response, merge_grids
 from sparserob_core.sip.convex_set import Box

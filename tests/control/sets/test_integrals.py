@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
+from math import comb
 
 import numpy as np
 import pytest
 
-from sparserob_core.control.sets.integrals import curved_integral, enclosed
+from sparserob_core.control.sets.integrals import _halved, curved_integral, enclosed
 from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope, Zonotope, product
 from tests.control.sets.test_sets import ByItsSupport
 
@@ -157,3 +158,15 @@ def test_balls_that_are_nearly_those_of_the_1_norm_take_few_intervals(p: float) 
     assert found[0, 0] - 1e-14 <= exact <= found[0, 1] + 1e-14
     assert found[0, 1] - found[0, 0] <= 1e-11
     assert sum(calls) < 20_000  # and a power of 10 of more for each of the exponent, without an entry that leads
+
+
+def test_the_halves_of_a_polynomial_are_itself() -> None:
+    points = np.random.default_rng(1).normal(size=(2, 5, 3))
+
+    def at(coefficients: np.ndarray, u: float) -> np.ndarray:
+        return sum(comb(4, k) * u**k * (1 - u) ** (4 - k) * coefficients[:, k] for k in range(5))
+
+    halves = _halved(points)
+    for u in (0.0, 0.3, 1.0):
+        np.testing.assert_allclose(at(halves[:2], u), at(points, u / 2), atol=1e-14)
+        np.testing.assert_allclose(at(halves[2:], u), at(points, 0.5 + u / 2), atol=1e-14)

@@ -199,7 +199,7 @@ def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws
     assert not loaded & {"scipy.optimize", "piqp", "sparserob_core.checker", "matplotlib", "rich", "flint"}
     elsewhere = (
         "control.feedback.closed_loop",
-        "control.response.measurable",
+        "control.reach.measurable",
         "sip.working.robust",
         "sip.search.search",
     )

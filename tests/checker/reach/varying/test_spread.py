@@ -15,7 +15,7 @@ from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.varying import spread as expansions
 from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates, SpreadTube
-from tests.control.response.test_spread_motion import FILLING, RELAXING, SYSTEM, decay
+from tests.control.reach.test_spread_motion import FILLING, RELAXING, SYSTEM, decay
 
 flint = pytest.importorskip("flint")
 

@@ -1,4 +1,4 @@
-"""Guards control/response/enclosure: bounds of the violation on cells: never below a dense maximum, and close to it on
+"""Guards control/reach/enclosure: bounds of the violation on cells: never below a dense maximum, and close to it on
 small cells."""
 
 from __future__ import annotations

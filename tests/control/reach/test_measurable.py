@@ -1,10 +1,9 @@
-"""Guards control/response/measurable: measurable disturbances: the limit from above of ever finer piecewise constant
+"""Guards control/reach/measurable: measurable disturbances: the limit from above of ever finer piecewise constant
 ones."""
 
 from __future__ import annotations
 
 import itertools
-from math import comb
 from unittest.mock import patch
 
 import numpy as np
@@ -16,7 +15,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
-from sparserob_core.control.response import measurable
+from sparserob_core.control.reach import measurable
 from sparserob_core.control.response.response import Response, merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
@@ -228,18 +227,6 @@ def test_bounds_across_a_root_are_those_of_the_modulus_of_a_sine():
     assert (truth <= bounds[:, 1]).all()
     assert (bounds[:, 1] - bounds[:, 0] <= 4e-13).all()
     assert bounds[0].tolist() == [0.0, 0.0]
-
-
-def test_the_halves_of_a_polynomial_are_itself():
-    points = np.random.default_rng(1).normal(size=(2, 5, 3))
-
-    def at(coefficients, u):
-        return sum(comb(4, k) * u**k * (1 - u) ** (4 - k) * coefficients[:, k] for k in range(5))
-
-    halves = measurable._halved(points)
-    for u in (0.0, 0.3, 1.0):
-        np.testing.assert_allclose(at(halves[:2], u), at(points, u / 2), atol=1e-14)
-        np.testing.assert_allclose(at(halves[2:], u), at(points, 0.5 + u / 2), atol=1e-14)
 
 
 @pytest.mark.first(2)

@@ -1,4 +1,4 @@
-"""Guards control/response/varying_motion: bounds of the violation on cells of time of systems that change
+"""Guards control/reach/varying_motion: bounds of the violation on cells of time of systems that change
 with time: never below a dense maximum, close to it on small cells, and holding what transitions are off by."""
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sparserob_core.control.response.varying.expansion as expansion
-import sparserob_core.control.response.varying_motion as varying_motion
 from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.reach import varying_motion
+from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.response.disturbance import disturbance_model
-from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Reference
 from sparserob_core.control.response.response import Response, merge_grids
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
-from sparserob_core.control.response.varying_motion import VaryingMotion
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from tests.support.plants import indicators, uniform, walsh

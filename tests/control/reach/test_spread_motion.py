@@ -13,11 +13,11 @@ from scipy.integrate import solve_ivp
 import sparserob_core as sr
 from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.reach.varying_motion import Truncation, VaryingMotion
 from sparserob_core.control.response.response import Outputs, Propagator, Response, merge_grids
 from sparserob_core.control.response.varying import spread as expansions
 from sparserob_core.control.response.varying.discs import cauchy
 from sparserob_core.control.response.varying.expansion import Expansion
-from sparserob_core.control.response.varying_motion import Truncation, VaryingMotion
 from sparserob_core.control.transcription.transcribe import prepare
 
 BOX = sr.Box([-0.3], [0.6])

@@ -1,4 +1,4 @@
-"""Guards control/response/measurable: errors of execution of systems that change with time, against closed
+"""Guards control/reach/varying_execution: errors of execution of systems that change with time, against closed
 forms, an integrator and the constant system; enclosed on cells of time, also where series are cut short."""
 
 from __future__ import annotations
@@ -13,13 +13,10 @@ import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.problem.system import System, VaryingSystem
-from sparserob_core.control.response.measurable import (
-    Execution,
-    VaryingExecution,
-    VaryingExecutionCellSupport,
-    absolute,
-)
+from sparserob_core.control.reach.execution import Execution
+from sparserob_core.control.reach.varying_execution import VaryingExecution, VaryingExecutionCellSupport
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
+from sparserob_core.control.sets.integrals import absolute
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 from sparserob_core.sip.convex_set import Array
 from tests.support.enclosed import assert_bounded_on_cells

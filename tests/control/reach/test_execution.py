@@ -1,4 +1,4 @@
-"""Guards control/response/measurable: what errors of execution add to the state, exact, and enclosed on cells of
+"""Guards control/reach/execution: what errors of execution add to the state, exact, and enclosed on cells of
 time."""
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import sparserob_core as sr
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.enclosures.comparison import block_norms
 from sparserob_core.control.enclosures.matrix_exponential import rounding
+from sparserob_core.control.reach.execution import Execution, ExecutionCellSupport
 from sparserob_core.control.response.lifted import LiftedSystem
-from sparserob_core.control.response.measurable import Execution, ExecutionCellSupport
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 from tests.support.enclosed import assert_bounded_on_cells
 

@@ -27,7 +27,7 @@ from sparserob_core.control.enclosures.polynomial import (
 )
 from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
-from sparserob_core.control.response.initial_support import Supports
+from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.response.reference import Direct, Moving
 from sparserob_core.control.response.response import TimeGrid
 from sparserob_core.errors import NotEnclosable

@@ -1,4 +1,4 @@
-"""Guards control/response/functional, disturbance, response: what one functional is asked in several ways is the same,
+"""Guards control/reach/functional, disturbance, response: what one functional is asked in several ways is the same,
 and what it says of worst disturbances is found by going through all of their corners."""
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from scipy.linalg import expm
 
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.response.disturbance import disturbance_model
-from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.response import Outputs, Response, TimeGrid, merge_grids
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Product
 from sparserob_core.errors import InputError

@@ -16,24 +16,26 @@ from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
-from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.disturbance_support import DisturbanceSupport
-from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
-from sparserob_core.control.response.lifted import LiftedSystem, frozen, lift_legs
-from sparserob_core.control.response.response import Response, TimeGrid, Weights
-from sparserob_core.control.response.varying_motion import (
+from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
+from sparserob_core.control.reach.support import InitialSupport, Support, Supports
+from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
     SpreadSupport,
     Truncation,
     VaryingMotion,
     VaryingSupport,
 )
+from sparserob_core.control.response.disturbance import DisturbanceModel
+from sparserob_core.control.response.lifted import LiftedSystem, frozen, lift_legs
+from sparserob_core.control.response.response import Response, TimeGrid, Weights
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
-    from sparserob_core.control.response.measurable import Execution, MeasurableSupport, VaryingMeasurable
+    from sparserob_core.control.reach.execution import Execution
+    from sparserob_core.control.reach.measurable import MeasurableSupport
+    from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = (
@@ -456,7 +458,7 @@ class WorstCase:
             return None
         if given and given.response.propagator is self.response.propagator and given.bound is bound:
             return given
-        from sparserob_core.control.response.measurable import measurable_support
+        from sparserob_core.control.reach.varying_measurable import measurable_support
 
         return measurable_support(self.response, bound)
 

@@ -11,8 +11,8 @@ from scipy.linalg import expm
 
 from sparserob_core.control.enclosures.comparison import block_norms
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response.disturbance_support import DisturbanceSupport
-from sparserob_core.control.response.initial_support import InitialSupport
+from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
+from sparserob_core.control.reach.support import InitialSupport
 from sparserob_core.control.response.lifted import lift
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.sip.convex_set import Array, Box

@@ -28,8 +28,8 @@ from sparserob_core.control.enclosures.comparison import product
 from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
+from sparserob_core.control.reach.disturbance_support import over_faces, summed
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.disturbance_support import over_faces, summed
 from sparserob_core.control.response.response import Propagator, TimeGrid
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.sip.convex_set import Array, ConvexSet

@@ -1,18 +1,25 @@
-"""How far the worst initial state of a set pushes a functional of the state, enclosed over a cell of parameters; and
-what several such parts of the uncertainty add up to."""
+"""Parts of the uncertainty, enclosed over cells of time, parameters and directions, and what several of them add up to:
+how far the worst initial state of a set pushes a functional of the state, and what is asked along single directions, as
+over a cell of these."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from itertools import product as every_choice
+from typing import Protocol, final
 
 import numpy as np
 
 from sparserob_core.control.enclosures.comparison import block_norms, product
+from sparserob_core.control.enclosures.matrix_exponential import rounding
+from sparserob_core.control.enclosures.polynomial import distinct_patterns
 from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
-from sparserob_core.control.response.disturbance_support import Carried, carried, over_faces, summed
+from sparserob_core.control.reach.disturbance_support import Carried, carried, over_faces, summed
+from sparserob_core.control.reach.varying_motion import OUTWARD, VaryingMotion
 from sparserob_core.control.response.lifted import KNOWN, LiftedSystem
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 
@@ -221,3 +228,133 @@ class InitialSupport:
         grid = self.lifted.grid
         flow = self.lifted.comparison.over(grid.lengths).flow
         return flow.summed(self._sizes, np.zeros((grid.pieces, self._sizes.size)))
+
+
+class KnownCellSupport:
+    """A part of the uncertainty on functionals ``rows (r, d)`` of a *known* system, in the form of `Support`."""
+
+    rows: Array
+
+    @shaped
+    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r 0"]:
+        """No parameters, no steepness: ``(k, r, 0)``."""
+        return np.zeros((times.size, self.rows.shape[0], 0))
+
+    def repeated(self, times: Array) -> tuple[Array, Array]:
+        """Every time with every row: ``(k r,)``, ``(k r, d)``."""
+        return np.repeat(times, self.rows.shape[0]), np.tile(self.rows, (times.size, 1))
+
+    def between(self, bounds: Array) -> tuple[Array, Array]:
+        """The middle ``(k, r, 1)`` of bounds ``(k r, 2)``, and how far they are from it, ``(k, r)``."""
+        bounds = bounds.reshape(-1, self.rows.shape[0], 2)
+        return bounds.mean(axis=2)[..., None], (bounds[..., 1] - bounds[..., 0]) / 2 * (1.0 + rounding(4))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class DirectionsCellSupport:
+    """A part of the uncertainty of a *known* system on one functional over a cell of directions ``c = rows[0] + sum_j
+    eta_j rows[j]``, ``|eta_j| <= 1``, in the form of `Support`; ``made`` is what it is on given ``rows (r, d)``, and
+    ``joined`` says which monomials there are.
+
+    It is a support function, or a sum of such with factors that are not negative: sublinear in ``c``. So it is, one
+    coordinate after another, at most what is linear in each between the corners. How far it leaves its chord in time is
+    a mean of differences ``h(y(s)) - h(y(r))`` with ``y`` linear in ``c``, each at most the sum of those of the rows:
+    so bounds of these, and of what is left out, add up.
+    """
+
+    made: Callable[[Array], Support]
+    rows: Array
+    leg: LiftedSystem | VaryingMotion
+    joined: Combination
+
+    @shaped
+    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k 1 nu"]:
+        """`Support.steepness`: what is added along a row, or against it, at most."""
+        axes = self.rows[1:]
+        # powers of two of one row are asked for again in every smaller cell
+        sizes = np.exp2(np.frexp(np.abs(axes).max(axis=1, initial=0.0))[1])
+        axes = axes / sizes[:, None]
+        along, off = self._at(times, np.vstack([axes, -axes]))
+        most = np.maximum(along + off, 0.0).reshape(times.size, 2, len(axes)).max(axis=1)
+        return np.asarray((most * sizes * OUTWARD)[:, None])
+
+    @shaped
+    def at(
+        self, times: Float[Array, " k"], ends: Float[Array, "k 1 nu"]
+    ) -> tuple[Float[Array, "k 1 M"], Float[Array, "k 1"]]:
+        """`Support.at`. What is lost in the middle of the cell is a part of the excess, since smaller cells lose
+        less."""
+        coefficients, excess = np.zeros((times.size, 1, self.joined.space.size)), np.zeros((times.size, 1))
+        patterns, which = distinct_patterns(ends)
+        for position, pattern in enumerate(patterns):
+            here = np.flatnonzero(which[:, 0] == position)
+            corners = _corners(pattern)
+            along, off = self._at(times[here], self.rows[0] + np.vstack([pattern, corners]) @ self.rows[1:])
+            found, beyond = between_corners(self.joined.space, pattern, along[:, 1:])
+            lost = np.maximum(along[:, 1:].mean(axis=1) - along[:, 0], 0.0)
+            size = rounding(len(corners) + 4) * np.abs(along).max(axis=1)
+            found[:, 0] -= lost
+            coefficients[here, 0] = found
+            excess[here, 0] = (off[:, 1:].max(axis=1) + beyond + lost + size) * OUTWARD
+        return coefficients, excess
+
+    @shaped
+    def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
+        """`Support.deviation` of every row."""
+        return self._each.deviation(start, widths)
+
+    @cached_property
+    def neglected(self) -> Array:
+        """`Support.neglected` of every row, with what rounding makes of the corners, ``(r, L)``."""
+        sizes = block_norms(np.abs(self.rows) @ np.abs(self.leg.transform), self.leg.starts)
+        return np.asarray(self._each.neglected + rounding(len(self.rows)) * product(sizes, self.reached.T))
+
+    @cached_property
+    def reached(self) -> Array:
+        """`Support.reached`."""
+        return self._each.reached
+
+    @cached_property
+    def _each(self) -> Support:
+        return self.made(self.rows)
+
+    def _at(self, times: Array, rows: Array) -> tuple[Array, Array]:
+        """What is added along ``rows (r, d)``, and how far it may be from that, ``(k, r)`` each."""
+        found, off = self.made(rows).at(times, np.zeros((times.size, len(rows), 0)))
+        return found[..., 0], off
+
+
+def over_directions(
+    made: Callable[[Array], Support], rows: Array, leg: LiftedSystem | VaryingMotion, joined: Combination | None
+) -> Support:
+    """What is ``made`` of functionals ``rows (r, d)``, or of the direction that they make where they are ``joined``."""
+    return made(rows) if joined is None else DirectionsCellSupport(made, rows, leg, joined)
+
+
+def _corners(pattern: Array) -> Array:
+    """The corners ``(n, nu)`` of the face of ``[-1, 1]^nu`` on which the coordinates with an end in ``pattern (nu,)``
+    are at it."""
+    free = np.flatnonzero(pattern == 0.0)
+    signs = np.array(list(every_choice((-1.0, 1.0), repeat=free.size)))
+    corners = np.tile(pattern, (len(signs), 1))
+    corners[:, free] = signs
+    return corners
+
+
+def between_corners(space: TaylorSpace, pattern: Array, values: Array) -> tuple[Array, Array]:
+    """What is linear in every coordinate between ``values (q, n)`` at the `_corners` of a face: coefficients ``(q,
+    M)``, and how far it may be above these, ``(q,)``: of products that the space has not, and by rounding."""
+    corners, free = _corners(pattern), np.flatnonzero(pattern == 0.0)
+    coefficients = np.zeros((len(values), space.size))
+    beyond = len(corners) * rounding(2 * len(corners) + 8) * np.abs(values).max(axis=1)
+    for chosen in every_choice((0, 1), repeat=free.size):
+        found = values @ corners[:, free[np.flatnonzero(chosen)]].prod(axis=1) / len(corners)
+        exponents = np.zeros(space.nu, dtype=int)
+        exponents[free] = chosen
+        place = space.index.get(tuple(exponents.tolist()))
+        if place is None:  # of more coordinates than there are degrees
+            beyond = beyond + np.abs(found)
+        else:
+            coefficients[:, place] = found
+    return coefficients, beyond

@@ -13,9 +13,8 @@ from sparserob_core.control.enclosures.comparison import block_norms
 from sparserob_core.control.enclosures.taylor import TaylorSpace, combination
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
-from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.initial_support import Supports
-from sparserob_core.control.response.measurable import DirectionsCellSupport, between_corners
+from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.support import DirectionsCellSupport, Supports, between_corners
 from sparserob_core.control.sets.sets import Box, Ellipsoid
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.plants import uniform

@@ -1,5 +1,5 @@
-"""Guards control/response/measurable: measurable disturbances of systems that change with time, against an integrator
-and the constant system; enclosed on cells of time, also where series are cut short."""
+"""Guards control/reach/varying_measurable: measurable disturbances of systems that change with time, against an
+integrator and the constant system; enclosed on cells of time, also where series are cut short."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.problem.system import System, VaryingSystem
-from sparserob_core.control.response.initial_support import Supports
-from sparserob_core.control.response.measurable import MeasurableSupport, VaryingMeasurable
-from sparserob_core.control.response.varying_motion import VaryingMotion
+from sparserob_core.control.reach.measurable import MeasurableSupport
+from sparserob_core.control.reach.support import Supports
+from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
+from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 from sparserob_core.sip.convex_set import Array
