@@ -196,6 +196,13 @@ class MeasurablePieces:
             made = self.zonoids[piece].signals(np.stack([point for _, point in points.values()]))
             self.composed.update({(key, point): arc for point, arc in zip(points, made, strict=True)})
 
+    def attained(self, deviation: Array) -> Array:
+        """The deviation ``(Q,)`` that the `signal` of one has: it misses it by what composing leaves."""
+        found = np.zeros(self.size)
+        for piece, (one, arc) in enumerate(zip(self.zonoids, self._arcs(deviation), strict=True)):
+            found[self.at(piece)[0]] = one.reached(arc)
+        return found
+
     def _arcs(self, deviation: Array) -> list[Arc]:
         """The signals on all pieces that have a deviation ``(Q,)``."""
         self.compose([deviation])

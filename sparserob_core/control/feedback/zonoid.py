@@ -31,8 +31,7 @@ NEWTON = 5  # steps to a root; with 3 of them ten times as many cells beside one
 FLAT = 2.0**-44  # of the largest height: a difference of heights that is rounding
 HELD = 2_000_000  # numbers that are held at once
 NEGLIGIBLE = 1e-13  # of the largest extent, one that is rounding
-PIVOTS = 500  # points asked for at most on the way to one point's parts; of four coordinates 200 leave 7e-9 of it
-COMPOSED = 1e-11  # of a point, by how much its signal may miss it: 6e-12 was seen, of four coordinates
+PIVOTS = 500  # points asked for at most on the way to one point's parts; of four coordinates 490 were seen
 RELATIVE = 2e-14  # by which a gauge may be too large
 SPIKE, TILT = 1e-12, 1e-14  # as in `ConvexSet`
 EDGE = 1e-9  # of a cell, a root that is so near to an end is no progress
@@ -242,6 +241,18 @@ class Zonoid(ConvexSet):
         made = [self._swept(part, direction[None]).arc() for part in self.parts]
         return _mean(made, np.ones(len(made)), self.channels)
 
+    def reached(self, signal: Arc) -> Array:
+        """The point ``(r,)`` that a signal leads to."""
+        ends, halves = self.pushes.ends, self.pushes.halves
+        left = ends[-1] * (1.0 - np.concatenate([[0.0], signal.ends]))
+        part = np.clip(np.searchsorted(ends, left, side="right") - 1, 0, self.count - 1)
+        along = (left - ends[part]) / halves[part] - 1.0
+        orders = np.arange(self.integrals.shape[1])
+        moved = along[:, None] ** orders - (-1.0) ** orders
+        whole = np.concatenate([np.zeros((1, *self.across.shape[1:])), np.cumsum(self.across, axis=0)])
+        since = whole[part] + np.einsum("np,nprw->nrw", moved, self.integrals[part])
+        return np.asarray(np.einsum("nrw,nw->r", since[:-1] - since[1:], signal.values))
+
     def _chunks(self, size: int, part: Array) -> Iterator[slice]:
         step = max(1, HELD // ((self.count + 1) * max(self.channels, part.shape[0])))
         return (slice(first, first + step) for first in range(0, size, step))
@@ -251,8 +262,8 @@ class Zonoid(ConvexSet):
 
     def _made_of(self, points: Array) -> tuple[Array, Array]:
         """Directions ``(k, r, r)`` and shares ``(k, r)``, at most 1 together, such that the support points of the
-        directions in these shares are ``points (k, r)`` of the set, up to rounding: the gauge of a point as a linear
-        program whose columns are generated, as in `ConvexSet`."""
+        directions in these shares are ``points (k, r)`` of the set, nearly: the gauge of a point as a linear program
+        whose columns are generated, as in `ConvexSet`. By how much they miss it, `reached` says."""
         k, r = points.shape
         turned = np.where(points < 0.0, -1.0, 1.0)
         lengths = np.linalg.norm(points, axis=1)
@@ -273,8 +284,9 @@ class Zonoid(ConvexSet):
                 leaving = np.where(slope > 0.0, np.maximum(share, 0.0) / slope, np.inf).argmin(axis=1)
             columns[open_, leaving], chosen[open_, leaving] = entering, directions
             made[open_, leaving] = True
-        shares = np.linalg.solve(np.swapaxes(columns, 1, 2), (tilted * lengths[:, None])[..., None])[..., 0]
-        shares = np.where(made, np.maximum(shares, 0.0), 0.0)
+        shares = np.linalg.solve(np.swapaxes(columns, 1, 2), points[..., None])[..., 0]
+        for point in np.flatnonzero(((shares < 0.0) | ~made).any(axis=1)):
+            shares[point] = _shares(np.where(made[point][:, None], columns[point], 0.0), points[point])
         return chosen, shares / np.maximum(1.0, shares.sum(axis=1, keepdims=True))
 
 
@@ -414,6 +426,21 @@ def _root(P: Array, low: Array, high: Array) -> Array:
     least = EDGE * (high - low)
     inside = crossing & (u > low + least) & (u < high - least)
     return np.asarray(np.where(inside, u, middle))
+
+
+def _shares(columns: Array, point: Array) -> Array:
+    """Shares ``(r,) >= 0`` in which ``columns (r, r)``, one in each row, are a point, as nearly as those do that are
+    left: where columns are the same but for rounding a share of one may be negative, and is taken over by the others.
+    """
+    left = np.flatnonzero(columns.any(axis=1))
+    while True:
+        shares = np.linalg.lstsq(columns[left].T, point, rcond=None)[0]
+        if not (shares < 0.0).any():
+            break
+        left = np.delete(left, shares.argmin())
+    found = np.zeros(point.size)
+    found[left] = shares
+    return found
 
 
 def _mean(signals: Sequence[Arc], shares: Array, channels: int) -> Arc:

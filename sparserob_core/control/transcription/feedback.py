@@ -18,11 +18,12 @@ from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_o
 from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
 from sparserob_core.control.feedback.observer import Observer, between, innovations_of
-from sparserob_core.control.feedback.zonoid import COMPOSED, has_corners
+from sparserob_core.control.feedback.zonoid import has_corners
 from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
+from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.control.transcription.own_units import added_up, fixed, units_of_steps
 from sparserob_core.control.transcription.program import ranges, transcribed
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
@@ -291,7 +292,7 @@ def _spread(posed: Posed, acting: MeasurablePieces | None) -> Spread:
     """The deviations of a problem's disturbance and of its initial state."""
     problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _begins_anew(posed)
     if acting is not None:
-        return Spread((*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets), COMPOSED)
+        return Spread((*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets), MISSED)
     blocks = 0 if disturbance is None else disturbance.block_count
     noise = None if problem.measurements is None else problem.measurements.noise
     return deviations_of(problem.disturbance, blocks, problem.initial_set, noise, posed.control.pieces, periods)

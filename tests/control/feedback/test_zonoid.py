@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from sparserob_core.checker.reach.flow import OwnUnits, stacked
 from sparserob_core.checker.reach.measurable import Kernel, Side
 from sparserob_core.checker.sets.polynomials import Enclosed
-from sparserob_core.control.feedback.zonoid import Pushes, Zonoid, _apart
+from sparserob_core.control.feedback.zonoid import Arc, Pushes, Zonoid, _apart, _shares
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -94,6 +94,45 @@ def test_every_point_of_the_set_has_an_admissible_signal(name: str) -> None:
         assert (bound.violation(made.values + bound.middle()) <= 1e-12).all()
         reached = found.into @ effect(A, E, length, made.ends, made.values)
         np.testing.assert_allclose(reached, point, atol=1e-11 * np.abs(extreme).max())
+
+
+@pytest.mark.first(2)
+@pytest.mark.parametrize("name", CASES)
+def test_a_signal_leads_where_an_exponential_says(name: str) -> None:
+    """Signals that jump anywhere, at ends of parts too, not those of the best corners alone."""
+    A, E, length, bound = CASES[name]
+    found, rng = Zonoid.of(Pushes.of(A, E, length), bound), np.random.default_rng(6)
+    of_parts = 1.0 - found.pushes.ends[1:-1] / length
+    for ends in (np.ones(1), np.append(np.sort(rng.uniform(size=7)), 1.0), np.append(of_parts[::-1], 1.0)):
+        values = rng.normal(size=(ends.size, E.shape[1]))
+        truth = found.into @ effect(A, E, length, ends, values)
+        np.testing.assert_allclose(
+            found.reached(Arc(ends, values)), truth, rtol=1e-12, atol=1e-12 * np.abs(truth).max()
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", ["four integrators", "two forces on a motion in a plane"])
+def test_a_signal_does_not_miss_its_point_where_columns_are_the_same_but_for_rounding(name: str, seed: int) -> None:
+    """Towards a corner of a round set three of four columns are one point to 1e-9, and a share of theirs is negative:
+    without it a signal missed 3e-8."""
+    A, E, length, bound = CASES[name]
+    found, rng = Zonoid.of(Pushes.of(A, E, length), bound), np.random.default_rng(seed)
+    points = found.support_point(rng.normal(size=(8, 4))) * rng.uniform(size=(8, 1))
+    reached = np.array([found.reached(one) for one in found.signals(points)])
+    assert np.abs(reached - points).max() <= 1e-13
+
+
+def test_shares_of_columns_that_are_one_point_are_taken_over_by_one_of_them() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 4))
+    columns = np.array([a, a + 1e-9 * rng.normal(size=4), b, a + 1e-9 * rng.normal(size=4)])
+    for point in (0.7 * a + 0.2 * b, 0.7 * a + 1e-10 * rng.normal(size=4), b, 0.0 * a):
+        shares = _shares(columns, point)
+        assert (shares >= 0.0).all()
+        assert shares @ columns == pytest.approx(point, abs=1e-9)
+    assert _shares(np.array([a, 0.0 * a, b, 0.0 * a]), 0.7 * a + 0.2 * b) == pytest.approx([0.7, 0.0, 0.2, 0.0])
 
 
 def test_a_direction_that_nothing_pushes_is_no_coordinate() -> None:
