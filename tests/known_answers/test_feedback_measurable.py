@@ -18,6 +18,7 @@ import sparserob_core as sr
 from sparserob_core.control.feedback.zonoid import Zonoid
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.check.check import check
+from sparserob_core.experiment.run.conclusion import bound
 from tests.support.problems import pushed_spring
 
 SPRING = {**pushed_spring(0.25), "path": [{"box": [0.7, None], "from": 0.5}]}
@@ -311,6 +312,87 @@ def test_what_a_bound_rests_on_is_composed_once(tmp_path: Path, monkeypatch: pyt
     assert outcome.status == "certified"
     assert len(composed) > 2
     assert len(composed) == len(set(composed))
+
+
+@pytest.mark.slow
+def test_what_a_bound_rests_on_is_composed_at_once_beside_initial_states_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Deviations of initial states come after those of the pieces, and are no points of their sets."""
+    batches: list[set[bytes]] = []
+    plain = Zonoid.signals
+
+    def told(zonoid: Zonoid, points: np.ndarray) -> list[Any]:
+        batches.append({point.tobytes() for point in points})
+        return plain(zonoid, points)
+
+    monkeypatch.setattr(Zonoid, "signals", told)
+    problem = {**SPRING, **VARIANTS["initial states in a set"], "horizon": 2.0}
+    outcome = run(problem, tmp_path / "run", "peak", dictionaries=FEW, causal_signals=0)
+    experiment: Any = outcome.experiment
+    loop = experiment.transcription.answering.loop
+    assert loop.spread.size == loop.measurable.size + 2
+    rests = [cut.index[-loop.spread.size :] for cut in outcome.result.dual.cuts]
+    points = [w[loop.measurable.at(piece)[0]] for w in rests for piece in range(3)]
+    assert batches[0] == {point.tobytes() for point in points if point.any()}
+
+
+PLANE: dict[str, Any] = {
+    "name": "linear",
+    "system": {
+        "A": [[0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 1.36], [0, 1.39, -1.36, 0]],
+        "B": [[0, 0], [0, 0], [1, 0], [0, 1]],
+        "E": [[0, 0], [0, 0], [1, 0], [0, 1]],
+    },
+    "horizon": 3.0,
+    "initial_state": [-1.0, 0.3, 0.2, 0.0],
+    "control": {"box": 1.0},
+    "disturbance": {"box": 0.01},
+    "disturbance_class": "measurable",
+    "terminal": [{"box": [0.1, 0.1, 0.1, 0.1]}],
+}
+BENT = {**PLANE, "system": {**PLANE["system"], "A": [*PLANE["system"]["A"][:3], [0, "1.39 + 0.1*t", -1.36, 0]]}}
+
+
+def missing(monkeypatch: pytest.MonkeyPatch, shares: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Signals that miss their points, since their parts have these shares, and nobody derives the bound anew."""
+    plain = Zonoid._made_of
+
+    def made(zonoid: Zonoid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        directions, found = plain(zonoid, points)
+        return directions, shares(found)
+
+    monkeypatch.setattr(Zonoid, "_made_of", made)
+    monkeypatch.setattr(bound, "SECONDS", 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("problem", [PLANE, BENT], ids=["constant", "in t"])
+def test_what_signals_miss_of_their_deviations_is_taken_off_the_lower_bound(
+    problem: dict[str, Any], seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(seed)
+    missing(monkeypatch, lambda shares: shares * (1.0 - 1e-6 * rng.uniform(0.5, 1.0, shares.shape)))
+    outcome = run(problem, tmp_path / "run", dictionaries=FEW, causal_signals=0)
+    assert outcome.status == "verified"  # the gap is not closed by signals that prove less
+    assert 4e-7 < 1.0 - outcome.result.lower_bound / outcome.result.cost < 2e-5
+    assert check(outcome.directory).status == "verified"
+    for name in ("certificate.json", "result.json"):
+        file = outcome.directory / name
+        data = json.loads(file.read_text())
+        file.write_text(json.dumps({**data, "lower_bound": outcome.result.cost * (1.0 - 1.3e-8)}))
+    assert check(outcome.directory).status == "refuted"
+
+
+@pytest.mark.slow
+def test_what_signals_do_not_show_to_be_infeasible_is_not_said_to_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missing(monkeypatch, lambda shares: 0.1 * shares)
+    outcome = run({**SPRING, "disturbance": {"box": 0.6}}, tmp_path / "run")
+    assert outcome.status == "failed" and "do not prove it" in outcome.result.message
+    assert outcome.result.lower_bound == -np.inf and outcome.result.infeasible is None
 
 
 @pytest.mark.slow

@@ -169,7 +169,7 @@ class Transcription(Posed):
         fresh = {key: cut for key, cut in zip(keys, cuts, strict=True) if key not in self._explained}
         loop = None if self.feedback is None else self.feedback.loop
         if loop is not None and loop.measurable is not None and fresh:
-            size = loop.measurable.size  # of the deviations, which end an index
+            size = loop.spread.size  # of the deviations, which end an index: those of the initial state come last
             loop.measurable.compose([cut.index[-size:] for cut in fresh.values() if cut.index.size > size > 0])
         for key, cut in fresh.items():
             self._explained[key] = in_numbers(self.program, cut.family, cut.formulation, cut.index, cut.row)

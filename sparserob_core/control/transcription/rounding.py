@@ -15,11 +15,13 @@ from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.inner.simplex.counterpart import robust_bound
 from sparserob_core.sip.result import Result
 
 SHARE = 64 * 2.0**-52  # of the numbers that are added up to a row: products of a few matrices and sums of many terms
 INTEGRATED = 8.0  # as often do integrals of absolute values count: whoever encloses them adds up many parts of each
 SMALL_GAP = 1e-11  # by which the gap may be wider then than it was to be
+UNPROVEN = "nothing is feasible, but the signals that were found for the worst disturbances do not prove it"
 
 
 def rounded_down(model: Transcription, result: Result, tolerance: float | None, prices: Array | None = None) -> Result:
@@ -31,14 +33,18 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
     and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). A piece of the
     control whose push is below its price by more than that is 0 in the bound, whatever is rounded (`_pushed`). What a
     multiplier of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their
-    own (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`). ``prices (n,)`` are those of the
-    decision, where the bound is one of what its sizes cost at them.
+    own (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`). Signals of measurable
+    disturbances under feedback prove what they lead to, not what they were composed for (`_missed`); where they do not
+    prove that nothing is feasible, that is not claimed. ``prices (n,)`` are those of the decision, where the bound is
+    one of what its sizes cost at them.
     """
+    if result.status == "infeasible" and np.subtract(*_missed(model, result)) >= 0.0:
+        return replace(result, status="failed", message=UNPROVEN, infeasible=None, lower_bound=-np.inf)
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
     share = SHARE + _moving(model)
     lost = share * (_added(model, result, share, prices) + _quadratic(model, result) + result.lower_bound)
-    lost += _neglected(model, result) + _beyond(model, result)
+    lost += _neglected(model, result) + _beyond(model, result) + _missed(model, result)[0]
     lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
@@ -122,6 +128,37 @@ def _beyond(model: Transcription, result: Result) -> float:
         for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
             lost += 0.0 if said is None else abs(cut.multiplier) * float(np.abs(said.direction[: off.size]) @ off)
     return lost
+
+
+def _missed(model: Transcription, result: Result) -> tuple[float, float]:
+    """By how much less the multipliers prove, at most, at the signals of measurable disturbances than at the deviations
+    that these stand for: of every row multiplier times what its signal misses, times what that does to the row, gains
+    at their largest; and what they prove at these deviations of the sum of the rows, without the cost. Without such
+    disturbances, and where rows are samples, 0 and ``inf``.
+
+    What is missed is not summed with its signs: whoever derives the bound counts gains in other ways.
+    """
+    loop, cuts, finite = None if model.feedback is None else model.feedback.loop, result.dual.cuts, model.program.finite
+    whole = all(cut.formulation == "literal" for cut in cuts)
+    if loop is None or loop.measurable is None or not cuts or not whole:
+        return 0.0, np.inf
+    model.explained(cuts)  # all signals are composed at once
+    far, size, lost = np.maximum(np.abs(finite.lower), np.abs(finite.upper)), loop.measurable.size, 0.0
+    blocks, multipliers, deviations = [], [], []
+    for cut in cuts:
+        index, w = np.split(cut.index, [cut.index.size - loop.spread.size])
+        uncertain = model.program.family(cut.family).uncertain
+        assert uncertain is not None
+        rows = uncertain(index)
+        blocks.append(rows)
+        multipliers.append(np.where(np.arange(rows.h.size) == cut.row, cut.multiplier, 0.0))
+        deviations.append(np.tile(w, (rows.h.size, 1)))
+        part = int(rows.part[cut.row])
+        off = cut.multiplier * abs(float(rows.factor[cut.row])) * np.abs(w[:size] - loop.measurable.attained(w[:size]))
+        lost += float(off @ (np.abs(rows.d[part]) + abs(rows.C[part]) @ far)[:size])
+    given = finite, blocks, np.concatenate(multipliers), np.vstack(deviations), result.dual.mu
+    bound, added = robust_bound(*given, priced=False)
+    return lost, bound - SHARE * added
 
 
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:
