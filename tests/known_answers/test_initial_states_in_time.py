@@ -91,6 +91,42 @@ def test_before_a_fixed_end_the_set_is_that_of_a_linear_program(ends: np.ndarray
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 0.1], ids=["disturbed", "errors too"])
+def test_with_no_fixed_end_a_measurable_disturbance_and_errors_take_their_share(ends: np.ndarray, share: float) -> None:
+    half, bound, beside = np.array([0.3, 0.2]), 0.05, {"execution": [share]} if share else {}
+    found = sr.initial_states(
+        changed(
+            SPRING,
+            terminal=[{"box": half.tolist()}],
+            disturbance={"box": bound},
+            disturbance_class="measurable",
+            **beside,
+        ),
+        directions=4,
+        values=0,
+    )
+    assert found.status == "verified"
+    times = (np.arange(300) + 0.5) * T / 300
+    onward = np.array([moved(np.array([0.0, 1.0]), 0.0, s, T) for s in times])
+    pushed = bound * np.abs(onward).mean(axis=0) * T
+    acting = (onward * np.exp(-times / 4)[:, None]).reshape(PIECES, -1, 2)
+    off = share * np.abs(acting).mean(axis=1).T * (T / PIECES)
+    G = np.vstack([
+        np.hstack([sign * ends[:, :PIECES] + off, off - sign * ends[:, :PIECES], sign * ends[:, PIECES:]])
+        for sign in (1.0, -1.0)
+    ])  # fmt: skip
+    for direction, bounded, reached in zip(found.directions, found.bounds, found.reached, strict=True):
+        exact = -linprog(
+            np.concatenate([np.zeros(2 * PIECES), -direction]),
+            A_ub=G,
+            b_ub=np.tile(half - pushed, 2),
+            bounds=[(0, 1)] * (2 * PIECES) + [(None, None)] * 2,
+        ).fun
+        assert reached - 1e-4 <= exact <= bounded + 1e-4
+        assert bounded - reached < 1e-6
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", [None, ANSWERING], ids=["planned", "answering"])
 def test_costs_before_a_fixed_end_are_those_of_a_linear_program(ends: np.ndarray, policy: Config | None) -> None:
     found = sr.initial_states(changed(SPRING, policy), directions=4, values=2)

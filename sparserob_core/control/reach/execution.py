@@ -102,7 +102,7 @@ class Execution:
         found = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1))
         for j, integral in enumerate(self._integrals(ages, directions)):
             found[:, j] = self.shares[j] * np.maximum(integral[:, :-1] - integral[:, 1:], 0.0)
-        return found.reshape(times.size, -1)
+        return found.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
 
     @shaped
     def added(

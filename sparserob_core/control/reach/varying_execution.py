@@ -148,7 +148,8 @@ class VaryingExecution(Execution):
     @shaped
     def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
         """`Execution.lengths`."""
-        return np.asarray(self._of_each(times, directions)[:, :, self.late :].reshape(times.size, -1))
+        found = self._of_each(times, directions)[:, :, self.late :]
+        return found.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
 
     @shaped
     def given(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, " k"]:
@@ -175,7 +176,8 @@ class VaryingExecution(Execution):
             return self.added(control, times, directions)
         key = times.tobytes() + directions.tobytes()
         if key not in self._lengths:
-            remember(self._lengths, key, self._of_each(times, directions).reshape(times.size, -1), KEPT)
+            found = self._of_each(times, directions)
+            remember(self._lengths, key, found.reshape(times.size, found.shape[1] * found.shape[2]), KEPT)
         return np.asarray(self._lengths[key] @ self.acts(control).ravel())
 
     @shaped
