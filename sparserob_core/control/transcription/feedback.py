@@ -23,7 +23,7 @@ from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
-from sparserob_core.control.response.measurable import MISSED
+from sparserob_core.control.reach.measurable import MISSED
 from sparserob_core.control.transcription.own_units import added_up, fixed, units_of_steps
 from sparserob_core.control.transcription.program import ranges, transcribed
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
