@@ -386,6 +386,32 @@ def test_what_signals_miss_of_their_deviations_is_taken_off_the_lower_bound(
 
 
 @pytest.mark.slow
+def test_what_signals_miss_is_taken_off_where_nothing_is_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``x' = -x + u + w`` with one command for all time, twice: ``2 e^-3 - (|u| - r) (1 - e^-3)`` is at most the wall,
+    of which signals that are a thousandth smaller on the first two of three pieces prove that much less."""
+    radii, walls = np.array([0.05, 0.02]), np.array([0.06, 0.03])
+    problem = {
+        **PLANE,
+        "system": {"A": [[-1.0, 0.0], [0.0, -1.0]], "B": [[1.0, 0.0], [0.0, 1.0]]},
+        "initial_state": [2.0, 2.0],
+        "disturbance": {"box": radii.tolist()},
+        "terminal": [{"box": walls.tolist()}],
+    }
+    grids = {"control": 1, "disturbance": 3}
+    named = {name: {"name": "piecewise_constant", "pieces": count} for name, count in grids.items()}
+    missing(monkeypatch, lambda shares: shares * (1.0 - 1e-3))
+    outcome = run(problem, tmp_path / "run", dictionaries=named, causal_signals=0)
+    faded = np.exp(-3.0)
+    least = 3.0 * float(((2.0 * faded - walls) / (1.0 - faded) + radii).sum())
+    lost = 3.0 * 1e-3 * float(radii.sum()) * (np.exp(-1.0) - faded) / (1.0 - faded)
+    assert outcome.result.cost == pytest.approx(least, rel=1e-6)
+    assert outcome.result.lower_bound == pytest.approx(least - lost, rel=1e-6)
+    assert check(outcome.directory).status == "verified"
+
+
+@pytest.mark.slow
 def test_what_signals_do_not_show_to_be_infeasible_is_not_said_to_be(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

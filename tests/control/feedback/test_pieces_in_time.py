@@ -193,7 +193,9 @@ def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_
             zonoid, (_, outward) = pieces.zonoids[piece], pieces.at(piece)
             for a in np.array([[1.0, 0.2], [-0.7, 1.0]]):
                 arc = zonoid.best(a @ outward)
-                reached = float(a @ driven(low, low + arc.ends * (high - low), arc.values * pieces.disturbances))
+                state = driven(low, low + arc.ends * (high - low), arc.values * pieces.disturbances)
+                reached = float(a @ state)
+                np.testing.assert_allclose(outward @ zonoid.reached(arc), state, atol=1e-9)
                 assert float(zonoid.support(a @ outward)) == pytest.approx(reached, abs=1e-9)
                 told = both.kernel(piece).most(Enclosed(a[None], np.zeros((1, 2))), both.sides)
                 assert told.mid[0] == pytest.approx(reached, abs=1e-9) and told.rad[0] < 1e-12
