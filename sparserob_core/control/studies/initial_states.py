@@ -118,7 +118,7 @@ class InitialPlane:
         rounding, what steps of a system that changes with time are, and what an expansion in the parameters leaves
         out; 0 for a system that does not change with time."""
         response = self.centred.response
-        if response.propagator.expansion is None:
+        if response.propagator.expansion is None or not times.size:
             return np.zeros(times.size)
         columns = response.weights(times, directions, parameters).free[:, list(self.states)] * self.radius
         sizes = added_up(self.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
