@@ -465,11 +465,12 @@ class VaryingExecutionCellSupport(KnownCellSupport):
         return self._sizes(self.motion.grid.breakpoints)
 
     def _sizes(self, times: Array) -> Array:
-        """What errors can have made of every state, ``(k, d)``, at most."""
-        d = self.motion.states
-        ways = [np.eye(d)] if self.execution.bound is None else [np.eye(d), -np.eye(d)]
-        every = (self.execution.enclosed(self.control, *self._each(times, way))[:, 1] for way in ways)
-        return np.asarray(np.max([np.maximum(one, 0.0) for one in every], axis=0).reshape(-1, d) * OUTWARD)
+        """What errors can have made of every state, ``(k, d)``, at most; of a set of what enters by several columns at
+        once those of the box around it, whose integrals are of absolute values."""
+        around, d = self.execution.around, self.motion.states
+        control = np.repeat(self.control, around.shares.size // self.execution.shares.size, axis=0)
+        found = around.enclosed(control, *self._each(times, np.eye(d)))[:, 1]
+        return np.asarray(np.maximum(found, 0.0).reshape(-1, d) * OUTWARD)
 
     @staticmethod
     def _each(times: Array, rows: Array) -> tuple[Array, Array]:

@@ -15,6 +15,7 @@ from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.reach.measurable import MeasurableSupport
 from sparserob_core.control.reach.support import Supports
+from sparserob_core.control.reach.varying_execution import VaryingExecution
 from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal
@@ -32,7 +33,7 @@ H = np.array([[1.0, -0.4], [0.3, 1.0], [-1.0, -0.2]])
 NONE = np.zeros(0)
 
 
-def model(system: System, box: sr.Box = BOX) -> Transcription:
+def model(system: System, box: sr.ConvexSet = BOX) -> Transcription:
     dictionary = sr.Dictionary.indicators(np.linspace(0.0, HORIZON, PIECES + 1))
     problem = sr.OptimalControlProblem(
         system=system,
@@ -150,6 +151,23 @@ def test_a_box_is_within_its_middle_and_half_its_widths() -> None:
                     4 * np.spacing(max(-low, low, high))
                 )
                 assert low < high or far == 0.0
+
+
+@pytest.mark.parametrize(
+    "bound", [sr.Ellipsoid([0.02, -0.01], [[0.01, 0.004], [0.004, 0.02]]), sr.Polytope(H, [0.1, 0.2, 0.05])]
+)
+def test_what_a_set_makes_of_states_is_bounded_by_the_box_around_it(bound: sr.ConvexSet) -> None:
+    far = bound.reach(np.eye(2))
+    found, boxed = (
+        model(VaryingSystem.of(*MATHIEU[:2], HORIZON, MATHIEU[2]), one).functionals.measurable
+        for one in (bound, sr.Box(-far, far))
+    )
+    assert isinstance(found, VaryingMeasurable) and isinstance(boxed, VaryingMeasurable)
+    assert isinstance(found.errors, VaryingExecution)
+    most, marks = found.errors.reaching(found.command).at_marks, found.errors.motion.grid.breakpoints
+    both = values(found, marks, np.vstack([np.eye(2), -np.eye(2)]))
+    assert (most >= np.maximum(both[:, :2], both[:, 2:])).all()
+    np.testing.assert_allclose(most, values(boxed, marks, np.eye(2)), rtol=1e-9)
 
 
 @pytest.mark.slow
