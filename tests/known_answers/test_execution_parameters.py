@@ -252,3 +252,25 @@ def test_the_checker_bounds_errors_over_boxes_and_cells_of_time_from_above_and_b
     assert smaller.off < 0.26 * found.off  # of second order in the widths and in the time
     middle = delivered.at(tube.flow.centre).added(c, start)[0]
     assert found.ends[0, 0] - found.off - found.over <= middle
+
+
+@pytest.mark.slow
+def test_a_function_may_multiply_whole_matrices_by_a_parameter() -> None:
+    known, uncertain = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.0, 0.0], [1.0, 0.0]])
+
+    def cost(A: object) -> float | None:
+        problem = sr.OptimalControlProblem(
+            system=sr.LinearSystem(A, [[0.0], [1.0]], parameters=sr.Box([-0.1], [0.1])),  # type: ignore[arg-type]
+            horizon=2.0,
+            initial_state=[-0.9, 0.5],
+            control=sr.Box([-1.0], [1.0]),
+            path=[sr.PathConstraint(sr.Box([-0.7, -5.0], [0.7, 5.0]), start=0.4)],
+            execution=[0.02],
+        )
+        result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
+        assert result.status == "certified"
+        return result.cost
+
+    whole = cost(lambda p: known + uncertain * p[0])
+    assert whole is not None and whole > 0.05
+    assert whole == cost(lambda p: known + p[0] * uncertain) == cost(lambda p: [[0.0, 1.0], [-4.0 + p[0], -0.3]])

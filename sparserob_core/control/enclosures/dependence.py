@@ -45,6 +45,11 @@ class AnyNumber:
     __rpow__ = __neg__ = __pos__ = sin = cos = tan = exp = sqrt = log = tanh = kepler = _one
 
 
+def _is_array(other: object) -> bool:
+    """Whether numpy is to go through the entries, as where a function multiplies a whole matrix by a parameter."""
+    return isinstance(other, np.ndarray) and other.ndim > 0
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Dependent:
@@ -70,6 +75,8 @@ class Dependent:
         return Dependent(of(self.value), {key: of(one) for key, one in self.others.items()}, self.degree, self.beyond)
 
     def __add__(self, other: object) -> Dependent:
+        if _is_array(other):
+            return NotImplemented
         more = self._like(other)
         sums = _added([dict(self.others), dict(more.others)])
         return Dependent(self.value + more.value, sums, self.degree, self.beyond or more.beyond)
@@ -81,12 +88,18 @@ class Dependent:
         return self
 
     def __sub__(self, other: object) -> Dependent:
+        if _is_array(other):
+            return NotImplemented
         return self + -self._like(other)
 
     def __rsub__(self, other: object) -> Dependent:
+        if _is_array(other):
+            return NotImplemented
         return -self + other
 
     def __mul__(self, other: object) -> Dependent:
+        if _is_array(other):
+            return NotImplemented
         factor = self._like(other)
         if factor.free:
             return self._each(lambda one: one * factor.value)
@@ -107,10 +120,14 @@ class Dependent:
         return Dependent(self.value * factor.value, products, self.degree, beyond)
 
     def __truediv__(self, other: object) -> Dependent:
+        if _is_array(other):
+            return NotImplemented
         under = self._like(other)
         return self._each(lambda one: one / under.value) if under.free else self * under.raised(-1.0)
 
     def __rtruediv__(self, other: object) -> Dependent:
+        if _is_array(other):
+            return NotImplemented
         return self._like(other) / self
 
     def __pow__(self, other: object) -> Dependent:
