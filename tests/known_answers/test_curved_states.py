@@ -20,7 +20,7 @@ from tests.support import tampering
 from tests.support.places import CONFIGS
 
 Problem = dict[str, Any]
-HORIZON, PIECES, BEGIN, SIDES = 3.0, 6, 1.0, 48
+HORIZON, PIECES, BEGIN, SIDES = 3.0, 6, 1.0, 60
 A, B, E = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[0.2, 0.0], [0.0, 1.0]]), np.array([[1.0, 0.3], [0.0, 1.0]])
 CONSTANT: Problem = {"A": A.tolist(), "B": B.tolist(), "E": E.tolist()}
 IN_TIME: Problem = {

@@ -605,9 +605,10 @@ def headless(port: int) -> subprocess.Popen[bytes]:
     end = time.monotonic() + 20.0
     while time.monotonic() < end and process.poll() is None:
         with socket.socket() as one:
-            if one.connect_ex(("127.0.0.1", port)) == 0:
-                return process
-        time.sleep(0.2)
+            answered = one.connect_ex(("127.0.0.1", port)) == 0
+        time.sleep(2.0 if answered else 0.2)  # it answers before it knows that it cannot draw
+        if answered and process.poll() is None:
+            return process
     process.kill()
     process.wait()
     pytest.skip(

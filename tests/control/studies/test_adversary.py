@@ -58,7 +58,7 @@ def transcribed(convex, kind, dictionary, parameters=None):
 
 def reached(model, one, u):
     """The state at the adversary's time, one augmented exponential per piece of its own signal."""
-    A, B, E = (matrix[0] for matrix in model.response.system.matrices(one.parameter[None]))
+    A, B, E = (matrix[0] for matrix in model.stated.system.matrices(one.parameter[None]))
     cuts = np.unique(np.concatenate([one.breakpoints, model.control.breakpoints, [one.time]]))
     state = np.array(model.problem.initial_state, dtype=float)
     for left, right in pairwise(cuts[cuts <= one.time]):
