@@ -111,8 +111,9 @@ def test_no_cell_is_bounded_below_what_is_met_in_it_and_narrow_ones_hardly_above
                 assert (bounds - top)[near].max(initial=0.0) <= 1e-2, (name, family.name, bounds, top)
 
 
-def test_measurable_disturbances_beside_parameters_have_no_enclosure_and_that_is_said() -> None:
-    said = {"system": UNSURE, "disturbance": BOX, "disturbance_class": "measurable", "path": FLAT[:1]}
+def test_measurable_disturbances_beside_parameters_in_no_box_have_no_enclosure_and_that_is_said() -> None:
+    round_ = LinearSystem(UNSURE.A, B, E, parameters=Ellipsoid([0.0], [[0.0025]]))
+    said = {"system": round_, "disturbance": BOX, "disturbance_class": "measurable", "path": FLAT[:1]}
     made = OptimalControlProblem(horizon=HORIZON, initial_state=[-1.0, 0.5], control=Box([-1.0], [1.0]), **said)
     family = prepare(made, uniform(4, HORIZON), uniform(4, HORIZON)).program.families[0]
     assert family.enclosure is not None
