@@ -141,6 +141,9 @@ class ConstraintFamily:
     in the numbers of the rows as they are stated: rows of 1e-10 are to be divided by that. The rest is optional, and
     used when offered:
 
+    ``scale(x)``      the size of the smallest row at a decision, in the numbers of the rows: where it is below 1, a
+        proof may excuse only `TOLERANCE` of it (`allowed`);
+
     ``chosen(indices (k, d), rows (k,))``  one row of each index, ``(G (k, n), h (k,))``, where all would take longer;
     ``worst(x)``      exact separation (a `Separation`);
     ``enclosure(x, lower (k, d), upper (k, d))``  an `Enclosure` of the violation on cells, for proofs;
@@ -174,6 +177,7 @@ class ConstraintFamily:
     name: str
     index_set: Box
     rows: Callable[[Array], tuple[Array, Array]]
+    scale: Callable[[Array], float] | None = None
     chosen: Callable[[Array, np.ndarray], tuple[Array, Array]] | None = None
     worst: Callable[[Array], Separation] | None = None
     enclosure: Callable[[Array, Array, Array], Enclosure] | None = None
@@ -223,6 +227,10 @@ class ConstraintFamily:
         """What a violation of 1 of a row is in the user's units."""
         return 1.0 if self.row_units is None else float(self.row_units[row])
 
+    def allowed(self, x: Array) -> float:
+        """Return the violation that a proof at the decision ``x (n,)`` may count as none."""
+        return TOLERANCE if self.scale is None else TOLERANCE * min(1.0, self.scale(x))
+
     def measure(self, row: int | None = None) -> str:
         """What a violation of a row is measured in, or, without one, that of any of them, such as ``m or m/s``; empty
         where that is not known."""
@@ -237,6 +245,21 @@ class ConstraintFamily:
             return self.excess(x, indices)
         G, h = self.rows(indices)
         return np.asarray(G @ x - h, dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class EqualityErrors:
+    """Upper bounds ``missed (e,)`` of the errors of equalities at a decision, with all rounding counted, and the errors
+    ``allowed (e,)`` that a claim may excuse. ``advice``: the reason for large bounds, and what would help."""
+
+    missed: Array
+    allowed: Array
+    advice: str = ""
+
+    @property
+    def kept(self) -> bool:
+        """Whether every equality holds up to what is allowed."""
+        return bool((self.missed <= self.allowed).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,7 +282,9 @@ class SemiInfiniteProgram:
     ``among``: a program with the same constraints and another cost, whose decision begins with so many of the same
     entries: which of the decisions that cost as little is to be returned;
     ``settle(x)``: a decision that meets the same constraints and costs no more, such as one whose bounds are no looser
-    than they must be.
+    than they must be;
+    ``errors(x)``: proven bounds of the errors of ``A x = b``, where the entries of ``A`` and ``b`` are rounded
+    (`EqualityErrors`).
     """
 
     n: int
@@ -284,6 +309,7 @@ class SemiInfiniteProgram:
     largest: float | None = None
     spread: Spread | None = None
     settle: Callable[[Array], Array] | None = None
+    errors: Callable[[Array], EqualityErrors] | None = None
     guide: tuple[SemiInfiniteProgram, int] | None = field(default=None, repr=False)
     among: tuple[SemiInfiniteProgram, int] | None = field(default=None, repr=False)
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)

@@ -34,7 +34,7 @@ from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.problem.terms.integral import Accumulated
@@ -489,7 +489,7 @@ class Case:
         shape = held[name] if name in held else None if name == EQUALS else self.window(name).shape
         if shape is not None and shape.halfspaces() is None:
             return ""
-        return measured_in(direction, self.problem.names, 0 if name in held else self.problem.system.states)
+        return unit_of_row(direction, self.problem.names, 0 if name in held else self.problem.system.states)
 
     def units(self, window: Window) -> RowUnits:
         """What violations of a constraint are judged by."""
@@ -503,8 +503,30 @@ class Case:
                 window.reference,
                 self._acting,
                 self.changing,
+                self.nominal_sizes,
             )
         return self._units[window]
+
+    def nominal_sizes(self, rows: Array, gains: Array) -> Array:
+        """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``: 0 without one.
+
+        They are seen where every piece of the control begins to act, of ``rows (k, d)`` and ``gains (k, m)``, and never
+        too large.
+        """
+        if self.certificate.get("decision") is None:
+            return np.zeros(len(rows))
+        d = self.problem.system.states
+        z = np.array([[(float(x.mid()), float(x.rad())) for x in one.entries()] for one in self.nominal_states])
+        seen = np.delete(z, d, axis=1)  # without the 1
+        both = np.zeros((len(rows), seen.shape[1]))
+        both[:, :d], both[:, d : d + gains.shape[1]] = rows, gains
+        sizes = np.abs(both @ seen[:, :, 0].T) - np.abs(both) @ seen[:, :, 1].T
+        return np.asarray(np.where(np.isfinite(sizes), np.maximum(sizes, 0.0), 0.0).max(axis=1, initial=0.0))
+
+    @cached_property
+    def nominal_states(self) -> list[arb_mat]:
+        """The nominal ``(x, 1, u)`` of the decision where every piece begins to act, and at the end."""
+        return self.price.nominal_states(self.pieces)
 
     @property
     def _acting(self) -> Array | None:

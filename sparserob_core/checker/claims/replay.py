@@ -180,7 +180,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     pieces = _pieces(case, time, jumps=window.is_mixed)
     if follows(case):
         over, slack = _along_rows(case, window, time, begun, pieces)
-        return over, slack + ROUNDED * case.problem.system.states * float(case.units(window).rows.max(initial=0.0))
+        return over, slack + ROUNDED * case.problem.system.states * float(case.units(window).resolved.max(initial=0.0))
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
     tube = _tube(case, parameter, begun, basis, gains)
     beside = case.beside(window, basis, gains, parameter.tolist())
@@ -190,7 +190,9 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         polynomials += cells if beside is None else beside.added(cells, time, time, z, k)
     limits = [float(b.mid()) for _, b in flat] * (len(polynomials) // max(1, len(flat)))
     over = [float(poly.coefficients[0, 0]) - b for poly, b in zip(polynomials, limits, strict=True)]
-    slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(case.units(window).rows.max(initial=0.0))
+    slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(
+        case.units(window).resolved.max(initial=0.0)
+    )
     return over, slack
 
 

@@ -13,8 +13,9 @@ from sparserob_core.control.constraints.explanation import Source, TimedExplanat
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop, shared
-from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
+from sparserob_core.control.reach.sizes import stated_sizes
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
@@ -71,12 +72,13 @@ class Uncertain(Protocol):
         """One constraint for people, at an index that may hold deviations too."""
 
 
-def indexed(constraint: Uncertain, index_set: Box, start: Array, source: object) -> ConstraintFamily:
+def indexed(constraint: Uncertain, index_set: Box, start: Array, source: Source) -> ConstraintFamily:
     """A constraint as a family; in its literal form, deviations are part of the index."""
     family = ConstraintFamily(
         name=constraint.name,
         index_set=index_set,
         rows=not_linear,
+        scale=source.scale,
         excess=constraint.excess,
         uncertain=constraint.uncertain,
         start=start,
@@ -127,6 +129,9 @@ class FeedbackConstraint(Source):
     def normals_in(self, units: Units) -> tuple[Array, Array]:
         """Those without feedback."""
         return self.flat.normals_in(units)
+
+    def scale(self, x: Array) -> float:
+        return self.flat.scale(x)
 
     @property
     def of_state(self) -> FlatConstraint:
@@ -374,6 +379,10 @@ class FeedbackControl(Source):
         """Its sides, and the units of controls."""
         return self.H, units.controls
 
+    def scale(self, x: Array) -> float:
+        sizes = stated_sizes(self.H, self.h)
+        return float(sizes[(sizes > 0.0) & (sizes < 1.0)].min(initial=np.inf))
+
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         index_set = Box(self.places.starts[:1], np.array([self.places.stop]))
@@ -443,7 +452,7 @@ class FeedbackControl(Source):
     @property
     def measured(self) -> tuple[str, ...]:
         """The unit of every row, empty where it has none that is known."""
-        return tuple(measured_in(normal, self.loop.functionals.names, 0).strip() for normal in self.H)
+        return tuple(unit_of_row(normal, self.loop.functionals.names, 0).strip() for normal in self.H)
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people."""

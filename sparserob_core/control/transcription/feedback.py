@@ -25,7 +25,8 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.measurable import MISSED
 from sparserob_core.control.transcription.own_units import added_up, fixed, units_of_steps
-from sparserob_core.control.transcription.program import ranges, transcribed
+from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
+from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError
@@ -34,7 +35,6 @@ from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import Formulation
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
-EQUALS = "equals"  # the name of that of the terminal equalities
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
@@ -127,6 +127,7 @@ class Answering(Acting):
         loop = ClosedLoop(
             functionals, gains, _spread(posed, seen.pieces), size, seen.pieces, seen.observer, anew=_begins_anew(posed)
         )
+        system, horizon = functionals.response.system, problem.horizon
         families = [of_state(constraint, loop).family() for constraint in posed.constraints]
         settled: list[Callable[[Array], Array]] = []
         if seen.fixed[1].size:
@@ -170,7 +171,7 @@ class Answering(Acting):
         elif charge.among == "peak" and problem.cost.is_linear:
             among = (transcribed(posed, peak).program, first)
         return Part(
-            families=families,
+            families=[replace(one, hindrance=lambda low, high: hindrance(system, horizon)) for one in families],
             lower=lower,
             upper=upper,
             weights=weights,

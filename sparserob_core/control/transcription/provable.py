@@ -99,6 +99,6 @@ def hindrance(system: System, horizon: float) -> str:
         return ""
     size = f"e^{exponent:.0f} = {np.exp(min(exponent, 700.0)):.1g}"
     return (
-        f"the state can grow by {size} over the horizon: double precision cannot resolve more than "
-        f"{np.finfo(float).eps:.0e} of what it grows to; a shorter horizon or wider sets would help"
+        f"the plant amplifies by {size} over the horizon, and double precision resolves {np.finfo(float).eps:.0e} of"
+        " that; a shorter horizon, wider sets, or a plant that is stabilised before would help"
     )

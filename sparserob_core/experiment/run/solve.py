@@ -137,10 +137,11 @@ def solve(
     if isinstance(model, SemiInfiniteProgram):
         return result
     from sparserob_core.control.transcription.provable import remarked
+    from sparserob_core.experiment.run.conclusion.final_states import with_final_states
     from sparserob_core.experiment.run.outcome import Asked, SolvedProblem
 
+    result = with_final_states(model, result, getattr(chosen, "tolerance", None))
     result = remarked(model.problem, result, model.feedback is not None)
-
     asked = Asked(
         problem=model.stated,
         choices={

@@ -61,7 +61,13 @@ def prove(
     proven = (family.reduced or family for family in program.families)
     found = [(one, prove_family(one, x, notify, budgets[one.name], time_left)) for one in proven]
     return tuple(
-        replace(proof, formulation=one.formulation, unit=one.row_unit(proof.row), measured=one.measure(proof.row))
+        replace(
+            proof,
+            formulation=one.formulation,
+            unit=one.row_unit(proof.row),
+            measured=one.measure(proof.row),
+            allowed=one.allowed(x),
+        )
         for one, proof in found
     )
 
@@ -93,16 +99,18 @@ def prove_family(
 ) -> Proof:
     """Bound the violation of one family over its whole index set.
 
-    Cells whose enclosure is at most `TOLERANCE` are closed, the others halved; the centres of the worst are probed for
-    a witness, and where that takes long one is climbed to. At the deadline, or when it is interrupted from the
-    keyboard (of which the deadline takes note), a proof ends undecided, with what is left.
+    Cells whose enclosure is at most `ConstraintFamily.allowed` are closed, the others halved; the centres of the worst
+    are probed for a witness, and where that takes long one is climbed to. At the deadline, or when it is interrupted
+    from the keyboard (of which the deadline takes note), a proof ends undecided, with what is left.
     """
     time_left = deadline or Deadline()
     try:
         if family.enclosure is None:
             return _by_separation(family, x)
         try:
-            return _branch_and_bound(family, x, Course(family, notify, cells, time_left), NoViolation())[0]
+            return _branch_and_bound(
+                family, x, Course(family, notify, cells, time_left), NoViolation(family.allowed(x))
+            )[0]
         except NotEnclosable as error:
             if time_left.passed:
                 return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: {error}")
@@ -185,11 +193,14 @@ class Course:
 
 @dataclass(frozen=True)
 class NoViolation:
-    """The question whether anything is violated: cells are closed where nothing is, and a violation ends the search."""
+    """The question whether anything is violated by more than ``allowed``: cells are closed where nothing is, and a
+    violation of more than `TOLERANCE` ends the search. What lies between the two may be rounding."""
+
+    allowed: float = TOLERANCE
 
     def closes(self, best: float) -> float:
         """The bound up to which a cell is closed, where ``best`` was met."""
-        return TOLERANCE
+        return self.allowed
 
     def ends(self, best: float) -> bool:
         """Whether what was met answers the question."""
@@ -471,7 +482,7 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
     index, row = (found.indices[0], int(found.rows[0])) if found.violations.size else (None, 0)
     if violation > TOLERANCE:
         return Proof(family.name, "refuted", np.inf, violation, index, row)
-    if found.bound <= TOLERANCE:
+    if found.bound <= family.allowed(x):
         return Proof(family.name, "proven", found.bound, violation, index, row)
     return Proof(
         family.name,

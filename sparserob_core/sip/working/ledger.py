@@ -19,6 +19,7 @@ from sparserob_core.sip.program import (
     EQUALITY,
     TOLERANCE,
     ConstraintFamily,
+    EqualityErrors,
     SemiInfiniteProgram,
     Separation,
     WorstConstraint,
@@ -171,6 +172,9 @@ class Ledger:
         x = answer.solution.x
         if any(missed > most for _, missed, most in self._fixed(x, strictly=True)):
             return False
+        errors = self._errors(x)
+        if errors is not None and not errors.kept:
+            return False
         if self.cheaper(answer):
             self.proven = answer, found, proofs
         return True
@@ -188,6 +192,9 @@ class Ledger:
         for what, missed, most in self._fixed(x, strictly=status in ("certified", "verified")):
             if missed > most:
                 status, message = "failed", f"the decision misses {what} by {missed:.1e} of what they compare; {ADVICE}"
+        errors = self._errors(x) if status in ("certified", "verified") else None
+        if errors is not None and not errors.kept:
+            status, message = "undecided", errors.advice
         proven = status in ("certified", "verified") and len(proofs) == len(self.program.families)
         wrong = alarm(self.program, self.dual, x) if proven else ""
         if wrong:
@@ -196,7 +203,11 @@ class Ledger:
         if status == "refuted" and ending and ending == deadline.reason and not deadline.pressed:
             message = f"{message}; {more(deadline)}"
         result = self.result(status, message, answer, witness(self.program, worst, proofs))
-        return replace(result, proofs=tuple(proofs), stopped=ending if ending == deadline.reason else "")
+        return replace(result, proofs=tuple(proofs), errors=errors, stopped=ending if ending == deadline.reason else "")
+
+    def _errors(self, x: Array) -> EqualityErrors | None:
+        """Proven errors of the equalities at ``x (n,)``; ``None`` where the program offers none."""
+        return None if self.program.errors is None else self.program.errors(x)
 
     def _fixed(self, x: Array, strictly: bool) -> Iterator[tuple[str, float, float]]:
         """What is no family: a name, by how much ``x (n,)`` misses it, and by how much it may. ``strictly``: as much as

@@ -11,6 +11,7 @@ from sparserob_core.control.transcription.rounding import SMALL_GAP, rounded_dow
 from sparserob_core.experiment.assemble import ControlExperiment, counting
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import certificate
+from sparserob_core.experiment.run.conclusion.final_states import with_final_states
 from sparserob_core.sip.inner.solve import ADVICE
 from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.proof.verdict import verdict
@@ -27,8 +28,9 @@ INWARDS = 1e-13  # of it, so that whoever derives it with another precision does
 
 def bounded(experiment: ControlExperiment, result: Result) -> Result:
     """The same result with a lower bound that its multipliers prove, and with a word on what is not proven of it."""
-    feedback = experiment.transcription.feedback is not None
-    return remarked(experiment.problem, _bounded(experiment, result), feedback)
+    model = experiment.transcription
+    proven = with_final_states(model, result, experiment.gap_tolerance)
+    return remarked(experiment.problem, _bounded(experiment, proven), model.feedback is not None)
 
 
 def _bounded(experiment: ControlExperiment, result: Result) -> Result:
