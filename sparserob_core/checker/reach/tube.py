@@ -156,8 +156,10 @@ class Tube:
 
     @cached_property
     def _spans(self) -> list[int]:
-        """Of every piece of the grid the number of its duration; only equal ones share a number, since a ball of several
-        would be amplified with the state."""
+        """Of every piece of the grid the number of its duration; only equal ones share a number.
+
+        A ball that holds several durations is amplified with the state.
+        """
         from flint import arb
 
         found, numbers = list[int](), dict[tuple[float, float], int]()
