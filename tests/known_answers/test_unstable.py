@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.experiment.terminal.table import result_rows
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
 from tests.support.amplified import Amplified, drawn, exceeded
@@ -47,8 +49,8 @@ def verdicts(outcome: sr.Outcome) -> dict[str, str]:
     return {claim.name: claim.verdict for claim in sr.check(outcome).claims}
 
 
-def wall() -> Amplified:
-    return amplified(10.0, "affine", path=[{"box": [1.0, None]}])
+def wall(policy: str) -> Amplified:
+    return amplified(10.0, policy, path=[{"box": [1.0, None]}])
 
 
 def fixed_end(policy: str) -> Amplified:
@@ -56,14 +58,21 @@ def fixed_end(policy: str) -> Amplified:
 
 
 def test_a_wall_on_a_plant_that_grows_by_thirteen_digits_is_kept(tmp_path: Path) -> None:
-    """It was certified at a true 1.00011: now the control keeps away by what rounding leaves open, at the same cost."""
-    problem = wall()
+    """The control keeps away by what rounding leaves open, and costs what an independent program does."""
+    problem = wall("open_loop")
     outcome = solved(problem, tmp_path)
     assert outcome.status == "certified" and outcome.summary["cost"] == pytest.approx(3.206398, abs=1e-6)
     assert exceeded(problem, outcome) <= 1.0
     assert set(verdicts(outcome).values()) == {"holds"}
     (bound,) = set(outcome.summary["tolerances"]["path"]["rows"])
     assert bound <= TOLERANCE * 2.0  # the walls are 2 apart
+
+
+def test_a_wall_that_rounding_hides_is_not_claimed_to_be_kept(tmp_path: Path) -> None:
+    """With feedback it was certified at a true 1.00011."""
+    outcome = solved(wall("affine"), tmp_path)
+    assert outcome.status == "undecided" and "amplifies by e^30" in outcome.summary["message"]
+    assert "fails" not in verdicts(outcome).values()
 
 
 def test_what_is_excused_is_told_in_the_users_units(tmp_path: Path) -> None:
@@ -83,12 +92,14 @@ def test_a_fixed_end_that_doubles_cannot_reach_is_not_claimed(tmp_path: Path) ->
     assert "fails" not in verdicts(outcome).values()
 
 
-@pytest.mark.parametrize("make", [wall, lambda: fixed_end("affine")], ids=["wall", "fixed end"])
+@pytest.mark.parametrize("make", [wall, fixed_end])
 def test_a_certificate_that_excuses_what_the_plant_could_reach_is_refuted(
-    make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make: Callable[[str], Amplified], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    rounded = ClosedLoop._rounded
     monkeypatch.setattr(ConstraintFamily, "allowed", lambda family, x: TOLERANCE)
-    problem = make()
+    monkeypatch.setattr(ClosedLoop, "_rounded", lambda loop, x: tuple(0.0 * part for part in rounded(loop, x)))
+    problem = make("affine")
     outcome = solved(problem, tmp_path)
     assert outcome.status in ("certified", "verified") and exceeded(problem, outcome) > 1e3
     assert "fails" in verdicts(outcome).values()

@@ -300,8 +300,7 @@ class FeedbackConstraint(Source):
             acting = flat.commanded((ends[0] + ends[1]) / 2)[:, 0]
             added = flat.gains[:proven] @ self.loop.controls(x)[acting]
             beside = [np.concatenate([more + added[..., :1], added[..., 1:]], axis=-1) for more in beside]
-        # an equality is one of computed numbers, to their rounding, as it is without feedback
-        found, late = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]), computed=self.exact)
+        found, late = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]))
         excess, every = found - flat.h[:proven], np.arange(found.shape[0])
         worst = excess.argmax(axis=1)
         return Enclosure(excess[every, worst], np.zeros_like(every), late[every, worst])
