@@ -224,7 +224,7 @@ class ClosedLoop:
         return np.asarray(flow @ nodes[pieces] + driven @ drives[pieces])
 
     def _enclosed(self, x: Array, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
-        """The `states` at ``times (k,)`` on these pieces, and their error by rounding under any deviation, ``(k, d)``."""
+        """The `states` at ``times (k,)`` on these pieces, and their rounding error under any deviation, ``(k, d)``."""
         nodes, drives = self.path(x)
         flow, driven = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
         sizes, pushed, errors = self._rounded(x)
@@ -233,10 +233,10 @@ class ClosedLoop:
         return np.asarray(flow @ nodes[pieces] + driven @ drives[pieces]), off[:, :, 0]
 
     def _rounded(self, x: Array) -> tuple[Array, Array, Array]:
-        """The sizes of the nodes ``(L + 1, d)`` and of what drives them ``(L, ..)`` under any deviation, and the error of
-        every node by rounding.
+        """The sizes of the nodes ``(L + 1, d)`` and of what drives them ``(L, ..)`` under any deviation, and the
+        rounding error of every node.
 
-        Each step rounds `ROUND_OFF` of what it adds up, and the transitions to the node amplify that. Errors of a system
+        Each step rounds `ROUND_OFF` of what it adds up, and the transitions to the node amplify that. Those of a system
         that changes with time are counted by its motion.
         """
         key = x.tobytes()
