@@ -6,20 +6,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
+from typing import ClassVar, Literal, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import brief
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Float, read_only, sealed, shaped
+from sparserob_core.shapes import Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
+from sparserob_core.sip.convexity import require_convex, sparse_matrix
 from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
-
 
 Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
 """What an index of a family says. ``reduced``: everything but the uncertainty that is maximised in closed form;
@@ -267,7 +264,8 @@ class SemiInfiniteProgram:
     """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant`` subject to ``lower <= S x <= upper``,
     ``G x <= h``, ``A x = b`` and every constraint family at every index.
 
-    ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
+    ``n`` is the number of decision variables; ``P (n, n)`` is symmetric and positive semidefinite but for rounding
+    (`require_convex`), or refused; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
     ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
     (piece lengths), ``(k,)``. ``activity``: what it counts, always in the user's units, that an entry of ``S x`` is not
     0, of the first entries or all, where that means something (`working.counting`).
@@ -318,7 +316,8 @@ class SemiInfiniteProgram:
     def __post_init__(self) -> None:
         if not hasattr(self.n, "__index__") or self.n < 1:
             raise InputError(f"n: expected the number of decision variables, at least 1, got {self.n!r}")
-        S, P = _sparse("S", self.S, None), _sparse("P", self.P, self.n)
+        S = None if self.S is None else sparse_matrix("S", self.S)
+        P = None if self.P is None else require_convex("P", self.P, self.n)
         if S is not None and S.shape[1] != self.n:
             raise InputError(f"S: expected {self.n} columns, got shape {S.shape}")
         images = self.n if S is None else int(S.shape[0])
@@ -469,20 +468,3 @@ def _vector(name: str, value: object, size: int) -> Array:
     if not np.isfinite(vector).all():
         raise InputError(f"{name}: expected finite numbers, got {vector.tolist()}")
     return vector
-
-
-def _sparse(name: str, matrix: object, square: int | None) -> csc_array | None:
-    if matrix is None:
-        return None
-    from scipy.sparse import csc_array as sparse
-
-    try:
-        array = matrix if isinstance(matrix, sparse) else sparse(matrix)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected a matrix of numbers, got {matrix!r}") from error
-    if array.ndim != 2 or not np.isfinite(array.data).all():
-        raise InputError(f"{name}: expected a matrix of finite numbers, got shape {array.shape}")
-    if square is not None and array.shape != (square, square):
-        raise InputError(f"{name}: expected shape ({square}, {square}), got {array.shape}")
-    kept: csc_array = read_only(array)
-    return kept

@@ -58,10 +58,10 @@ class Ellipsoid(ConvexSet):
             raise InputError(
                 f"shape must be a square matrix of finite numbers, got shape {shape.shape}", path="ellipsoid"
             )
-        if not np.allclose(shape, shape.T, rtol=1e-12, atol=0.0) or not _positive(shape):
-            raise InputError(f"shape must be symmetric positive definite, got {shape.tolist()}", path="ellipsoid")
+        if (wrong := _indefinite(shape)) is not None:
+            raise InputError(f"shape must be symmetric positive definite, got {wrong}", path="ellipsoid")
         object.__setattr__(self, "centre", _finite("ellipsoid.centre", self.centre, shape.shape[0]))
-        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "shape", (shape + shape.T) / 2)
         sealed(self)
 
     @property
@@ -378,10 +378,24 @@ class NormBall(ConvexSet):
         return super().in_units(units)
 
 
-def _positive(shape: Array) -> bool:
-    """Whether a symmetric matrix is positive definite, judged with unit diagonal."""
+def _indefinite(shape: Array) -> str | None:
+    """What keeps a square matrix from being symmetric and positive definite, in words; ``None`` where it is both.
+    Judged with its diagonal scaled to 1, whatever the units are."""
+    apart = np.abs(shape - shape.T) > 1e-12 * np.abs(shape.T)
+    if apart.any():
+        i, j = np.argwhere(apart)[0]
+        return f"{shape[i, j]:.12g} in row {i + 1}, column {j + 1} and {shape[j, i]:.12g} across the diagonal"
     sizes = np.sqrt(np.maximum(np.diag(shape), 0.0))
-    return bool((sizes > 0.0).all() and np.linalg.eigvalsh(shape / np.outer(sizes, sizes))[0] > 0.0)
+    if not (sizes > 0.0).all():
+        return f"{np.diag(shape).min():.6g} on its diagonal"
+    least = float(np.linalg.eigvalsh(shape / np.outer(sizes, sizes))[0])
+    if not least > 0.0:
+        return f"the eigenvalue {least:.6g} where its diagonal is scaled to 1"
+    try:
+        np.linalg.cholesky(shape)
+    except np.linalg.LinAlgError:
+        return f"an eigenvalue that is 0 but for rounding, {least:.6g}, where its diagonal is scaled to 1"
+    return None
 
 
 @shaped

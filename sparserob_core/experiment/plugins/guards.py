@@ -13,10 +13,11 @@ import numpy as np
 from sparserob_core.control.policies.policy import Charge, Policy, Quantity
 from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
 from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
-from sparserob_core.errors import PluginError
+from sparserob_core.errors import InputError, PluginError
 from sparserob_core.experiment.plugins import files
 from sparserob_core.experiment.plugins.attribution import asked, attributed, short_repr
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convexity import require_convex
 from sparserob_core.sip.maximiser import Maximiser, Objective
 from sparserob_core.sip.method import ExecutorFactory, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -203,9 +204,12 @@ class _Regulariser(Regulariser):
             raise PluginError(
                 f"{self.origin}: quadratic returned shapes {P.shape} and {q.shape}, expected ({n}, {n}) and ({n},)"
             )
-        if not (np.isfinite(P.data).all() and np.isfinite(q).all()):
+        if not np.isfinite(q).all():
             raise PluginError(f"{self.origin}: quadratic returned numbers that are not finite")
-        return P, q
+        try:
+            return require_convex("P", P, n), q
+        except InputError as error:
+            raise InputError(f"{self.origin}: quadratic: {error}") from error
 
 
 def _rule(kind: type, expected: tuple[type, ...], words: str) -> Callable[[Any, str], object]:

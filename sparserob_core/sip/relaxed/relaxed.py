@@ -14,6 +14,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convexity import require_convex
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
@@ -194,7 +195,7 @@ class RelaxedProgram:
             S = eye_array(self.program.n, format="csc") if base.S is None else csc_array(base.S[:images])
             lengths = np.ones(images) if self.program.lengths is None else self.program.lengths
             P, q = self.regulariser.quadratic(ControlImage(S, self.program.channels, lengths))
-            self._terms = P.tocsc(), q
+            self._terms = require_convex("regulariser.P", P, self.program.n), q
 
     def solve(
         self, rows: Rows, epsilon: float, margin: float = 0.0, guess: FiniteSolution | None = None

@@ -57,7 +57,7 @@ MISBEHAVIOURS = [
     ("regulariser", "return None", "quadratic returned None, expected a tuple"),
     ("regulariser", "return ('a', 'b')", "quadratic: what it returned raised"),
     ("regulariser", "return np.eye(3), np.zeros(3)", r"quadratic returned shapes \(3, 3\) and \(3,\), expected \(100"),
-    ("regulariser", "return np.eye(100) * np.nan, np.zeros(100)", "quadratic returned numbers that are not finite"),
+    ("regulariser", "return np.eye(100), np.full(100, np.nan)", "quadratic returned numbers that are not finite"),
     ("regulariser", "raise SystemExit", "quadratic raised SystemExit"),
     ("regulariser", "1 / 0", "quadratic raised ZeroDivisionError: division by zero"),
     ("maximiser", "return None", "search returned None, expected an upper bound"),
