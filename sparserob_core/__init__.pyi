@@ -111,8 +111,8 @@ from sparserob_core.workers import without_script as without_script
 from sparserob_core.sip.solver import Claim as Claim
 from sparserob_core.sip.solver import QuadraticProgram as QuadraticProgram
 from sparserob_core.sip.solver import Solver as Solver
-from sparserob_core.sip.regulariser import ControlImage as ControlImage
-from sparserob_core.sip.regulariser import Regulariser as Regulariser
+from sparserob_core.sip.convexity import ControlImage as ControlImage
+from sparserob_core.sip.convexity import Regulariser as Regulariser
 from sparserob_core.sip.maximiser import EvaluationError as EvaluationError
 from sparserob_core.sip.maximiser import Maximiser as Maximiser
 from sparserob_core.sip.maximiser import LinearBlocks as LinearBlocks

@@ -16,9 +16,9 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError, TimeLimitError
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.plugins.guards import guarded
+from sparserob_core.sip.convexity import Regulariser
 from sparserob_core.sip.method import Deadline, OutOfTime, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.solver import AUTO, Auto, Solver, named
 
 if TYPE_CHECKING:

@@ -1,14 +1,17 @@
-"""Quadratic forms from outside: each is shown to be convex before a bound rests on it.
+"""Convex quadratic forms: each from outside is shown to be convex before a bound rests on it; strictly convex ones
+regularise a program.
 
 What is asked does not depend on the units of the variables: a matrix counts as positive semidefinite if a change of its
 diagonal by ``ROUNDED`` of itself, for every entry of the longest row, makes it so. That is more than rounding does to
 ``L L'`` in whatever scaling (Higham 2002, section 10.1; Demmel 1989): an entry ``(i, j)`` of such a product is rounded
 by its share of ``sqrt(P_ii P_jj)``. A factorisation without pivoting that meets positive pivots alone is the proof,
-but for its own rounding, which is of the same kind (Rump 2006, Theorem 2.3).
+but for its own rounding, which is of the same kind (Rump 2006).
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
@@ -30,6 +33,42 @@ SHOWN = 1000  # rows up to which a refusal computes all eigenvalues; ten times m
 STEPS = 60  # of the Lanczos method that a refusal makes beyond that
 
 _convex: WeakValueDictionary[int, csc_array] = WeakValueDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class ControlImage:
+    """How a decision ``x (n,)`` becomes the values ``S x (k,)`` that the cost is about.
+
+    ``S (k, n)`` sparse; its rows are channel-major: ``channels`` blocks of ``k / channels`` consecutive pieces each.
+    ``lengths (k,)``: how much each entry counts (the length of its piece, in time), positive.
+    """
+
+    S: csc_array
+    channels: int
+    lengths: Array
+
+    def __post_init__(self) -> None:
+        rows = self.S.shape[0]
+        lengths = np.asarray(self.lengths, dtype=float)
+        if lengths.shape != (rows,) or not (lengths > 0).all() or not np.isfinite(lengths).all():
+            raise InputError(f"control image: lengths must be {rows} positive numbers, one for each row of S")
+        if self.channels < 1 or rows % self.channels:
+            raise InputError(f"control image: {rows} rows of S do not divide into {self.channels} channels")
+        object.__setattr__(self, "lengths", lengths)
+
+    @property
+    def pieces(self) -> int:
+        """Number of entries of ``S x`` per channel."""
+        return int(self.S.shape[0]) // self.channels
+
+
+class Regulariser(ABC):
+    """A strictly convex quadratic ``rho(x) = 1/2 x'P x + q'x`` that is added to the cost with a factor that goes to
+    zero."""
+
+    @abstractmethod
+    def quadratic(self, image: ControlImage) -> tuple[csc_array, Array]:
+        """``P (n, n)`` symmetric positive definite, sparse, and ``q (n,)``."""
 
 
 def require_convex(path: str, matrix: object, size: int) -> csc_array:

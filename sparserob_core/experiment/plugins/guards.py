@@ -17,11 +17,10 @@ from sparserob_core.errors import InputError, PluginError
 from sparserob_core.experiment.plugins import files
 from sparserob_core.experiment.plugins.attribution import asked, attributed, short_repr
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.convexity import require_convex
+from sparserob_core.sip.convexity import ControlImage, Regulariser, require_convex
 from sparserob_core.sip.maximiser import Maximiser, Objective
 from sparserob_core.sip.method import ExecutorFactory, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import ControlImage, Regulariser
 from sparserob_core.sip.result import MEANING, Result
 from sparserob_core.sip.rules import InnerStop, OuterStop, Schedule, Selection
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver

@@ -47,7 +47,7 @@ class DictionaryPlugin(
 
 
 @final
-class RegulariserPlugin(Plugin, hook="sparserob_regularisers", component="sparserob_core.sip.regulariser:Regulariser"):
+class RegulariserPlugin(Plugin, hook="sparserob_regularisers", component="sparserob_core.sip.convexity:Regulariser"):
     """A `Regulariser`: a strictly convex quadratic."""
 
 

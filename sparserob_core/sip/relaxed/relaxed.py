@@ -14,7 +14,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.convexity import require_convex
+from sparserob_core.sip.convexity import ControlImage, Regulariser, require_convex
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
@@ -23,7 +23,6 @@ from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import ControlImage, Regulariser
 from sparserob_core.sip.result import SMALL_COST
 from sparserob_core.sip.solver import ROUNDING, Asked, Solver
 
