@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import product
 from typing import ClassVar, Literal, TypeAlias, final
 
 import numpy as np
@@ -24,6 +25,9 @@ Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
 
 
 TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as none (docs/decisions/0016)
+OUTSIDE = 1e-9  # of its sides and its distance from 0: how far outside of an index set rounding may put an index
+NARROW = 1e-12  # of its side: a gap between two cells that is rounding of their corners
+PARTS = 4_000_000  # of a grid between the corners of all cells: 32 MB
 EQUALITY = 1e-12  # of the numbers that are added up: an equality that is missed by at most this counts as met
 
 
@@ -214,6 +218,53 @@ class ConstraintFamily:
         return forms.get(formulation)
 
     @shaped
+    def separated(self, x: Float[Array, " n"]) -> Separation:
+        """What `worst` finds at ``x``; raises `InputError` where that is no separation of this family: violations that
+        are no numbers, indices outside of the index set, a bound below a violation."""
+        assert self.worst is not None
+        found, box = self.worst(x), self.index_set
+        indices, violations = np.asarray(found.indices, dtype=float), np.asarray(found.violations, dtype=float)
+        if indices.ndim != 2 or not len(indices) == np.size(found.rows) == violations.size:
+            raise self._wrong("worst", "indices (k, d), rows (k,) and violations (k,)", f"shape {indices.shape}")
+        if np.isnan(violations).any():
+            raise self._wrong("worst", "violations that are numbers", f"{violations.tolist()}")
+        if violations.size and found.bound < violations.max() - TOLERANCE:
+            raise self._wrong("worst", f"a bound of at least {violations.max():.6g}, its own", f"{found.bound:.6g}")
+        if indices.shape[1] != box.dimension:
+            raise self._wrong("worst", f"indices (k, {box.dimension})", f"shape {indices.shape}")
+        room = OUTSIDE * (box.upper - box.lower + np.abs(box.lower) + np.abs(box.upper))
+        outside = ~((indices >= box.lower - room) & (indices <= box.upper + room)).all(axis=1)
+        if outside.any():
+            raise self._wrong("worst", "indices of the index set", f"{indices[outside][0].tolist()}")
+        return found
+
+    @shaped
+    def enclosed(self, x: Float[Array, " n"], lower: Float[Array, "k d"], upper: Float[Array, "k d"]) -> Enclosure:
+        """What `enclosure` says of cells; raises `InputError` where that is not one bound for each. One that is no
+        number says nothing, and is infinite."""
+        assert self.enclosure is not None
+        found = self.enclosure(x, lower, upper)
+        if np.shape(found.bounds) != (len(lower),) or np.shape(found.split) != (len(lower),):
+            got = f"shapes {np.shape(found.bounds)} and {np.shape(found.split)}"
+            raise self._wrong("enclosure", f"bounds and coordinates ({len(lower)},)", got)
+        return replace(found, bounds=np.where(np.isnan(found.bounds), np.inf, found.bounds))
+
+    @cached_property
+    def partition(self) -> tuple[Array, Array]:
+        """The `cells`, or the whole index set; raises `InputError` where an index is in none of them."""
+        box = self.index_set
+        if self.cells is None:
+            return box.lower[None], box.upper[None]
+        lower, upper = self.cells
+        missing = uncovered(lower, upper, box)
+        if missing is not None:
+            raise self._wrong("cells", "cells that cover the index set", f"none around {missing.tolist()}")
+        return lower, upper
+
+    def _wrong(self, what: str, expected: str, got: str) -> InputError:
+        return InputError(f"family {self.name!r}: {what}: expected {expected}, got {got}")
+
+    @shaped
     def explanation(self, index: Float[Array, " d"], row: int) -> Explanation:
         """One constraint for people, by its number and index where the family does not explain itself."""
         if self.explain is not None:
@@ -242,6 +293,49 @@ class ConstraintFamily:
             return self.excess(x, indices)
         G, h = self.rows(indices)
         return np.asarray(G @ x - h, dtype=float)
+
+
+@shaped
+def uncovered(lower: Float[Array, "k d"], upper: Float[Array, "k d"], box: Box) -> Float[Array, " d"] | None:
+    """A point ``(d,)`` of the box that is in none of the cells between corners ``(k, d)``; ``None`` where there is
+    none, or where cells are faces of a cube of directions, whose inner points are multiples of others.
+
+    Between the corners of all cells the box is a grid, of which every part is in a cell or outside of it; a grid of
+    more than `PARTS` parts is not made, and then the volumes of the cells are compared with that of the box.
+    """
+    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1:] != box.lower.shape or not lower.size:
+        return box.lower
+    moves = np.flatnonzero(box.upper > box.lower)
+    low, sides = box.lower[moves], (box.upper - box.lower)[moves]
+    begins, ends = ((corners[:, moves] - low) / sides for corners in (lower, upper))
+    filled = np.prod(np.minimum(ends, 1.0) - np.maximum(begins, 0.0), axis=1)
+    if not np.isfinite(filled).all() or (moves.size > 1 and not filled.any()):
+        return box.lower if np.isnan(filled).any() else None
+    edges = [_apart(np.concatenate([begins[:, i], ends[:, i], [0.0, 1.0]])) for i in range(moves.size)]
+    middle = (box.lower + box.upper) / 2
+    if np.prod([float(one.size) for one in edges]) > PARTS:
+        return middle if filled.sum() < 1.0 - OUTSIDE else None
+    places = [
+        [np.searchsorted(edges[i], corners[:, i] - NARROW) for i in range(moves.size)] for corners in (begins, ends)
+    ]
+    count = np.zeros([one.size for one in edges], dtype=int)
+    for corner in product((0, 1), repeat=moves.size):
+        at = tuple(places[side][i] for i, side in enumerate(corner))
+        np.add.at(count, at, -1 if sum(corner) % 2 else 1)
+    for axis in range(moves.size):
+        count = np.cumsum(count, axis=axis)
+    empty = np.argwhere(count[(slice(None, -1),) * moves.size] <= 0)
+    if not empty.size:
+        return None
+    middle[moves] = low + sides * [(edges[i][at] + edges[i][at + 1]) / 2 for i, at in enumerate(empty[0])]
+    return middle
+
+
+def _apart(corners: Array) -> Array:
+    """Shares of a side in order, those outside of it moved to its ends, of which none are nearer than `NARROW`."""
+    edges = np.unique(np.clip(corners, 0.0, 1.0))
+    return edges[np.append(True, np.diff(edges) > NARROW)]
 
 
 @dataclass(frozen=True, eq=False)

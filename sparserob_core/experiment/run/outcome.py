@@ -39,6 +39,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.proof.verdict import remarked
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Named
 
@@ -179,7 +180,7 @@ def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Noti
     """What a run makes of the result of a method before it is written down: bounds that are proven without rounding,
     what is known of the time of action, and of causal policies. ``notify`` receives `StudyProgress`, one a phase."""
     if not isinstance(experiment, ControlExperiment):
-        return result
+        return remarked(experiment.program, result)
     notify(StudyProgress(text="certificate: what the multipliers prove without rounding", phase=True, result=result))
     known = bounded(experiment, result) if result.sparsest is None else result
     notify(StudyProgress(text="fewest active: how little any admissible control must act", phase=True))

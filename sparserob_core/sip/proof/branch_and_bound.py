@@ -248,7 +248,7 @@ def _branch_and_bound(
 ) -> tuple[Proof, Supremum]:
     """What is known of one family, as an answer to whether anything is violated, and as a number."""
     box = family.index_set
-    lower, upper = family.cells if family.cells is not None else (box.lower[None], box.upper[None])
+    lower, upper = family.partition
     best, known = (-np.inf, lower[0], 0), np.full(lower.shape[0], np.inf)
     leaves: list[tuple[Array, Array, Array]] = []  # one entry per halving
     slacks: list[float] = []
@@ -263,7 +263,7 @@ def _branch_and_bound(
         # Look for a witness: where separation finds the largest violations, and in the worst cells.
         first, peaks = not leaves, _NOWHERE
         if first and bend is not None and family.worst is not None:
-            peaks = family.worst(x)
+            peaks = family.separated(x)
         if peaks.violations.size:
             best = (float(peaks.violations[0]), peaks.indices[0], int(peaks.rows[0]))
         elif first or open_.any():
@@ -351,7 +351,6 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
     so that those go into one batch.
     """
     family, count = course.family, lower.shape[0]
-    assert family.enclosure is not None
     bounds, split, bend = np.full(count, np.inf), (upper - lower).argmax(axis=1), np.full(count, np.inf)
     known, hurried = True, course.deadline.bounded or course.deadline.passed
     start, size = 0, FIRST_BATCH if hurried else BATCH
@@ -361,8 +360,8 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
         if hurried:  # to the end of what shares its work, unless that is far
             stop = min(int(ends[np.searchsorted(ends, stop)]), start + BATCH)
         part = order[start:stop]
-        enclosed = family.enclosure(x, lower[part], upper[part])
-        bounds[part] = np.where(np.isnan(enclosed.bounds), np.inf, enclosed.bounds)
+        enclosed = family.enclosed(x, lower[part], upper[part])
+        bounds[part] = enclosed.bounds
         split[part] = enclosed.split
         known = known and enclosed.bend is not None
         bend[part] = np.inf if enclosed.bend is None else enclosed.bend
@@ -469,7 +468,8 @@ def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | N
 
 
 def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
-    """For families without an enclosure: believe a proven bound of their separation, otherwise leave it open."""
+    """For families without an enclosure: believe a proven bound of their separation, but for what both
+    ends of the index set say, otherwise leave it open."""
     if family.worst is None:
         return Proof(
             family.name,
@@ -477,9 +477,13 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
             np.inf,
             reason=f"family {family.name} offers no enclosure, so nothing can be excluded",
         )
-    found = family.worst(x)
+    found = family.separated(x)
     violation = float(found.violations[0]) if found.violations.size else -np.inf
     index, row = (found.indices[0], int(found.rows[0])) if found.violations.size else (None, 0)
+    ends = np.stack([family.index_set.lower, family.index_set.upper])
+    met = _probe(family, x, ends, ends, np.zeros(2)) if np.isfinite(ends).all() else (-np.inf, ends[0], 0)
+    if met[0] > max(violation, TOLERANCE):  # what it says is believed, but not against its own rows
+        violation, index, row = met
     if violation > TOLERANCE:
         return Proof(family.name, "refuted", np.inf, violation, index, row)
     if found.bound <= family.allowed(x):

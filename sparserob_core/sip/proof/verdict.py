@@ -19,7 +19,7 @@ from sparserob_core.sip.program import (
     told_apart,
 )
 from sparserob_core.sip.relaxed.relaxed import Rows
-from sparserob_core.sip.result import MEANING, Status
+from sparserob_core.sip.result import MEANING, Result, Status
 
 NAMED = 6  # reasons, or members of an infeasible subsystem, that are named; of these those with the largest multipliers
 
@@ -38,6 +38,16 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
         return "undecided", "; ".join(undecided)
     status: Status = "certified" if gap <= tolerance else "verified"
     return status, f"{MEANING[status]} (gap {max(gap, 0.0):.1e})"
+
+
+def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
+    """The same result with a word on what its claim rests on that nobody has proven: the enclosures and separations of
+    a program that was stated as it is, whose rows can be evaluated only. Nothing is added where nothing is claimed."""
+    names = [family.name for family in program.families if family.enclosure is not None or family.worst is not None]
+    if not names or result.status not in ("certified", "verified"):
+        return result
+    said = f"what {', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''} encloses or separates is believed"
+    return replace(result, message=f"{result.message}; {said}")
 
 
 def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[ConstraintFamily, Separation]]) -> list[Proof]:

@@ -43,7 +43,7 @@ def separate(
     separations = []
     for family in program.families:
         tools.deadline.check()
-        found = searched(family) if family.worst is None else family.worst(x)
+        found = searched(family) if family.worst is None else family.separated(x)
         separations.append((family, replace(found, formulation=family.formulation)))
     return separations
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.control.sets.sets import Equality, Polytope, cylinder, oblique
+from sparserob_core.control.sets.strangers import require_consistent
 from sparserob_core.control.term import SAME_TIME, STATES, TIME, UNITLESS, Term, measured, over, timed
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense
@@ -298,6 +299,7 @@ def checked_set(name: str, value: object, dimension: int, of: str, bounded: bool
         )
     if bounded and not value.is_bounded:
         raise InputError("the set must be bounded", path=name)
+    require_consistent(name, value)
     return value
 
 
