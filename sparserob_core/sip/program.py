@@ -295,8 +295,7 @@ class ConstraintFamily:
         return np.asarray(G @ x - h, dtype=float)
 
 
-@shaped
-def uncovered(lower: Float[Array, "k d"], upper: Float[Array, "k d"], box: Box) -> Float[Array, " d"] | None:
+def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
     """A point ``(d,)`` of the box that is in none of the cells between corners ``(k, d)``; ``None`` where there is
     none, or where cells are faces of a cube of directions, whose inner points are multiples of others.
 
