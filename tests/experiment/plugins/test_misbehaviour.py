@@ -124,6 +124,16 @@ def test_a_component_that_misbehaves_is_named_and_ends_with_status_5(kind, body,
     assert "Traceback" not in flat
 
 
+@pytest.mark.parametrize("claimed", ["certified", "infeasible", "undecided"])
+def test_what_a_method_of_others_claims_is_said_to_be_believed(claimed, status, tmp_path) -> None:
+    body = f"return sr.Result(status='{claimed}', message='so it is', decision=np.zeros(program.n))"
+    (tmp_path / "odd.py").write_text(plugin("method", body))
+    method = sr.load_registry([tmp_path / "odd.py"]).build("method", "odd")
+    result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0), method=method)
+    believed = "" if claimed == "undecided" else "; what the method Odd claims is believed"
+    assert result.message == f"so it is{believed}"
+
+
 SOLVERS = [
     ("return 1", "solve returned 1, expected a Claim"),
     ("raise SystemExit(0)", "solve raised SystemExit: 0"),
