@@ -226,6 +226,8 @@ class ConstraintFamily:
         indices, violations = np.asarray(found.indices, dtype=float), np.asarray(found.violations, dtype=float)
         if indices.ndim != 2 or not len(indices) == np.size(found.rows) == violations.size:
             raise self._wrong("worst", "indices (k, d), rows (k,) and violations (k,)", f"shape {indices.shape}")
+        if np.asarray(found.rows).dtype.kind not in "iu" or (np.asarray(found.rows) < 0).any():
+            raise self._wrong("worst", "numbers of rows, from 0", f"{np.asarray(found.rows).tolist()}")
         if np.isnan(violations).any():
             raise self._wrong("worst", "violations that are numbers", f"{violations.tolist()}")
         if violations.size and found.bound < violations.max() - TOLERANCE:

@@ -56,6 +56,12 @@ WRONG = {
     "one bound for all": (
         {"enclosure": lambda x, a, b: sr.Enclosure(np.array([-1.0]), np.zeros(1, dtype=int)),
          "cells": (np.array([[0.0], [0.5]]), np.array([[0.5], [1.0]]))}, r"enclosure: expected bounds .* \(2,\), got"),
+    "half a row": ({"worst": lambda x: sr.Separation(np.zeros((1, 1)), np.array([0.5]), np.zeros(1), 0.0)},
+                   r"worst: expected numbers of rows, from 0, got \[0.5\]"),
+    "a row before the first": ({"worst": lambda x: sr.Separation(np.zeros((1, 1)), np.array([-1]), np.ones(1))},
+                               r"worst: expected numbers of rows, from 0, got \[-1\]"),
+    "a row after the last": ({"worst": lambda x: sr.Separation(np.zeros((1, 1)), np.array([7]), np.ones(1))},
+                             "worst: expected a row below 1, got 7"),
     "rows that are none": ({"rows": lambda t: (np.full((len(t), 1, 2), np.nan), 1.0 + 0.0 * t)}, "rows are not num"),
     "rows that nothing meets": ({"rows": lambda t: (rows(t)[0], np.full((len(t), 1), -np.inf))}, "above -inf"),
 }  # fmt: skip
@@ -92,6 +98,30 @@ def test_rows_that_change_from_call_to_call_are_not_certified():
 
     result = solved(rows=noisy, enclosure=enclosure)
     assert result.status == "failed" and "one of the two is wrong" in result.message
+
+
+def test_a_witness_that_meets_its_row_refutes_nothing():
+    def worst(x):
+        return sr.Separation(np.array([[0.5]]), np.array([0]), np.array([x[0] + 0.5 * x[1] + 4.0]))
+
+    result = solved(worst=worst)
+    assert result.status == "failed" and "one of the two is wrong" in result.message
+    assert result.lower_bound == -np.inf and result.upper_bound == np.inf
+
+
+@pytest.mark.parametrize("lie", [1e-7, 0.5, -0.5])
+def test_no_bound_rests_on_chosen_rows_that_are_others(lie):
+    def chosen(t, which):
+        G, h = rows(t)
+        return G[:, 0], h[:, 0] + lie
+
+    def honest(t, which):
+        return rows(t)[0][:, 0], rows(t)[1][:, 0]
+
+    assert solved(enclosure=enclosure, chosen=honest).status == "certified"
+    result = solved(enclosure=enclosure, chosen=chosen)
+    assert result.status in ("failed", "refuted")  # where more is allowed, the decision is refuted by its rows
+    assert result.lower_bound <= -1.0 + 1e-9
 
 
 def test_a_violation_beside_a_proof_is_a_contradiction_from_two_tolerances_on():

@@ -78,6 +78,8 @@ def rows_at(
         where, which, (G, h) = every, rows, constraints.chosen(indices, rows)
     else:
         G, h = constraints.rows(indices)
+        if rows is not None and rows.max() >= h.shape[1]:
+            raise InputError(f"family {family!r}: worst: expected a row below {h.shape[1]}, got {int(rows.max())}")
         where, which = (
             (every, rows)
             if rows is not None
