@@ -21,8 +21,8 @@ from sparserob_core.sip.program import (
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Result, Status
 
-# Of the largest entry of a row: by how much the same row may differ where it is chosen among others. Ten times more, and
-# a bound is off by more than a gap that is certified; ten times less, and sums in another order are refused.
+# Of the largest entry of a row: by how much the same row may differ where it is chosen among others. Ten times more,
+# and a bound is off by more than a gap that is certified; ten times less, and sums in another order are refused.
 CHOSEN = 1e-9
 NAMED = 6  # reasons, or members of an infeasible subsystem, that are named; of these those with the largest multipliers
 
