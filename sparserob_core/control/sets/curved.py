@@ -178,7 +178,8 @@ class NormBall(ConvexSet):
     the origin.
 
     Flat for ``p = 1`` (up to ten dimensions) and ``p = inf``. Support function ``c'centre + radius |c|_q``,
-    ``1/p + 1/q = 1``.
+    ``1/p + 1/q = 1``. A ball of radius 0 is a point whatever ``p``, and is kept as that of ``p = inf``: of a point
+    there is no gauge by which directions could be scaled.
     """
 
     p: float
@@ -199,7 +200,7 @@ class NormBall(ConvexSet):
         if dimension is not None and dimension < 1:
             raise InputError(path="norm.dimension", expected="at least 1", got=str(dimension))
         middle = np.zeros(dimension or 0) if centre is None else _finite("norm.centre", centre, dimension)
-        object.__setattr__(self, "p", float(p))
+        object.__setattr__(self, "p", float(p) if float(radius) > 0.0 else np.inf)
         object.__setattr__(self, "radius", float(radius))
         object.__setattr__(self, "centre", middle)
         sealed(self)
