@@ -53,7 +53,7 @@ def test_a_final_ball_of_radius_0_costs_what_the_point_does(p: float, tmp_path: 
 
 
 def test_a_final_ball_of_radius_0_under_a_disturbance_is_infeasible_for_anybody(tmp_path: Path) -> None:
-    """The disturbance alone moves the state by 0.1 and 0.06. Multipliers of directions without a unit said otherwise."""
+    """The disturbance alone moves the state by 0.1 and 0.06. Multipliers of directions without a unit said no."""
     noise = {"box": [0.02, 0.03]}
     outcome = solved(tmp_path / "run", terminal=[{"norm": {"p": 2.0, "radius": 0.0}}], disturbance=noise)
     assert outcome.status == "infeasible" and is_verified(outcome)
