@@ -14,12 +14,14 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 # Of the extent of the set, as in the contract of sets. Ten times less, and a support function that is computed by
 # iterations is refused; ten times more, and one that is none by so much passes, though a proof asks for 1e-9.
 CLOSE = 1e-7
+# Where the own kinds of sets stand; those of a plugin that is a file stand below sparserob_core.experiment.
+OWN = ("sparserob_core.control.", "sparserob_core.sip.")
 DIRECTIONS = 16  # random ones, beside the axes and the sums of neighbours
 
 
 def strangers(record: Any) -> Iterator[ConvexSet]:
     """The sets of kinds of others that a record holds, or is: its fields, and the members of its tuples."""
-    if isinstance(record, ConvexSet) and not type(record).__module__.startswith("sparserob_core."):
+    if isinstance(record, ConvexSet) and not type(record).__module__.startswith(OWN):
         yield record
     elif isinstance(record, tuple):
         for member in record:
@@ -29,7 +31,7 @@ def strangers(record: Any) -> Iterator[ConvexSet]:
             yield from strangers(getattr(record, name, None))
 
 
-def require_consistent(path: str, convex: ConvexSet) -> None:
+def require_consistent(path: str, convex: ConvexSet | None) -> None:
     """Raise `InputError` where a set, or one of its parts, is of a kind of others and contradicts itself.
 
     In some directions ``c`` the support function has to be positively homogeneous, to be attained at the support point,

@@ -85,6 +85,7 @@ PLACES = {
     r"terminal\.0": lambda one: {"terminal": [one]},
     "disturbance ": lambda one: {"disturbances": [sr.Disturbance(one, E=np.eye(2))]},
     "disturbance  ": lambda one: {"disturbance": one.in_units(np.array([2.0, 4.0]))},
+    r"measurements\.noise": lambda one: {"measurements": sr.Measurements(C=np.eye(2), noise=one)},
     r"system\.parameters": lambda one: {
         "system": sr.LinearSystem(lambda p: [[p[0], 0.0], [0.0, p[1]]], np.eye(2), parameters=one)
     },
@@ -99,6 +100,21 @@ def test_a_set_is_looked_at_wherever_it_stands(place):
     made = problem(**PLACES[place](Stranger()))
     assert "stranger" in {one.kind for one in strangers(made)}
     assert "what sets of the kind stranger say of themselves is believed" in remark(made)
+
+
+def test_a_set_of_a_plugin_that_is_a_file_is_one_of_others(tmp_path):
+    (tmp_path / "low.py").write_text(
+        "import numpy as np\nimport sparserob_core as sr\n"
+        "class Low(sr.ConvexSet):\n    dimension = 2\n"
+        "    def support(self, c): return 0.9 * np.linalg.norm(c, axis=-1)\n"
+        "    def support_point(self, c):\n"
+        "        return c / np.maximum(np.linalg.norm(c, axis=-1, keepdims=True), 1e-300)\n"
+        "class Lows(sr.SetFactory, sr.Options):\n    def build(self, dimension): return Low()\n"
+        "@sr.hookimpl\ndef sparserob_sets():\n    yield sr.SetPlugin(name='low', factory=Lows)\n"
+    )
+    low = sr.load_registry([tmp_path / "low.py"]).build("set", "low").build(2)
+    with pytest.raises(sr.InputError, match=r"terminal\.0: .*the kind low: it is not attained"):
+        problem(terminal=[low])
 
 
 def test_sets_of_this_distribution_are_known():
