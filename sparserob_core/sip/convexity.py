@@ -210,7 +210,8 @@ def _failing(P: csc_array, factor: float) -> Array | None:
         return None
     unit = np.zeros(n)
     unit[int(np.argmax(~(pivots > 0.0)))] = 1.0  # L'v = e gives v'A v = pivot, of A = L D L' up to there
-    return np.asarray(spsolve_triangular(csc_array(found.L.T), unit, lower=False), dtype=float)[found.perm_c]
+    direction: Array = np.asarray(spsolve_triangular(csc_array(found.L.T), unit, lower=False))[found.perm_c]
+    return direction
 
 
 def _failing_dense(P: csc_array, factor: float) -> Array | None:

@@ -336,7 +336,8 @@ def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
 def _apart(corners: Array) -> Array:
     """Shares of a side in order, those outside of it moved to its ends, of which none are nearer than `NARROW`."""
     edges = np.unique(np.clip(corners, 0.0, 1.0))
-    return edges[np.append(True, np.diff(edges) > NARROW)]
+    kept: Array = edges[np.append(True, np.diff(edges) > NARROW)]
+    return kept
 
 
 @dataclass(frozen=True, eq=False)
