@@ -20,10 +20,11 @@ from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.integrals import Running, integrating, spelt
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
-from sparserob_core.checker.reach.measurable import Execution, Side, Together
+from sparserob_core.checker.reach.measurable import Side, Together
 from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
@@ -452,7 +453,7 @@ class Case:
             raise Unchecked("the checker knows errors of execution of known systems, without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
         if self.changing is None:
-            return Execution(self.problem, shares, self.control.breakpoints, pieces)
+            return Execution(self.problem, shares, self.control.breakpoints, pieces, self.clock)
         acts = self.control.breakpoints
         if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
             begins = acts[:-1] + system.delay

@@ -22,6 +22,7 @@ from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Stopped, Worst
+from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.tube import Tube
@@ -103,7 +104,7 @@ def is_followed(case: Case, window: Window) -> bool:
 def follows(case: Case) -> bool:
     """Whether rows of the system, which is known and has many states, are followed by their adjoints."""
     system, still = case.problem.system, case.still
-    if case.answering or not case.alike or case.execution is not None or len(case.grid) > MOST_PIECES:
+    if case.answering or not case.alike or len(case.grid) > MOST_PIECES:
         return False
     return still is not None and not system.parameter_count and system.states >= FOLLOWED
 
@@ -172,13 +173,13 @@ def along(case: Case, window: Window, direction: Array, worst: Worst, limit: flo
     times = worst.cuts([window.start, window.stop, *window.cuts(breaks)])
     times = times[(times >= window.start) & (times <= window.stop)]
     start, stop = (times[:-1], times[1:]) if times.size > 1 else (times, times)
-    count, top, plain = 0, -np.inf, window.reference is None and not window.is_mixed
+    count, top = 0, -np.inf
     for _ in range(HALVINGS):
         case.clock.check()
         count += start.size
         if count > MOST_CELLS:
             break
-        tops = worst.over(start, stop, 0.0 if plain else _added(case, window, direction, start, stop))
+        tops = worst.over(start, stop, _added(case, window, direction, start, stop))
         open_ = ~(tops <= limit)
         top = max(top, float(tops[~open_].max(initial=-np.inf)))
         if not open_.any():
@@ -205,9 +206,32 @@ def beside(case: Case, window: Window, direction: Array, time: float, inside: fl
 
 
 def _added(case: Case, window: Window, direction: Array, start: Array, stop: Array) -> Array:
-    """What stands beside the state at both ends of cells, ``(2, k)``, at most."""
-    cells = case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
-    return np.array([[beside(case, window, direction, t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
+    """What stands beside the state at both ends of cells, and what errors of execution add there, ``(2, k)``, at most;
+    with how far these may be above their chord."""
+    found, delivered = np.zeros((2, start.size)), _delivered(case)
+    if window.reference is not None or window.is_mixed:
+        cells = case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
+        found = np.array([[beside(case, window, direction, t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
+    if delivered is not None:
+        c, _ = window.split(direction)
+        bent = delivered.bent_over(c, start, stop)
+        more = np.stack([delivered.added_at(c, times)[1] for times in (start, stop)]) + bent
+        found = found + more + HALF_ULP * 4.0 * (np.abs(found) + more)
+    return found
+
+
+def _delivered(case: Case) -> Execution | None:
+    """How exactly the control is delivered, of a system whose rows are followed."""
+    found = case.execution
+    assert found is None or isinstance(found, Execution)  # of one that changes with time none are
+    return found
+
+
+def erring_at(case: Case, c: Array, times: Array) -> tuple[Array, Array]:
+    """What the worst errors of execution add to ``c'x`` at ``times (k,)``, of a system whose rows are followed: between
+    ``(k,)`` and ``(k,)``."""
+    delivered = _delivered(case)
+    return (np.zeros(times.size), np.zeros(times.size)) if delivered is None else delivered.added_at(c, times)
 
 
 def _refute(
@@ -224,6 +248,8 @@ def _refute(
     if window.reference is not None or window.is_mixed:
         more = [beside(case, window, direction, t, t)[0] for t in middles.tolist()]
         least = least + np.array(more) - HALF_ULP * 8.0 * np.abs(more)
+    errors, _ = erring_at(case, window.split(direction)[0], middles)
+    least = least + errors - HALF_ULP * 8.0 * np.abs(errors)
     place = int(least.argmax())
     if least[place] > limit:
         raise Broken(f"{limit!r} is exceeded, by {least[place] - limit:.3g} at t = {middles[place]:.6g}")

@@ -13,7 +13,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.answers import Named, answers_of, commanded
 from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
 from sparserob_core.checker.claims.cells import Reached
-from sparserob_core.checker.claims.constraints import beside, followed, follows, missed
+from sparserob_core.checker.claims.constraints import beside, erring_at, followed, follows, missed
 from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
@@ -212,6 +212,8 @@ def _along_rows(
                 worst = replace(worst, centre=begun, begun=None)
             (top,), (wide,) = worst.most(np.array([time]))
             low, high = beside(case, window, c, time, (breaks[k] + breaks[k + 1]) / 2)
+            (least,), (most,) = erring_at(case, window.split(c)[0], np.array([time]))
+            low, high = low + least, high + most
             over.append(float(top - wide / 3.0 + (low + high) / 2.0) - float(b.mid()))
             slack = max(slack, float(wide + high - low))
     return over, slack
