@@ -102,11 +102,13 @@ def is_followed(case: Case, window: Window) -> bool:
 
 
 def follows(case: Case) -> bool:
-    """Whether rows of the system, which is known and has many states, are followed by their adjoints."""
+    """Whether rows of the system, which is known, are followed by their adjoints: where it has many states, or
+    measurable disturbances, which would be integrated along matrices on every piece."""
     system, still = case.problem.system, case.still
     if case.answering or not case.alike or len(case.grid) > MOST_PIECES:
         return False
-    return still is not None and not system.parameter_count and system.states >= FOLLOWED
+    known_system = still is not None and not system.parameter_count
+    return known_system and (case.measurable or system.states >= FOLLOWED)
 
 
 def _along_rows(case: Case, window: Window) -> Proven:
