@@ -110,7 +110,7 @@ class Execution:
     def least(self, c: Array, time: float) -> Array:
         """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
         (low,), (high,) = self.integrals(c, np.array([time]), self.breakpoints)
-        return np.maximum(self.shares * (low[:-1] - high[1:]) * (1.0 - 1e-15), 0.0)
+        return np.asarray(np.maximum(self.shares * (low[:-1] - high[1:]) * (1.0 - 1e-15), 0.0))
 
     @cached_property
     def jumps(self) -> tuple[np.ndarray, Array, Array]:
