@@ -208,5 +208,5 @@ def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
 def _version(package: str) -> str | None:
     try:
         return metadata.version(package)
-    except metadata.PackageNotFoundError:
+    except Exception:  # noqa: BLE001  not installed, or a broken folder of that name, of which each Python raises its own
         return None
