@@ -31,6 +31,7 @@ from sparserob_core.control.transcription.transcribe import transcribe as transc
 from sparserob_core.sip.convex_set import Array as Array
 from sparserob_core.sip.convex_set import Box as Box
 from sparserob_core.sip.convex_set import ConvexSet as ConvexSet
+from sparserob_core.sip.inner.simplex.silence import silent as silent
 from sparserob_core.sip.program import ConstraintFamily as ConstraintFamily
 from sparserob_core.sip.program import Enclosure as Enclosure
 from sparserob_core.sip.program import SemiInfiniteProgram as SemiInfiniteProgram
