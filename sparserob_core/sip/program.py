@@ -207,6 +207,12 @@ class ConstraintFamily:
     def __post_init__(self) -> None:
         sealed(self)
 
+    @property
+    def provable(self) -> bool:
+        """Whether anything could prove that a decision meets all of its constraints; of rows alone nothing can."""
+        proven = self.reduced or self
+        return proven.enclosure is not None or proven.worst is not None
+
     def formulated(self, formulation: Formulation) -> ConstraintFamily | None:
         """The same constraints with the indices of another formulation; ``None`` where the family does not have it.
 
@@ -358,7 +364,8 @@ class EqualityErrors:
 @dataclass(frozen=True, eq=False)
 class SemiInfiniteProgram:
     """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant`` subject to ``lower <= S x <= upper``,
-    ``G x <= h``, ``A x = b`` and every constraint family at every index.
+    ``G x <= h``, ``A x = b`` and every constraint family at every index. A row with an ``h`` of infinity asks for
+    nothing.
 
     ``n`` is the number of decision variables; ``P (n, n)`` is symmetric and positive semidefinite but for rounding
     (`require_convex`), or refused; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
@@ -464,7 +471,7 @@ class SemiInfiniteProgram:
         rows = np.atleast_2d(np.asarray(matrix, dtype=float))
         if rows.ndim != 2 or rows.shape[1] != self.n or not np.isfinite(rows).all():
             raise InputError(f"{left}: expected finite numbers of shape (rows, {self.n}), got shape {rows.shape}")
-        return rows, _vector(right, bounds, rows.shape[0])
+        return rows, (_vector if left == "A" else _upper)(right, bounds, rows.shape[0])
 
     @property
     def own_units(self) -> OwnUnits | None:
@@ -563,4 +570,12 @@ def _vector(name: str, value: object, size: int) -> Array:
     vector = as_bound(name, value, size)
     if not np.isfinite(vector).all():
         raise InputError(f"{name}: expected finite numbers, got {vector.tolist()}")
+    return vector
+
+
+def _upper(name: str, value: object, size: int) -> Array:
+    """Right-hand sides of inequalities; infinity asks for nothing."""
+    vector = as_bound(name, value, size)
+    if (vector == -np.inf).any():
+        raise InputError(f"{name}: expected numbers, or inf for a row that asks for nothing, got {vector.tolist()}")
     return vector
