@@ -17,6 +17,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.convexity import ControlImage, Regulariser, require_convex
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.inner.curved import curved_bound, least_curvature
 from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
 from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
@@ -239,7 +240,17 @@ class RelaxedProgram:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
         at = _touched(plain, y, mu, solution.x)
         bound, y, mu, moved = proving(plain.tangent(at), y, mu, z, at=at)
+        if bound == -np.inf and self._bend is not None:
+            bound, at = curved_bound(plain, self._bend, y, mu, at)
         return bound - self.rounding(plain, y, mu, solution.x), y, mu, moved, at
+
+    @cached_property
+    def _bend(self) -> Array | None:
+        """What of the quadratic cost every entry has for itself ``(n,)``; ``None`` where a tangent does as well."""
+        base = self.program.finite
+        if base.P is None or base.S is not None or base.blocks is not None or base.separable or base.bounded:
+            return None
+        return least_curvature(base.P.toarray())
 
     @shaped
     def rounding(
