@@ -305,7 +305,8 @@ class ConstraintFamily:
 
 def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
     """A point ``(d,)`` of the box that is in none of the cells between corners ``(k, d)``; ``None`` where there is
-    none, or where cells are faces of a cube of directions, whose inner points are multiples of others.
+    none, or where all cells are on faces of the box, as those of a cube of directions, whose inner points are multiples
+    of others.
 
     Between the corners of all cells the box is a grid, of which every part is in a cell or outside of it; a grid of
     more than `PARTS` parts is not made, and then the volumes of the cells are compared with that of the box.
@@ -317,8 +318,10 @@ def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
     low, sides = box.lower[moves], (box.upper - box.lower)[moves]
     begins, ends = ((corners[:, moves] - low) / sides for corners in (lower, upper))
     filled = np.prod(np.minimum(ends, 1.0) - np.maximum(begins, 0.0), axis=1)
-    if not np.isfinite(filled).all() or (moves.size > 1 and not filled.any()):
-        return box.lower if np.isnan(filled).any() else None
+    if not np.isfinite(filled).all():
+        return box.lower
+    if ((begins == ends) & ((begins == 0.0) | (begins == 1.0))).any(axis=1).all() and moves.size:
+        return None
     edges = [_apart(np.concatenate([begins[:, i], ends[:, i], [0.0, 1.0]])) for i in range(moves.size)]
     middle = (box.lower + box.upper) / 2
     if np.prod([float(one.size) for one in edges]) > PARTS:
