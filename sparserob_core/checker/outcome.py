@@ -16,6 +16,9 @@ FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written fig
 # closed is judged by the cost that is derived, where that is the larger one.
 CANCELLED = 1e-3
 RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: TOLERANCE of it is 17 units of rounding
+# Of the numbers that are added up: a set that is thinner is a point to any solver that computes in doubles, and is
+# judged as one, by what is excused of a point. A run's own number is an eighth of it, since sums differ a little.
+THIN = 2.0**-34
 
 LOOKED = 1024  # items between two looks at the time: some ms; ten times as many may be late, a tenth costs time itself
 

@@ -182,7 +182,7 @@ def _turned(case: Case, shape: Shape, places: Sequence[int], heights: Callable[[
     """Show that what answers is in a curved set on these pieces, in every direction; by how much it leaves it at
     most."""
     m, times = shape.dimension, case.control.breakpoints.tolist()
-    curved = Curved(shape, np.diag(1.0 / np.array(shape.radius)), np.zeros(m))
+    curved = Curved(shape, np.diag(1.0 / np.array(shape.radius)), lambda c, width: 0.0)
     work = list[Work]()
     for axis in range(m):
         for sign in (-1.0, 1.0):

@@ -337,7 +337,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
     those with the same parameters and directions together, their times cut wherever anything turns or jumps."""
     nu, units = case.problem.system.parameter_count, case.units(window)
     basis, gains, flat = _facets(window, units)
-    curved = None if flat is not None else Curved(window.seen, normals, units.floors)
+    curved = None if flat is not None else Curved(window.seen, normals, units.least)
     pairs = case.clock.each(zip(lower, upper, strict=True))
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in pairs]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))

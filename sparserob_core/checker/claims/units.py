@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.checker.claims.duality import before
-from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
+from sparserob_core.checker.outcome import RESOLVED, THIN, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, flows, held, stacked
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
@@ -50,10 +50,11 @@ class RowUnits:
 
     That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any
     admissible control, the worst disturbance, any parameter), ``|b|``, and the width of the slab where the opposite row
-    exists. That of a curved set in a direction ``c`` is ``h(c) - c'm``, ``m`` its centre. It is at least what double
-    precision resolves of the numbers that are added up, but never more than what a user can read: the largest of
-    ``|b|``, of that width, and of what the row does along the nominal trajectory (decision 0088). A violation of
-    `TOLERANCE` of it counts as none. Units are no claims: floating point will do.
+    exists; of a row whose width is `THIN`, how far it can reach alone. That of a curved set in a direction ``c`` is
+    ``h(c) - c'm``, ``m`` its centre. It is at least what double precision resolves of the numbers that are added up,
+    but never more than what a user can read: the largest of ``|b|``, of that width, and of what the row does along the
+    nominal trajectory (decision 0088). A violation of `TOLERANCE` of it counts as none. Units are no claims: floating
+    point will do.
     """
 
     problem: OptimalControlProblem
@@ -78,13 +79,24 @@ class RowUnits:
             sizes = np.maximum(sizes, self.nominal(*self._rows_of(states=False)))
         return np.asarray(np.minimum(resolved, np.maximum(sizes, TINY)))
 
+    def least(self, direction: Array, width: float) -> float:
+        """The least unit of a direction ``c (d,)`` of a curved set that reaches ``width`` from its centre along it:
+        what double precision resolves, but never more than what the states do along the nominal trajectory; these alone
+        where the set is `THIN`."""
+        size = np.abs(direction)
+        floors = self._seen if width < THIN * float(size @ self.sums) else self._floors
+        return float(size @ floors)
+
     @cached_property
-    def floors(self) -> Array:
-        """The least units ``(d,)`` of the states, by which that of a direction of a curved set is bounded from below:
-        what double precision resolves, but never more than what the state does along the nominal trajectory."""
+    def _floors(self) -> Array:
+        """The least units ``(d,)`` of the states."""
+        return np.minimum(RESOLVED * self.sums, self._seen)
+
+    @cached_property
+    def _seen(self) -> Array:
+        """How far every state goes along the nominal trajectory, ``(d,)``."""
         d = self.problem.system.states
-        seen = np.zeros(d) if self.nominal is None else self.nominal(np.eye(d), np.zeros((d, 0)))
-        return np.minimum(RESOLVED * self.sums, seen)
+        return np.zeros(d) if self.nominal is None else self.nominal(np.eye(d), np.zeros((d, 0)))
 
     @cached_property
     def resolved(self) -> Array:
@@ -94,7 +106,9 @@ class RowUnits:
         assert flat is not None
         heights = np.array([abs(float(b.mid())) for _, b in flat])
         reach, sums = self._measured(self._middle, states=False)
-        near = np.array([smallest(pair) for pair in zip(heights.tolist(), widths(flat), strict=True)])
+        across, thin = np.array(widths(flat)), THIN * sums[: heights.size]
+        both = np.where(across > thin, np.stack([heights, across]), 0.0)
+        near = np.array([smallest(pair) for pair in np.where(both > thin, both, 0.0).T.tolist()])
         if (reach[: near.size] < np.where(near > 0.0, near, np.inf)).any():  # elsewhere a row may reach further
             others = [self._measured(point, states=False)[0] for point in self._elsewhere]
             reach = np.max([reach, *others], axis=0)
@@ -114,7 +128,7 @@ class RowUnits:
         shape = known(self.shape)
         if shape.facets is None:
             width = float(limit.mid()) - float(direction @ shape.centre)
-            return TOLERANCE * max(width, RESOLVED * float(np.abs(direction) @ self.sums))
+            return TOLERANCE * max(width, RESOLVED * float(np.abs(direction) @ self.sums), self.least(direction, width))
         return TOLERANCE * float(shape.shares(direction) @ self.resolved)
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, final
@@ -42,12 +42,12 @@ class Bounded:
 @final
 @dataclass(frozen=True, eq=False)
 class Curved:
-    """A curved set with the coordinates of its directions: ``c = z'normals``, ``normals (b, d)``; ``floors
-    (d,)``: the least unit of every state."""
+    """A curved set with the coordinates of its directions: ``c = z'normals``, ``normals (b, d)``; ``least``: the
+    least unit of a direction ``c (d,)``, along which the set reaches so far from its centre."""
 
     shape: Shape
     normals: Array
-    floors: Array
+    least: Callable[[Array, float], float]
 
     def bounded(self, z: Array, inside: Sequence[arb]) -> Bounded:
         """The constraint in one direction with a point ``inside`` the set as its limit. Its unit is the width of the
@@ -64,7 +64,7 @@ class Curved:
         return self._row(z, below(height), max(0.0, below(height - along(self.shape.centre, c))))
 
     def _row(self, z: Array, limit: float, unit: float) -> Bounded:
-        return Bounded(z, limit, max(unit, float(np.abs(self.floats(z)) @ self.floors)) or 1.0)
+        return Bounded(z, limit, max(unit, self.least(self.floats(z), unit)) or 1.0)
 
     def floats(self, z: Array) -> Array:
         """``c (d,)`` rounded."""

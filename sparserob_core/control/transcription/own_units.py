@@ -21,6 +21,14 @@ AT_ONCE = 2_000_000  # numbers that functionals are made of
 LOOKED_AT = 1000  # pieces, in about so many of which a reach is computed
 PARAMETERS = 9  # at most, at which a reach is looked at
 RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: 1e-9 of it is 17 units of rounding
+# Of the numbers that are added up: a set that is thinner holds no point that a solver of doubles finds, and counts as a
+# point there. With a thousandth of it, balls of radius 1e-12 end undecided; with a thousand times as much, sets that
+# are kept now would be excused more than their width. The checker's `THIN` is larger, so that it calls thin what is.
+THIN = 2.0**-37
+# Of how far a row of such a set reaches, its unit: a search leaves half a billionth of the unit, a claim may excuse a
+# billionth of what the row does, which is less than it could. A tenth of it is what solvers are off by; with ten times
+# as much, sets end undecided whose row does a tenth of what it could.
+POINT = 2.0**-4
 COST = 0.125  # of the largest possible cost, its unit: weights of a regulariser keep their size in the paper's problems
 CHAINED = 1e150  # a state that a chain of couplings might bring beyond this is left to the response
 
@@ -94,7 +102,8 @@ def _cost_per_time(problem: OptimalControlProblem, states: Array, time: float) -
 
 def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     """The unit ``(r,)`` of each row of a constraint: see `units_of_sides`; of a curved set, whose rows are in multiples
-    of its gauge, 1, or what double precision resolves of that."""
+    of its gauge, 1, or what double precision resolves of that; of one that is a point to rounding, how far it reaches
+    in these multiples."""
     functionals, sides = constraint.functionals.coarser(LOOKED_AT), constraint.sides
     times = window_times(functionals, constraint.start, constraint.stop)
     moved = constraint.reference
@@ -110,8 +119,11 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     added = added + moved.size
     if (np.abs(directions) @ added).max() <= 1.0 / RESOLVED:  # a sum along c is at most |c| times those along the axes
         return np.ones(1)
-    _, added = reaches(functionals, constraint.parameters, control, directions, times)
+    reach, added = reaches(functionals, constraint.parameters, control, directions, times)
     added = added + moved.reach(directions)
+    if (THIN * added > 1.0).all():
+        reach = reach + moved.reach(directions)
+        return np.maximum(1.0, power_of_two(np.array([POINT * reach[reach > 0.0].min(initial=added.max())])))
     return np.maximum(1.0, power_of_two(np.array([RESOLVED * added.max()])))
 
 
@@ -137,9 +149,13 @@ def constraint_sides(constraint: StateConstraint) -> tuple[Array, Array]:
 
 def units_of_sides(H: Array, h: Array, reach: Array, added: Array) -> Array:
     """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
-    those of them that are not 0; no less than what double precision resolves of the sums ``added (r,)``. A power of
-    two, 1.2 to 2.5 times below that."""
-    sizes = np.stack([reach, np.abs(h), widths(H, h)])
+    those of them that are not 0, nor `THIN` beside the sums ``added (r,)``; of a row whose width is, ``reach`` alone,
+    since nothing is left to keep away from it. No less than what double precision resolves of these. A power of two,
+    1.2 to 2.5 times below that."""
+    across, thin = widths(H, h), np.where(np.isfinite(added), THIN * added, 0.0)
+    near = np.where(across > thin, np.stack([np.abs(h), across]), 0.0)
+    reach = np.where(across > thin, 1.0, POINT) * reach
+    sizes = np.vstack([reach[None], np.where(near > thin, near, 0.0)])
     sizes = np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, np.inf).min(axis=0)
     least = np.where(np.isfinite(added), RESOLVED * added, 0.0)
     unit = np.where(np.isfinite(sizes), np.maximum(sizes, least), np.where(least > 0.0, least, 2.0))
