@@ -17,7 +17,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet, projector
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array, csr_array
@@ -390,18 +390,34 @@ class Spread:
 
     @cached_property
     def chords(self) -> Array:
-        """How long the set is along each axis through the middle, ``(Q,)``: for all ``a``, the width of the set along
-        ``a`` is at least that times ``|a_i|``."""
+        """How long the set is along each axis through the middle, ``(Q,)``, in parts of the axis: for all ``a`` in its
+        span, the width of the set along ``a`` is at least that times ``|a_i|``. Of a set without an interior the axes
+        are those within its span."""
         found = [np.zeros(0)]
-        for _, count, convex, middle in self.parts:
+        for (_, count, convex, middle), within in zip(self.parts, self._projectors, strict=True):
             if convex.is_box:
                 box = convex.bounding_box()
                 low, high = box.lower, box.upper
             else:
-                axes = np.eye(convex.dimension)
-                low, high = convex.chord(np.broadcast_to(middle, axes.shape), axes)
+                low, high = convex.chord(np.broadcast_to(middle, within.shape), within)
+                low, high = (np.where(within.any(axis=1), side, 0.0) for side in (low, high))
             found.append(np.tile(np.maximum(high - low, 0.0), count))
         return np.concatenate(found)
+
+    @cached_property
+    def _projectors(self) -> list[Array]:
+        """Of every set the orthogonal projector ``(q, q)`` onto its span."""
+        return [projector(convex.span) for _, _, convex, _ in self.parts]
+
+    def within(self, a: Array) -> Array:
+        """What ``a (..., Q)`` is within the span of the set, along which all deviations are; 0 on entries that do not
+        deviate."""
+        found = a * (self.chords > 0.0)
+        for (part, count, convex, _), within in zip(self.parts, self._projectors, strict=True):
+            if not np.array_equal(within, np.diag(np.diag(within))):
+                blocks = a[..., part].reshape(*a.shape[:-1], count, convex.dimension)
+                found[..., part] = (blocks @ within).reshape(*a.shape[:-1], -1)
+        return np.asarray(found)
 
     @property
     def is_box(self) -> bool:

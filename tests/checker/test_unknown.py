@@ -137,7 +137,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "an effort that is larger": (largest_effort(arb(2), 0.5), Broken, "causes the effort 2.0"),
     "a system that is too fast": (lambda: kernel_of([[-1e9]], [[1.0]], 1.0), Unchecked, "too fast for its pieces"),
     "numbers that are not exact": (
-        lambda: Pushed.of([(arb_mat([[arb(1, 0.1)]]), arb_mat([[1]]))], [0]),
+        lambda: Pushed.of([(arb_mat([[arb(1, 0.1)]]), arb_mat([[1]]))], [[1]]),
         Unchecked,
         "the numbers of the system are not exact",
     ),

@@ -6,12 +6,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import balls, rational
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers
 from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
@@ -24,7 +26,7 @@ from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.shape import along
+from sparserob_core.checker.sets.shape import NEAR, along
 from sparserob_core.control.problem.disturbances import apart
 from sparserob_core.control.problem.system import SwitchedSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
@@ -274,7 +276,7 @@ class Answers:
                     ).entries()
                     shares = iter(z)
                     sizes += [
-                        sum((abs(next(shares)) / chord for chord in self._chords[block].values()), arb(0))
+                        sum((abs(next(shares)) / length for _, length in self._segments[block]), arb(0))
                         for block in blocks
                     ]
                 total = total + width[i] * _largest(sizes)
@@ -285,7 +287,7 @@ class Answers:
         gives, from a combination of the states seen there, a combination of the blocks, ``(q, J d)``."""
         groups: list[tuple[list[int], set[int]]] = []
         for j in np.flatnonzero(self.case.answers[k, : k + 1]).tolist():
-            seen = {block for block in loop.seen[j] if self._chords[block]}
+            seen = {block for block in loop.seen[j] if self._segments[block]}
             if not seen:
                 continue
             mine, rest = ([j], seen), []
@@ -299,16 +301,15 @@ class Answers:
 
     def _inverse(self, loop: ClosedLoop, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
         """What gives, of any combination of the states seen at these breakpoints, one of the blocks that is seen so."""
-        from flint import arb
-
         if members not in self._inverses:
-            blocks = sorted({block for j in members for block in loop.seen[j] if self._chords[block]})
-            d, zero = loop.outputs, arb(0)
+            blocks = sorted({block for j in members for block in loop.seen[j] if self._segments[block]})
+            d = loop.outputs
             table: list[list[arb]] = []
             for j in members:
-                lists = {block: push.tolist() for block, push in loop.seen[j].items()}
+                seen = loop.seen[j]
+                lists = {block: _onto(push, self._segments[block]) for block, push in seen.items() if block in blocks}
                 table += [
-                    [lists[block][s][b] if block in lists else zero for block in blocks for b in self._chords[block]]
+                    [x for block in blocks for x in (lists[block][s] if block in lists else self._none_of(block))]
                     for s in range(d)
                 ]
             groups = [self._pushed(loop, block) for block in blocks]
@@ -320,32 +321,37 @@ class Answers:
             rows = [(d * (k + 1), most) for k in range(len(members))]
             ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
             columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
-            reach = np.array([float(chord.mid()) for block in blocks for chord in self._chords[block].values()])
+            reach = np.array([float(length.mid()) for block in blocks for _, length in self._segments[block]])
             self._inverses[members] = Seen(stacked(table), pattern, rows, columns, reach).inverse(), blocks
         return self._inverses[members]
 
+    def _none_of(self, block: int) -> list[arb]:
+        """Nothing of any of the segments of a block."""
+        return [balls([0.0])[0]] * len(self._segments[block])
+
     def _pushed(self, loop: ClosedLoop, block: int) -> Pushed:
         """Who can see the deviations of a block; of the initial state everyone sees its own."""
-        d, varying = loop.system.states, tuple(self._chords[block])
+        vectors = [vector for vector, _ in self._segments[block]]
         if loop.measured is not None:  # outputs see what the observer makes of everything: as many as there are
-            return Pushed(np.ones((loop.outputs, len(varying)), dtype=bool), loop.outputs, len(varying))
+            return Pushed(np.ones((loop.outputs, len(vectors)), dtype=bool), loop.outputs, len(vectors))
         if self.case.problem.initial_set is not None and block == loop.begun:
-            return Pushed(np.eye(d, dtype=bool)[:, list(varying)], len(varying), len(varying))
-        if varying not in self._pushes:
-            self._pushes[varying] = loop.pushed(varying)
-        return self._pushes[varying]
+            return Pushed(np.array([[bool(v) for v in row] for row in vectors]).T, len(vectors), len(vectors))
+        key = tuple(map(tuple, vectors))
+        if key not in self._pushes:
+            self._pushes[key] = loop.pushed(vectors)
+        return self._pushes[key]
 
     @cached_property
-    def _pushes(self) -> dict[tuple[int, ...], Pushed]:
+    def _pushes(self) -> dict[tuple[tuple[Fraction, ...], ...], Pushed]:
         return {}
 
     @cached_property
-    def _chords(self) -> list[dict[int, arb]]:
-        """Of every block how long its set is along the axes, those along which it is a point left out: what cannot
-        deviate is never seen."""
+    def _segments(self) -> list[list[tuple[list[Fraction], arb]]]:
+        """Of every block the directions along which its set is long, and how long; none of what cannot deviate, which
+        is never seen."""
         loop = self.loop_at_rest
-        found = {id(shape): _chords(shape, about) for shape, about in loop.sets}
-        return [{b: chord for b, chord in enumerate(found[id(shape)]) if chord > 0} for shape, _ in loop.sets]
+        found = {id(shape): _segments(shape, about) for shape, about in loop.sets}
+        return [found[id(shape)] for shape, _ in loop.sets]
 
     @cached_property
     def loop_at_rest(self) -> ClosedLoop:
@@ -390,10 +396,11 @@ class Answers:
             return Named(self.case, named.loop, calm)
         point = numbers(entry.get("following"), f"{name}: following")
         held = known(self.case.problem.initial_set)
-        if point.shape != (self.case.problem.system.states,) or not held.contains(point):
+        found = held.member(point) if point.shape == (self.case.problem.system.states,) else None
+        if found is None:
             raise Broken(f"{name}: the next deviation {point.tolist()} is not shown to be in its set")
         about = self.loop_at_rest.sets[-1][1]
-        begun = [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]
+        begun = [v - arb(float(c)) for v, c in zip(found, about, strict=True)]
         return Named(self.case, named.loop, [*calm, begun])
 
     @cached_property
@@ -480,19 +487,23 @@ def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: st
         points.append(numbers(entry.get("deviation"), f"{name}: deviation"))
         if points[-1].shape != (case.problem.system.states,):
             raise Broken(f"{name}: a deviation of the initial state of shape {points[-1].shape}")
-    for number_of, (point, (shape, _)) in enumerate(zip(points, loop.sets, strict=True)):
-        if not known(shape).contains(point):
+    found = list[list[arb]]()
+    for number_of, (point, (shape, about)) in enumerate(zip(points, loop.sets, strict=True)):
+        member = known(shape).member(point)
+        if member is None:
             kinds = ("disturbance", "noise", "deviation of the initial state")
             what = kinds[(number_of >= loop.blocks) + (number_of >= loop.begun)]
             raise Broken(f"{name}: the {what} {point.tolist()} is not shown to be in its set")
-    return [
-        [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]
-        for point, (_, about) in zip(points, loop.sets, strict=True)
-    ]
+        found.append([v - arb(float(c)) for v, c in zip(member, about, strict=True)])
+    return found
 
 
 def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
-    return known(shape).support(balls([sign * float(i == channel) for i in range(shape.dimension)]))
+    return _support(shape, sign * np.eye(shape.dimension)[channel])
+
+
+def _support(shape: ConvexSet, direction: Array) -> arb:
+    return known(shape).support(balls(direction))
 
 
 def _width(shape: ConvexSet, channel: int) -> arb:
@@ -501,6 +512,33 @@ def _width(shape: ConvexSet, channel: int) -> arb:
 
 def _reach(shape: ConvexSet, channel: int) -> arb:
     return _axis(shape, channel, 1.0).max(_axis(shape, channel, -1.0)).max(_axis(shape, channel, 1.0) * 0)
+
+
+def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb]]:
+    """Vectors ``v (d,)`` that span the directions along which points of a set differ, and numbers ``c > 0`` such that
+    its width along any ``a`` is at least ``c |a'v|``: along the axes, but of a set without an interior."""
+    if isinstance(shape, Product):
+        return [
+            ([*[Fraction(0)] * place.start, *vector, *[Fraction(0)] * (shape.dimension - place.stop)], length)
+            for part, own, place in _parts(shape, middle)
+            for vector, length in _segments(part, own)
+        ]
+    chords, axes = _chords(shape, middle), np.eye(shape.dimension)
+    wide = [_support(shape, axis) + _support(shape, -axis) for axis in axes]
+    if all(wide[b].is_zero() or chord > NEAR * wide[b] for b, chord in enumerate(chords)):
+        kept = [b for b, width in enumerate(wide) if not width.is_zero()]
+        return [([Fraction(float(v)) for v in axes[b]], chords[b]) for b in kept]
+    along = known(shape).segments
+    if along is None:
+        raise Unchecked(f"the checker does not know how long the {shape.kind} is along the axes")
+    return [(vector, rational(length)) for vector, length in along]
+
+
+def _parts(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]]:
+    """Every part of a product with its part of a point, and its place."""
+    ends = np.cumsum([0, *(part.dimension for part in shape.parts)]).tolist()
+    places = [slice(begin, end) for begin, end in pairwise(ends)]
+    return [(part, middle[place], place) for part, place in zip(shape.parts, places, strict=True)]
 
 
 def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
@@ -529,6 +567,16 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
             reach.append(least)
         found.append(reach[0] + reach[1])
     return found
+
+
+def _onto(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
+    """What every entry is of some segments of a block, that is this of its coordinates."""
+    from flint import arb
+
+    rows, columns = push.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
+    return [
+        [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in one), arb(0)) for one in columns] for row in rows
+    ]
 
 
 def _largest(values: list[arb]) -> arb:

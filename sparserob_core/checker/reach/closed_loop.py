@@ -13,6 +13,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
@@ -47,7 +48,7 @@ def arb_of(value: float) -> arb:
 def middle(shape: ConvexSet) -> Array:
     """The middle ``(d,)`` of a bounded set."""
     found = shape.middle()  # any point of the set would be right: what is claimed is claimed of deviations from it
-    if not known(shape).contains(found):
+    if known(shape).member(found) is None:
         raise Unchecked(f"the middle of the {shape.kind} is not shown to be in it")
     return found
 
@@ -175,9 +176,9 @@ class ClosedLoop:
         Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
         return Phi, Gamma * self.modes[self.mode(self.grid[piece])]["E"]
 
-    def pushed(self, entries: Sequence[int]) -> Pushed:
-        """Who can see these entries of a block of the disturbance."""
-        return Pushed.of([(one["A"], one["E"]) for one in self.modes], entries)
+    def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
+        """Who can see a block of the disturbance along these vectors."""
+        return Pushed.of([(one["A"], one["E"]) for one in self.modes], vectors)
 
     @staticmethod
     def _exact(start: float, stop: float, key: float) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
@@ -45,26 +46,27 @@ class Pushed:
     entries: int
 
     @staticmethod
-    def of(modes: Sequence[tuple[arb_mat, arb_mat]], varying: Sequence[int]) -> Pushed:
-        """Without rounding, for the entries ``varying`` of a disturbance, of systems ``A (d, d)``, ``E (d, mw)``;
+    def of(modes: Sequence[tuple[arb_mat, arb_mat]], vectors: Sequence[Sequence[Fraction]]) -> Pushed:
+        """Without rounding, for a disturbance along the ``vectors (q, mw)``, of systems ``A (d, d)``, ``E (d, mw)``;
         raises `Unchecked` where their numbers are not exact.
 
         Where columns of ``E`` are brought to by any of the systems, one after another, is the least subspace that holds
         them and that no ``A`` leaves; it is reached within ``d`` steps."""
-        from flint import fmpq_mat
+        from flint import fmpq, fmpq_mat
 
         if not all(x.is_exact() for mode in modes for part in mode for x in part.entries()):
             raise Unchecked("the numbers of the system are not exact")
         systems = [_rational(A.transpose().tolist()) for A, _ in modes]
-        entered = [[[row[b] for b in varying] for row in E.tolist()] for _, E in modes]
-        pattern: Pattern = np.any([middles(E)[:, list(varying)] != 0.0 for _, E in modes], axis=0)
+        along = fmpq_mat([[fmpq(v.numerator, v.denominator) for v in vector] for vector in vectors]).transpose()
+        entered = [_rational(E.tolist()) * along for _, E in modes]
+        pattern: Pattern = np.any([[[x != 0 for x in row] for row in E.tolist()] for E in entered], axis=0)
         linked = np.any([middles(A) != 0.0 for A, _ in modes], axis=0).astype(int)
-        spanned = _basis([row for one in entered for row in _rational(one).transpose().tolist()])
+        spanned = _basis([row for one in entered for row in one.transpose().tolist()])
         for _ in range(linked.shape[0] - 1):
             moved = [row for a in systems for row in (fmpq_mat(spanned) * a).tolist()] if spanned else []
             spanned = _basis([*spanned, *moved])
             pattern = pattern | (linked @ pattern.astype(int) > 0)
-        return Pushed(pattern, len(spanned), _rational([row for one in entered for row in one]).rank())
+        return Pushed(pattern, len(spanned), fmpq_mat([row for one in entered for row in one.tolist()]).rank())
 
 
 def _basis(rows: list[list[fmpq]]) -> list[list[fmpq]]:

@@ -243,6 +243,11 @@ class Joint(Shape):
     def holds(self, point: Sequence[arb]) -> bool:
         return all(part.holds(point[place]) for part, place in zip(self.parts, self.places, strict=True))
 
+    def member(self, point: Sequence[float] | Array) -> list[arb] | None:
+        each = [part.member(point[place]) for part, place in zip(self.parts, self.places, strict=True)]
+        known = [one for one in each if one is not None]
+        return [x for one in known for x in one] if len(known) == len(each) else None
+
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         each = [
             part.bound(value[:, place], spread[:, place]) for part, place in zip(self.parts, self.places, strict=True)

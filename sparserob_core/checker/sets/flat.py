@@ -15,12 +15,12 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, balls, below, rational
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, rounding
-from sparserob_core.checker.sets.shape import Facet, Shape, along, dot, facet, total
+from sparserob_core.checker.sets.shape import NEAR, Facet, Shape, along, dot, facet, total
 from sparserob_core.control.sets.sets import Box, NormBall, Polytope, Zonotope
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb
+    from flint import arb, fmpq
 
 MOST_CORNERS = 20_000  # intersections of facets looked at when a polytope's corners are listed
 
@@ -145,6 +145,33 @@ class Cornered(Flat):
             answer = answer.max(height)
         return answer
 
+    @cached_property
+    def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
+        """From one corner to others, which are in the set with what is between."""
+        first, *others = self.corners
+        longest = sorted(([a - b for a, b in zip(x, first, strict=True)] for x in others), key=_size, reverse=True)
+        chosen = _apart(longest)
+        if len(chosen) == self.dimension:
+            return None
+        self._sums = longest[:1] if len(chosen) == 1 else longest
+        if len(chosen) > 1 and len(_independent(longest)) > len(chosen):
+            raise Unchecked(f"a {self.source.kind} is thin, but not flat, in more than one direction")
+        return [(vector, Fraction(1)) for vector in chosen]
+
+    def nearest(self, point: Array) -> list[arb]:
+        """A mean of corners."""
+        from scipy.optimize import nnls
+
+        assert self.segments is not None
+        first, offsets = self.corners[0], [[Fraction(0)] * self.dimension, *self._sums]
+        table = np.array([[float(x) for x in offset] for offset in offsets])
+        size = float(np.abs(table).max(initial=0.0)) or 1.0
+        away = (point - np.array([float(x) for x in first])) / size
+        weights = nnls(np.vstack([table.T / size, np.ones(len(table))]), np.append(away, 1.0))[0]
+        shares = [Fraction(float(w)) / sum(Fraction(float(v)) for v in weights) for w in weights]
+        columns = zip(first, zip(*offsets, strict=True), strict=True)
+        return [rational(x + sum(w * v for w, v in zip(shares, column, strict=True))) for x, column in columns]
+
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         """The corner that is best at ``value``: nothing is lost where it stays the best."""
         points = np.array([[float(x) for x in corner] for corner in self.corners])
@@ -215,16 +242,17 @@ class Octahedral(Cornered):
 
 @final
 class Segments(Flat):
-    """A zonotope: ``h(c) = c'm + sum_j |c'g_j|``. It has facets where its segments span the space."""
+    """A zonotope: ``h(c) = c'm + sum_j |c'g_j|``. Where its segments do not span the space it has opposite facets
+    across every direction in which it does not reach."""
 
     source: Zonotope
 
     @cached_property
     def facets(self) -> list[Facet] | None:
-        """Every facet is spanned by ``d - 1`` segments. Its normal is one of floats, of length 1, near the exact one:
-        its limit is drawn inwards by as much as a point within it, up to twice as large as the set, could be outside of
-        the exact one."""
-        if self.source.halfspaces() is None:  # too many, or no interior: what a run sees as curved
+        """Every facet is spanned by as many segments as their span has dimensions, less one. Its normal is one of
+        floats, of length 1, near the exact one: its limit is drawn inwards by as much as a point within it, up to
+        twice as large as the set, could be outside of the exact one."""
+        if self.source.halfspaces() is None:  # too many: what a run sees as curved
             return None
         far, found = 2 * total(balls(self.radius)), []
         for exact in self._normals:
@@ -241,12 +269,17 @@ class Segments(Flat):
 
     @property
     def _normals(self) -> list[tuple[Fraction, ...]]:
-        """One normal of every pair of facets, exactly."""
+        """One normal of every pair of facets, exactly: those within the span of the segments, and some that span what
+        is across it."""
         from flint import fmpq, fmpq_mat
 
         d, found = self.dimension, dict[tuple[str, ...], list[fmpq]]()
         rows = [[fmpq(*v.as_integer_ratio()) for v in g] for g in self.source.generators.tolist() if any(g)]
-        for chosen in combinations(rows, d - 1):
+        across = _null_space(rows, d)
+        rank = d - len(across)
+        every = [[*chosen, *across] for chosen in combinations(rows, rank - 1)] if rank else []
+        every += [[*across[:i], *across[i + 1 :], *_basis(rows)] for i in range(len(across))]
+        for chosen in every:
             minors = [
                 (-1) ** i * (fmpq_mat([[*r[:i], *r[i + 1 :]] for r in chosen]).det() if d > 1 else fmpq(1))
                 for i in range(d)
@@ -261,16 +294,55 @@ class Segments(Flat):
         """Of its middle that is no question."""
         return np.array_equal(point, self.source.centre) or super().contains(point)
 
-    @property
-    def segments(self) -> list[list[Fraction]]:
-        """The segments ``(q, d)``, exactly."""
-        return [[Fraction(float(v)) for v in row] for row in self.source.generators if row.any()]
+    @cached_property
+    def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
+        """Those of the segments that it is a sum of, the longest first, as many as are apart."""
+        chosen = _apart(self._sums)
+        if len(chosen) == self.dimension:
+            return None
+        if len(_independent(self._sums)) > len(chosen):
+            raise Unchecked(f"a {self.source.kind} is thin, but not flat, in more than one direction")
+        return [(vector, Fraction(2)) for vector in chosen]
+
+    @cached_property
+    def _sums(self) -> list[list[Fraction]]:
+        """The segments that are long, the longest first; those along one another as one, and all of them in the set
+        together."""
+        found = list[list[Fraction]]()
+        rows = sorted(
+            ([Fraction(v) for v in g] for g in self.source.generators.tolist() if any(g)), key=_size, reverse=True
+        )
+        for row in rows:
+            if _size(row) <= NEAR * _size(rows[0]):
+                break
+            for place, other in enumerate(found):
+                sign = 1 if sum(a * b for a, b in zip(row, other, strict=True)) > 0 else -1
+                if len(_apart([other, row])) == 1:
+                    found[place] = [b + sign * a for a, b in zip(row, other, strict=True)]
+                    break
+            else:
+                found.append(row)
+        return sorted(found, key=_size, reverse=True)
+
+    def nearest(self, point: Array) -> list[arb]:
+        """So much of every segment, none of them more than whole."""
+        from scipy.optimize import lsq_linear
+
+        offset, middle = point - self.source.centre, self.source.centre
+        if not self._sums:
+            return balls(middle)
+        table = np.array([[float(v) for v in row] for row in self._sums])
+        size = np.abs(table).max()
+        found = np.clip(lsq_linear(table.T / size, offset / size, (-1.0, 1.0), tol=1e-15).x, -1.0, 1.0).tolist()
+        columns = zip(middle.tolist(), zip(*self._sums, strict=True), strict=True)
+        return [
+            rational(Fraction(m) + sum(Fraction(s) * v for s, v in zip(found, column, strict=True)))
+            for m, column in columns
+        ]
 
     def holds(self, point: Sequence[arb]) -> bool:
         if self.facets is None:
-            raise Unchecked(
-                "the checker cannot tell who is in a zonotope without an interior, or with very many facets"
-            )
+            raise Unchecked("the checker cannot tell who is in a zonotope with very many facets")
         return super().holds(point)
 
     def support(self, direction: Sequence[arb]) -> arb:
@@ -292,6 +364,67 @@ class Segments(Flat):
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
         flat = self.facets is not None
         return super().least(ups, downs, slope) if flat else Shape.least(self, ups, downs, slope)
+
+
+def _basis(rows: Sequence[Sequence[fmpq]]) -> list[list[fmpq]]:
+    """Rows that span what some do, as many as are independent."""
+    from flint import fmpq_mat
+
+    if not rows:
+        return []
+    reduced, rank = fmpq_mat(rows).rref()
+    table: list[list[fmpq]] = reduced.tolist()
+    return table[:rank]
+
+
+def _size(row: Sequence[Fraction]) -> float:
+    return float(np.linalg.norm([float(v) for v in row]))
+
+
+def _apart(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
+    """The rows that are further than `NEAR`, beside the longest of all, from what those before them span."""
+    chosen, basis = list[list[Fraction]](), list[Array]()
+    longest = max(map(_size, rows), default=0.0)
+    for row in rows:
+        size = _size(row)
+        rest = np.array([float(v) for v in row]) / (size or 1.0)
+        for _ in range(2):
+            for other in basis:
+                rest = rest - (rest @ other) * other
+        away = float(np.linalg.norm(rest))
+        if size * away > NEAR * longest:
+            chosen.append(row)
+            basis.append(rest / away)
+    return chosen
+
+
+def _independent(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
+    """The rows of which none is a combination of those before it."""
+    chosen, reduced = list[list[Fraction]](), list[tuple[int, list[Fraction]]]()
+    for row in rows:
+        rest = row
+        for lead, other in reduced:
+            rest = [a - rest[lead] * b for a, b in zip(rest, other, strict=True)]
+        lead = next((i for i, v in enumerate(rest) if v), None)
+        if lead is not None:
+            reduced.append((lead, [v / rest[lead] for v in rest]))
+            chosen.append(row)
+    return chosen
+
+
+def _null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
+    """Vectors ``(d,)`` that span what is orthogonal to all of the rows."""
+    from flint import fmpq
+
+    basis = _basis(rows)
+    leads = [next(i for i, v in enumerate(row) if v != 0) for row in basis]
+    found = []
+    for free in (i for i in range(d) if i not in leads):
+        vector = [fmpq(int(i == free)) for i in range(d)]
+        for row, lead in zip(basis, leads, strict=True):
+            vector[lead] = -row[free]
+        found.append(vector)
+    return found
 
 
 def _height(up: arb, down: arb, slope: arb, value: arb) -> arb:

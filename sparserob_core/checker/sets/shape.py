@@ -18,6 +18,9 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 if TYPE_CHECKING:
     from flint import arb
 
+# Of a set's size: what is no further off counts as no direction of its own, and a point as one of the set. Nothing
+# false is believed with more of it: points are replaced by some of the set. A run's own number is a tenth of it.
+NEAR = 1e-8
 PARALLEL = 1e-12  # of unit vectors: rows that differ by less are opposite ones
 SPARE = 20  # bits of the working precision by which a point that is to be in a set is drawn inwards
 
@@ -47,8 +50,34 @@ class Shape(ABC):
         """Whether a point is proven to be in the set, ``(d,)`` balls."""
 
     def contains(self, point: Sequence[float] | Array) -> bool:
-        """Whether an exact point is proven to be in the set."""
-        return self.holds(balls(point))
+        """Whether an exact point is proven to be in the set; raises `Unchecked` for one that rounding may have taken
+        out of a set without an interior."""
+        if self.holds(balls(point)):
+            return True
+        if self.member(point) is not None:
+            raise Unchecked(f"floats seldom name a point of a {self.source.kind} without an interior")
+        return False
+
+    def member(self, point: Sequence[float] | Array) -> list[arb] | None:
+        """The point of the set that an exact one stands for: itself, or of a set without an interior, in which floats
+        seldom are, one that is next to it along its `segments`. ``None`` where there is none."""
+        if self.segments is None:
+            return balls(point) if self.holds(balls(point)) else None
+        near = self.nearest(np.asarray(point, dtype=float))
+        size = NEAR * max(max(self.radius, default=0.0), float(np.abs(point).max(initial=0.0)))
+        far = total(abs(a - b) for a, b in zip(near, balls(point), strict=True))
+        return near if far <= size else None
+
+    def nearest(self, point: Array) -> list[arb]:
+        """A point of the set next to another one, in what its `segments` span."""
+        raise Unchecked(f"the checker cannot tell who is in a {self.source.kind} without an interior")
+
+    @property
+    def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
+        """Of a set without an interior, or none beside its length, vectors ``v (d,)`` along which its points differ,
+        and numbers ``c`` such that its width along any ``a`` is at least ``c |a'v|``; ``None`` of others. They span
+        what a part of the set is in, next to all of it."""
+        return None
 
     @abstractmethod
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:

@@ -284,6 +284,12 @@ class Product(ConvexSet):
         return "product of " + " and ".join(part.kind for part in self.parts)
 
     @property
+    def span(self) -> Array:
+        from scipy.linalg import block_diag
+
+        return np.asarray(block_diag(*(part.span for part in self.parts)))
+
+    @property
     def is_symmetric(self) -> bool:
         return all(part.is_symmetric for part in self.parts)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.brief import noun
 from sparserob_core.shapes import sealed
-from sparserob_core.sip.convex_set import Array, ConvexSet, chords, continued_by_signs
+from sparserob_core.sip.convex_set import CLOSED, Array, ConvexSet, chords, continued_by_signs
 
 MOST_SIDES = 500  # pairs of half-spaces that are listed; beyond, the set is left to its support function
 ROUNDED = 1e-14  # of what is added up along a generator
@@ -25,7 +25,7 @@ class Zonotope(ConvexSet):
     """``{centre + sum_j s_j generators_j : |s_j| <= 1}``, ``centre (d,)``, ``generators (q, d)``.
 
     Support function ``c'centre + sum_j |c'generators_j|``. Without an interior where the generators do not span the
-    space: such a set can be a disturbance's, but not one that states must stay in.
+    space: it then has two opposite sides across every direction in which it does not reach.
     """
 
     centre: Array
@@ -86,17 +86,32 @@ class Zonotope(ConvexSet):
 
     @cached_property
     def _sides(self) -> tuple[Array, Array] | None:
-        """Every facet is spanned by ``d - 1`` generators; ``None`` where these are too many, or there is no
-        interior."""
+        """Every facet is spanned by as many generators as their span has dimensions, less one; ``None`` where these are
+        too many. Of a set without an interior the sides across its span are apart by rounding, so that its points are
+        within them."""
         d, sizes = self.dimension, np.linalg.norm(self.generators, axis=1)
         generators = self.generators[sizes > 0] / sizes[sizes > 0, None]
-        few = comb(len(generators), d - 1) <= MOST_SIDES
-        if not few or not len(generators) or np.linalg.matrix_rank(generators, tol=PARALLEL) < d:
+        _, values, turned = np.linalg.svd(generators, full_matrices=True)
+        rank = int((values > PARALLEL).sum())
+        if comb(len(generators), max(rank - 1, 0)) > MOST_SIDES:
             return None
+        turned = np.where(np.abs(turned) > ROUNDED, turned, 0.0) if rank < d else np.eye(d)
+        within = [normal @ turned[:rank] for normal in self._across(generators @ turned[:rank].T, rank)] if rank else []
+        H = np.vstack([*within, turned[rank:]])
+        H, both, size = (
+            np.vstack([H, -H]),
+            np.tile(self.support(H) + self.support(-H), 2),
+            np.abs(self.generators).sum(axis=0),
+        )
+        room = np.where(both > CLOSED * (np.abs(H) @ size), 0.0, ROUNDED)
+        return H, self.support(H) + room * (np.abs(H) @ (np.abs(self.centre) + size))
+
+    @staticmethod
+    def _across(generators: Array, d: int) -> list[Array]:
+        """A normal of every pair of facets, of generators of length 1 that span all ``d`` dimensions."""
         normals = []
         for chosen in combinations(generators, d - 1):
             _, values, rows = np.linalg.svd(np.array(chosen).reshape(d - 1, d))
             if d == 1 or values.min() > PARALLEL:
                 normals.append(rows[-1])
-        H = np.vstack([normals, -np.array(normals)])
-        return H, self.support(H)
+        return normals

@@ -30,7 +30,7 @@ from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import CLOSED, Array, Box, ConvexSet
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import Formulation
 
@@ -43,7 +43,8 @@ FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: i
 class Seen:
     """What a control sees and answers, in one set of units: the coordinates of its ``answers``; the ``pieces`` on which
     measurable disturbances are the deviations, and the ``observer`` of outputs, where there are such; the terminal
-    equalities, ``fixed``, as rows ``H x(T) <= h``, the second half of them the opposites of the first.
+    equalities, ``fixed``, as rows ``H x(T) <= h``, the second half of them the opposites of the first. ``still (d,)``:
+    which entries of the initial state deviate by no more than doubles resolve of it.
 
     In own units ``deviations (Q,)``, what one of each is in the user's, and ``steps (r,)``, what the rows of the
     control's steps are divided by.
@@ -53,6 +54,7 @@ class Seen:
     pieces: MeasurablePieces | None
     observer: Observer | None
     fixed: tuple[Array, Array]
+    still: np.ndarray
     deviations: Array | None = None
     steps: Array | None = None
 
@@ -125,7 +127,13 @@ class Answering(Acting):
         nominal, first = functionals.variables, functionals.variables + gains.variables
         size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
         loop = ClosedLoop(
-            functionals, gains, _spread(posed, seen.pieces), size, seen.pieces, seen.observer, anew=_begins_anew(posed)
+            functionals,
+            gains,
+            _spread(posed, seen.pieces, seen.still),
+            size,
+            seen.pieces,
+            seen.observer,
+            anew=_begins_anew(posed),
         )
         system, horizon = functionals.response.system, problem.horizon
         families = [of_state(constraint, loop).family() for constraint in posed.constraints]
@@ -194,6 +202,7 @@ def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units:
         pieces=None if pieces is None else pieces.in_units_of(posed.functionals, units.states, units.disturbances),
         observer=None if observer is None else observer.in_units(units.states, outputs),
         fixed=_equal(*fixed(posed.problem)),
+        still=scaled.still,
     )
     return Answering(policy, mask, policy.charge, seen, (own, scaled))
 
@@ -203,7 +212,11 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
     outputs is in these."""
     problem, disturbance, begins = own.problem, own.functionals.disturbance, own.problem.initial_set is not None
     pieces = measurable_pieces(own.functionals)
-    spread = _spread(own, pieces)
+    still = np.zeros(problem.system.states, dtype=bool)
+    if problem.initial_set is not None:
+        axes = np.eye(still.size)
+        still = problem.initial_set.support(axes) + problem.initial_set.support(-axes) <= CLOSED
+    spread = _spread(own, pieces, still)
     blocks = 0 if disturbance is None else disturbance.block_count
     deviations = np.tile(units.disturbances[: problem.system.disturbances], blocks)
     deviations = deviations if pieces is None else np.ones(pieces.size)
@@ -216,11 +229,11 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
         deviations = np.append(deviations, np.tile(outputs, own.control.pieces if observer.noisy else 0))
     anew = _begins_anew(own)
     deviations = np.concatenate([deviations, begun, *[begun] * anew])
-    seen = innovations_of(seen, begun.size, observer, anew) * (spread.chords > 0.0)  # else not answered
+    seen = spread.within(innovations_of(seen, begun.size, observer, anew))  # else not answered
     coordinates, (H, h) = answers(seen, mask, problem.system.controls), fixed(problem)
     small = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
     ends = _equal(H / small[:, None], h / small)
-    return Seen(coordinates, pieces, observer, ends, deviations, _step_units(problem)), outputs
+    return Seen(coordinates, pieces, observer, ends, still, deviations, _step_units(problem)), outputs
 
 
 def _equal(H: Array, h: Array) -> tuple[Array, Array]:
@@ -239,9 +252,6 @@ def refuse(
     curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     bound, measurable = problem.disturbance, classes == {"measurable"}
-    slanted = [
-        one.kind for one in (None if measurable else bound, problem.initial_set) if one is not None and _is_slanted(one)
-    ]
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
@@ -258,9 +268,6 @@ def refuse(
         f"set with flat sides for states and controls under measurable disturbances, which the "
         f"{' and the '.join(curved)} has not": measurable and bool(curved),
         "cost other than worst under measurable disturbances": measurable and cost == "worst",
-        f"set of disturbances and of initial states with an interior, or of axes that are points, which the"
-        f" {' and the '.join(slanted)} has not: a flat set is a box of its own coordinates, whose directions are the"
-        " columns of E": bool(slanted),
         "disturbance that takes any value on each of its pieces": bool(classes)
         and not measurable
         and not disturbance.is_complete,
@@ -284,13 +291,6 @@ def refuse(
             raise InputError(f"feedback needs a {wanted}", path="policy.name")
 
 
-def _is_slanted(convex: ConvexSet) -> bool:
-    """Whether a set has no length along an axis through its middle, though it deviates along it: then no gain on that
-    entry of a deviation is bounded."""
-    spread = Spread(((1, convex),))
-    return bool(((spread.chords <= 0.0) & (spread.radii > 0.0)).any())
-
-
 def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
     """The same coordinates of gains in the user's units, in which one of what is ``measured (d,)`` and of the
     ``deviations (Q,)`` is that; powers of two change no number but its exponent."""
@@ -302,14 +302,24 @@ def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
     return replace(own, effect=effect, gain=gain)
 
 
-def _spread(posed: Posed, acting: MeasurablePieces | None) -> Spread:
-    """The deviations of a problem's disturbance and of its initial state."""
+def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray) -> Spread:
+    """The deviations of a problem's disturbance and of its initial state, of which some entries are ``still (d,)``."""
     problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _begins_anew(posed)
+    initial = problem.initial_set if problem.initial_set is None else _held(problem.initial_set, still)
     if acting is not None:
-        return Spread((*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets), MISSED)
+        return Spread((*acting.sets, *deviations_of(None, 0, initial, periods=periods).sets), MISSED)
     blocks = 0 if disturbance is None else disturbance.block_count
     noise = None if problem.measurements is None else problem.measurements.noise
-    return deviations_of(problem.disturbance, blocks, problem.initial_set, noise, posed.control.pieces, periods)
+    return deviations_of(problem.disturbance, blocks, initial, noise, posed.control.pieces, periods)
+
+
+def _held(initial: ConvexSet, still: np.ndarray) -> ConvexSet:
+    """A set of initial states with some entries at their middle: gains on what they deviate by would be without
+    measure, and what they do is less than a claim excuses."""
+    if not still.any() or not (still.all() or initial.is_box):
+        return initial
+    box, middle = initial.bounding_box(), initial.middle()
+    return Box(np.where(still, middle, box.lower), np.where(still, middle, box.upper))
 
 
 def _begins_anew(posed: Posed) -> bool:

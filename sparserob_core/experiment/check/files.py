@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.control.sets.sets import ConvexSet
     from sparserob_core.experiment.config.load import Loaded
+    from sparserob_core.sip.convex_set import Array
 
 FIGURES = 1e-12  # how closely figures that were computed anew must agree
 CLOSE = 1e-9  # the same for what was rounded on the way: the largest cost, points that were drawn into their sets
@@ -302,10 +303,22 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
         return [f"worst: {error}"]
 
 
+def _outside(bound: ConvexSet, begun: Array, centre: Array) -> float:
+    """How far an initial state that is written is outside of a set of deviations from a centre, in its own unit; not
+    what was rounded where the deviation was added to the centre."""
+    from sparserob_core.checker.arithmetic.balls import balls
+
+    shape, deviation = known(bound), begun - centre
+    rounded = np.finfo(float).eps * (np.abs(begun) + np.abs(centre))
+    if shape.facets is not None:
+        return shape.excess(balls(deviation), lambda c: balls([-float(np.abs(c) @ rounded)])[0])[0]
+    off = np.maximum(np.abs(deviation - shape.centre) - rounded, 0.0)
+    return shape.excess(balls(shape.centre + np.copysign(off, deviation - shape.centre)))[0]
+
+
 def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     """Whether the worst violation is what the worst uncertainty causes, and is reached from the initial state that is
     named where there are several."""
-    from sparserob_core.checker.arithmetic.balls import balls
     from sparserob_core.checker.claims.case import numbers
     from sparserob_core.checker.claims.replay import exceeded
 
@@ -315,7 +328,7 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     if case.problem.initial_set is not None and not case.answering:
         begun = numbers(_whole(case, said.get("initial_state")), "initial_state")
         centre = np.asarray(case.problem.initial_state)
-        if begun.shape != centre.shape or known(case.problem.initial_set).excess(balls(begun - centre))[0] > CLOSE:
+        if begun.shape != centre.shape or _outside(case.problem.initial_set, begun, centre) > CLOSE:
             return [f"worst: {begun.tolist()} is no initial state"]
         found.append((f" from {begun.tolist()}", *exceeded(case, said, begun)))
     elif "initial_state" in said:

@@ -273,7 +273,9 @@ def test_no_deviation_comes_beyond_the_chords_of_a_cell_and_what_they_may_miss(n
 def shown(loop, radius, z, start, stop, piece=0):
     """By how much of its unit a disc is left on a cell of times in one direction, as it is proven."""
     tube = LoopTube(loop, np.eye(2), np.zeros((2, 0)))
-    sides = Sides.cell(Curved(known(Ellipsoid(np.zeros(2), radius**2 * np.eye(2))), np.eye(2), np.zeros(2)), z, z)
+    sides = Sides.cell(
+        Curved(known(Ellipsoid(np.zeros(2), radius**2 * np.eye(2))), np.eye(2), lambda c, width: 0.0), z, z
+    )
     return prove(lambda _: tube, Parameters(None), [(((), ()), sides, [(piece, start, stop)])], Clock()).share
 
 
@@ -346,7 +348,7 @@ def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_z
                 reached |= more
             seen[list(reached), place] = True
         flow = SimpleNamespace(links={"A": (arb_mat(A.tolist()),), "E": (arb_mat(E.tolist()),)})
-        found = VaryingLoop.pushed(SimpleNamespace(_flow=flow), entries)
+        found = VaryingLoop.pushed(SimpleNamespace(_flow=flow), np.eye(mw, dtype=int)[entries].tolist())
         assert found.pattern.tolist() == seen.tolist()
         assert (found.states, found.entries) == (seen.any(axis=1).sum(), seen.any(axis=0).sum())
 

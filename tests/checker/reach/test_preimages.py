@@ -43,7 +43,7 @@ def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> Seen:
         changes[:-1],
         Box(-np.ones(mw), np.ones(mw)),
     )
-    pushed = Pushed.of([(loop.parts["A"], loop.parts["E"])], range(mw))
+    pushed = Pushed.of([(loop.parts["A"], loop.parts["E"])], np.eye(mw, dtype=int).tolist())
     blocks = sorted({block for seen in loop.seen for block in seen})
     table = np.empty((3 * d, len(blocks) * mw), dtype=object)
     table[:] = arb(0)
@@ -150,11 +150,11 @@ def test_what_systems_that_take_turns_bring_to_a_state_counts_wherever_any_of_th
     """``w`` enters the first state; one system leads it to the second one, another from there to the third."""
     entry = arb_mat([[1], [0], [0]])
     lead = [arb_mat([[0, 0, 0], [1, 0, 0], [0, 0, 0]]), arb_mat([[0, 0, 0], [0, 0, 0], [0, 1, 0]])]
-    alone = [Pushed.of([(A, entry)], [0]) for A in lead]
+    alone = [Pushed.of([(A, entry)], [[1]]) for A in lead]
     assert [one.states for one in alone] == [2, 1] and not alone[0].pattern[2, 0]
-    together = Pushed.of([(A, entry) for A in lead], [0])
+    together = Pushed.of([(A, entry) for A in lead], [[1]])
     assert together.states == 3 and together.entries == 1 and together.pattern.all()
-    elsewhere = Pushed.of([(lead[0], entry), (lead[0], arb_mat([[0], [0], [1]]))], [0])
+    elsewhere = Pushed.of([(lead[0], entry), (lead[0], arb_mat([[0], [0], [1]]))], [[1]])
     assert elsewhere.states == 3 and elsewhere.entries == 1
 
 

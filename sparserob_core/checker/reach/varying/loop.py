@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -58,10 +59,10 @@ class VaryingLoop(ClosedLoop):
         Phi, _, Delta = self._flow.over(self.grid[piece], self.grid[piece + 1])
         return Phi, Delta
 
-    def pushed(self, entries: Sequence[int]) -> Pushed:
+    def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
         """As that of `ClosedLoop`, from which numbers are other than 0 at any time alone."""
         A, E = (np.array(self._flow.links[name][0].tolist(), dtype=float) != 0.0 for name in ("A", "E"))
-        pattern = E[:, list(entries)]
+        pattern = E.astype(int) @ np.array([[bool(v) for v in vector] for vector in vectors]).T > 0
         for _ in range(len(A) - 1):
             pattern = pattern | (A.astype(int) @ pattern.astype(int) > 0)
         return Pushed(pattern, int(pattern.any(axis=1).sum()), int(pattern.any(axis=0).sum()))
