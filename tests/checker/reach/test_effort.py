@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from flint import arb, ctx
 
+from sparserob_core.checker.cost import effort
 from sparserob_core.checker.cost.effort import _slope, at_most
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
-from sparserob_core.checker.reach import effort
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.sets import Box, NormBall
 
