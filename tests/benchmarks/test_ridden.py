@@ -22,7 +22,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.sip import method
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.deadline import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
 from tests.known_answers.test_walls import heating

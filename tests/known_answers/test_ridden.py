@@ -11,7 +11,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.sip import method
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.deadline import Deadline
 from tests.support.draws import taken
 from tests.support.ridden import unseen
 

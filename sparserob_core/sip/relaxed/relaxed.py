@@ -15,6 +15,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.convexity import ControlImage, Regulariser, require_convex
+from sparserob_core.sip.deadline import Deadline
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.curved import curved_bound, least_curvature
@@ -22,7 +23,6 @@ from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
 from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import SMALL_COST
 from sparserob_core.sip.solver import ROUNDING, Asked, Solver
@@ -370,7 +370,8 @@ class RelaxedProgram:
         self, finite: FiniteProgram, guess: FiniteSolution | None = None, small: float = np.inf
     ) -> FiniteSolution:
         """The checked solution of a finite program by the solver, whose answer is counted; see `solve_finite`."""
-        solution = solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
+        counted = self.counted.until(self.deadline)
+        solution = solve_finite(finite, counted, tolerance=self.tolerance, guess=guess, small=small)
         self.count(solution.by)
         if solution.unanswered:
             self.counted.failures.add(RELAXED, solution.unanswered, solution.by)

@@ -14,7 +14,8 @@ import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble, tools_of
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.sip import method
-from sparserob_core.sip.method import Deadline, OutOfTime, Tools
+from sparserob_core.sip.deadline import Deadline, OutOfTime
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods import driver, exchange
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.methods.exchange import Exchange
