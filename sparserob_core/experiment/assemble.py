@@ -17,7 +17,7 @@ from sparserob_core.errors import InputError, TimeLimitError
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.plugins.guards import guarded
 from sparserob_core.sip.convexity import Regulariser
-from sparserob_core.sip.deadline import Deadline, OutOfTime
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.solver import AUTO, Auto, Solver, named

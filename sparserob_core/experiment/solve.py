@@ -18,8 +18,8 @@ from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.guards import guarded, origin_of
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.deadline import as_seconds
 from sparserob_core.sip.events import ignore
+from sparserob_core.sip.limits.deadline import as_seconds
 from sparserob_core.sip.maximiser import Maximiser, Report
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from pydantic import Field, model_validator
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convexity import Regulariser
-from sparserob_core.sip.deadline import Deadline
 from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result

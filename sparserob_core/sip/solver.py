@@ -14,10 +14,10 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
-from sparserob_core.sip.apart import POSSIBLE, call_apart
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.deadline import Deadline
 from sparserob_core.sip.finite import CLOSED_FORM, DUAL_NEWTON, HIGHS, SOLVER
+from sparserob_core.sip.limits.apart import POSSIBLE, call_apart
+from sparserob_core.sip.limits.deadline import Deadline
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array

@@ -21,9 +21,9 @@ from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
 from sparserob_core.errors import SparseRobError
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.deadline import Deadline, OutOfTime
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.own_units import answered_in_own_units

@@ -25,8 +25,8 @@ from sparserob_core.control.transcription.transcribe import prepare, windows_of
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
-from sparserob_core.sip.deadline import Deadline
 from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import ConstraintFamily, Enclosure
 from sparserob_core.sip.proof.branch_and_bound import Supremum, supremum
 

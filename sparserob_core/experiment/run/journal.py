@@ -22,8 +22,8 @@ from sparserob_core.experiment.directory.record import arrays_of, control_of, su
 from sparserob_core.experiment.directory.rounds import round_arrays
 from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Observer, RoundFinished, StudyProgress
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.deadline import Deadline
 from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import AUTO, Unanswered, whole_name
 
@@ -150,7 +150,7 @@ class Journal(Observer):
             write.write_json("certificate.json", proof)
         if result.trace is not None:
             write.write_arrays("evaluations.npz", result.trace.arrays())
-        drawn = (STOPPED,) if figures else ()
+        drawn: tuple[str, ...] = (STOPPED,) if figures else ()
         if not result.stopped:  # what is drawn may take longer than what was solved
             notify(StudyProgress(text="figures: the worst cases, and what there is to draw", phase=True))
             drawn = time_left.attempt(lambda: self._illustrated(result, control, figures, notify), lambda: drawn)

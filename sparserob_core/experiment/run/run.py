@@ -22,7 +22,7 @@ from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.run.outcome import HEADING, Outcome, SolvedProblem, concluded
 from sparserob_core.experiment.terminal.printing import printable
-from sparserob_core.sip.deadline import Deadline, OutOfTime
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.method import ExecutorFactory, Method, Tools, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.proof.branch_and_bound import more

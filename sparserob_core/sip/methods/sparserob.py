@@ -21,9 +21,9 @@ from pydantic import Field, field_validator
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.deadline import LAST, Deadline, OutOfTime
 from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forwarded, frozen, ignore
 from sparserob_core.sip.evidence import Dual
+from sparserob_core.sip.limits.deadline import LAST, Deadline, OutOfTime
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.program import SemiInfiniteProgram

@@ -13,9 +13,9 @@ import numpy as np
 from sparserob_core.brief import brief
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.deadline import Deadline, OutOfTime
 from sparserob_core.sip.events import Notify, ProofProgress, ignore
 from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 
 CELLS = 400_000  # cells examined per family before the proof is given up

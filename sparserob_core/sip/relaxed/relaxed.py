@@ -15,7 +15,6 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.convexity import ControlImage, Regulariser, require_convex
-from sparserob_core.sip.deadline import Deadline
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.curved import curved_bound, least_curvature
@@ -23,6 +22,7 @@ from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
 from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import SMALL_COST
 from sparserob_core.sip.solver import ROUNDING, Asked, Solver

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.deadline import Deadline, OutOfTime
 from sparserob_core.sip.evidence import Cut, Dual
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.program import Enclosure
 from sparserob_core.sip.proof.branch_and_bound import prove_family
 from sparserob_core.sip.result import relative_gap

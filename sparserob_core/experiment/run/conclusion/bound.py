@@ -12,9 +12,9 @@ from sparserob_core.experiment.assemble import ControlExperiment, counting
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import certificate
 from sparserob_core.experiment.run.conclusion.final_states import with_final_states
-from sparserob_core.sip.deadline import Deadline
 from sparserob_core.sip.evidence import NO_BOUND
 from sparserob_core.sip.inner.solve import ADVICE
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result

@@ -15,7 +15,7 @@ from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import causal_data
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.deadline import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.result import Result
 

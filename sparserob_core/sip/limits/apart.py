@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import NoReturn, TypeVar
 
 from sparserob_core.errors import SolverError, named
-from sparserob_core.sip.deadline import Deadline, OutOfTime
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 
 Value = TypeVar("Value")
 
