@@ -3,6 +3,7 @@ that keeps the interpreter for itself hears of no signal, and one that aborts ta
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import pickle
 import select
@@ -54,6 +55,7 @@ def _answer(call: Callable[[], object], write: int) -> NoReturn:
     """Make the call in the copy, write the answer, and end."""
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever pressed a key is heard by the process itself
+        faulthandler.disable()
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)

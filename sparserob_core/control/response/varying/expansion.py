@@ -329,22 +329,26 @@ class Expansion:
         A, F = (one.reshape(count, DEGREE + 1, -1, own, one.shape[3]) for one in (A, F))
         size = A.shape[2]
         left, right, target = NUMBERS if self.spread is None else self.spread.space.products
-        factors = [(left[right == b], target[right == b]) for b in range(size)]
+        # the latest term comes first, so that those that meet one another lie side by side
+        every = np.zeros((count, size, own, terms + 2, own))
+        every[:, 0, :, terms + 1] = np.eye(own)
 
-        def times(series: Sequence[Array], n: int, other: Array, there: Sequence[tuple[int, int]]) -> Array:
-            found = np.zeros((count, size, own, other.shape[4]))
-            for k, b in there:
-                if k <= n:
-                    mine, place = factors[b]
-                    found[:, place] += series[n - k][:, mine] @ other[:, k, b, None]
+        def factors(other: Array) -> list[tuple[np.ndarray, np.ndarray, Array]]:
+            there = np.flatnonzero(other.any(axis=(0, 1, 3, 4)))
+            table = other.swapaxes(1, 2).reshape(count, size, 1, (DEGREE + 1) * own, -1)
+            return [(left[right == b], target[right == b], table[:, b]) for b in there]
+
+        def times(n: int, others: list[tuple[np.ndarray, np.ndarray, Array]], columns: int) -> Array:
+            last, found = min(n, DEGREE) + 1, np.zeros((count, size, own, columns))
+            earlier = every[:, :, :, terms + 1 - n : terms + 1 - n + last].reshape(count, size, own, last * own)
+            for mine, place, other in others:
+                found[:, place] += earlier[:, mine] @ other[:, :, : last * own]
             return found
 
-        of_A, of_F = (list(zip(*np.nonzero(one.any(axis=(0, 3, 4))), strict=True)) for one in (A, F))
-        back, found = [np.zeros((count, size, own, own))], []
-        back[0][:, 0] = np.eye(own)
+        of_A, of_F, columns, found = factors(A), factors(F), F.shape[4], []
         for n in range(terms + 1):
-            found.append(times(back, n, F, of_F).reshape(count, size * own, -1))
-            back.append(times(back, n, A, of_A) / (n + 1))
+            found.append(times(n, of_F, columns).reshape(count, size * own, columns))
+            every[:, :, :, terms - n] = times(n, of_A, own) / (n + 1)
         return np.stack(found, axis=1)
 
     def _recentred(self, segments: np.ndarray, times: Array, steps: Array, length: Array) -> tuple[Array, Array]:
