@@ -512,10 +512,14 @@ class Case:
         """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``: 0 without one.
 
         They are seen where every piece of the control begins to act, of ``rows (k, d)`` and ``gains (k, m)``, and never
-        too large.
+        too large. Under feedback, rows of the state alone count what deviations do too.
         """
         if self.certificate.get("decision") is None:
             return np.zeros(len(rows))
+        if self.looped and not gains.any():
+            from sparserob_core.checker.claims.answers import answers_of
+
+            return answers_of(self).sizes(rows)
         d = self.problem.system.states
         z = np.array([[(float(x.mid()), float(x.rad())) for x in one.entries()] for one in self.nominal_states])
         seen = np.delete(z, d, axis=1)  # without the 1

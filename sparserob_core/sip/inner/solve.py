@@ -51,11 +51,6 @@ DIRECTIONS, PATIENCE = 60, 12
 # From a gap of this share of the value, and again from such a share of that gap, Newton's method is tried for so many
 # steps, on blocks whose norm is more than this share of the largest.
 NEARLY, NEWTON, SMALLEST = 0.03, 6, 1e-7
-# Numbers in the rows of a linear program, up to which a vertex is sought first where there are more rows than
-# variables: nearly parallel rows along a wall, and hardly anything that is feasible, cost an interior point method its
-# digits, and seconds for what takes the simplex method some milliseconds. With a tenth of it, 50 variables and 200 rows
-# take these seconds; ten times as many take the simplex method as long as the other.
-CROWDED_ROWS = 100_000
 # Steps of the simplex method for each row and variable, at most, where another method lacks digits: an ordinary program
 # takes one to three. With a third of them some are given up; ten times as many take longer than what they replace.
 TURNS = 10
@@ -161,14 +156,7 @@ def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
     answer = None if easier is None else _through(case, easier, guess)
     if answer is None and program.blocks is not None:
         return _by_directions(case, program.blocks, guess)
-    return answer or _crowded(case) or _tried(case)
-
-
-def _crowded(case: _Case) -> FiniteSolution | None:
-    """A vertex of a linear program with more rows than variables, if it is believed."""
-    program = case.program
-    few = program.n < program.h.size and program.n * program.h.size <= CROWDED_ROWS
-    return _at_a_vertex(case) if few else None
+    return _tried(case) if answer is None else answer
 
 
 def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:

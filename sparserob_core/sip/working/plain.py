@@ -109,9 +109,6 @@ class PlainRows(Working):
         solution = ledger.relaxed.solve(self.rows, epsilon, self.margin, self.guess)
         while solution.status == "infeasible" and self.thin():
             solution = ledger.relaxed.solve(self.rows, epsilon, self.margin, None)
-        if self.exact and epsilon > 0.0 and solution.status == "failed":
-            self.epsilon = 0.0  # where hardly anything is feasible, a vertex can be found that no curvature leads to
-            return self._solve(ledger, 0.0)
         if usable(solution):
             self.guess = solution
             ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))

@@ -55,7 +55,8 @@ def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) 
     Running bounds of rounding are cheap, but where multipliers are large, as those of nearly parallel rows are, they
     may be all that keeps the gap open. There the bound is derived from the same multipliers in ball arithmetic, which
     leaves out no rounding, in the rows neither. So it is where the worst deviations of a policy are found by support
-    points of sets that are no boxes: what they are off by is in no running bound.
+    points of sets that are no boxes: what they are off by is in no running bound. And beside errors of execution, whose
+    integrals a running bound estimates by shares.
     """
     tolerance = experiment.gap_tolerance
     prices = None if any(counting(experiment.loaded)) else experiment.program.finite.weights
@@ -63,7 +64,7 @@ def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) 
     if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
         return safe
     feedback = experiment.transcription.feedback
-    exact = feedback is None or feedback.loop.spread.is_box
+    exact = experiment.problem.execution is None and (feedback is None or feedback.loop.spread.is_box)
     if exact and safe.gap <= tolerance + SMALL_GAP:
         return safe
     data = certificate(experiment, safe)
