@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip import apart
+from sparserob_core.sip.limits import apart
 from sparserob_core.sip.limits.apart import call_apart
 from sparserob_core.sip.limits.deadline import GRACE, LAST, Deadline, OutOfTime
 

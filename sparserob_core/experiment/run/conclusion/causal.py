@@ -96,7 +96,7 @@ def searched(
 
 
 def proven(
-    model: Transcription, problem: OptimalControlProblem, stated: CausalBound, deadline: Deadline
+    model: Transcription, problem: OptimalControlProblem, stated: CausalBound, deadline: Deadline | None = None
 ) -> float | None:
     """The lower bound of the cost that the multipliers prove, rounded downwards; where none is to exist, by how much
     every policy misses their sum. ``None`` where that is not positive, and where it is not derived."""
@@ -106,7 +106,14 @@ def proven(
 
     policy, none = model.answering.policy, stated.lower == np.inf
     try:
-        case = Case(problem, model.control, model.disturbance, {}, Clock(deadline.at_most(SECONDS)), policy=policy)
+        case = Case(
+            problem,
+            model.control,
+            model.disturbance,
+            {},
+            Clock((deadline or Deadline()).at_most(SECONDS)),
+            policy=policy,
+        )
         derived = derived_causal_bound(case, finite(causal_data(stated)), priced=not none)
     except (Broken, Unchecked, ZeroDivisionError):
         return None
