@@ -8,7 +8,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from types import FrameType
 from typing import TypeVar, final
@@ -187,11 +187,11 @@ class _Call(_Bell):
                 left = self.due - time.monotonic()
                 if left <= 0.0:
                     self.rung, self.due = True, time.monotonic() + LAST
-                    self._raise(ctypes.py_object(OutOfTime))
+                    self._raise(OutOfTime)
                 self._changed.wait(min(max(left, 0.0), threading.TIMEOUT_MAX))
 
-    def _raise(self, error: object) -> None:
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread), error)
+    def _raise(self, error: type[OutOfTime]) -> None:
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread), ctypes.py_object(error))
 
     def _set(self) -> None:
         with self._changed:
@@ -201,7 +201,16 @@ class _Call(_Bell):
         with self._changed:
             self._ended = True
             self._changed.notify()
-            self._raise(None)
+        if self.rung:
+            self._wait_for_the_last()
+
+    def _wait_for_the_last(self) -> None:
+        """Let what was set and is not raised yet be raised here, or another in its place. It could be withdrawn, but
+        the interpreter (3.11) would look for it ever after, at every call, and be slow."""
+        with suppress(OutOfTime):
+            self._raise(OutOfTime)
+            while True:
+                time.sleep(0)
 
 
 _bells: dict[int, _Bell] = {}
@@ -227,8 +236,10 @@ def _hung(due: float, deadline: Deadline) -> Iterator[_Bell]:
             raise bell.error() from fault
         raise
     finally:
-        bell.take_down()
-        del _bells[threading.get_ident()]
+        while threading.get_ident() in _bells:
+            with suppress(OutOfTime):  # it may ring for the last time just now
+                bell.take_down()
+                del _bells[threading.get_ident()]
 
 
 def as_seconds(seconds: object) -> float | None:

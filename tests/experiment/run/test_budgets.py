@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -169,6 +171,32 @@ def test_a_deadline_is_enforced_in_every_thread_and_again_where_it_was_not_heede
     assert len(rung) == 2
     assert rung[0] >= GRACE
     assert [str(error) for error in errors] == ["the limit of 0.05 s is reached"]
+
+
+@pytest.mark.parametrize("seconds", [30.0, 0.01])
+def test_a_limit_in_a_thread_leaves_the_interpreter_as_it_was(seconds: float) -> None:
+    program = f"""
+import sys, threading, time
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
+
+def work():
+    try:
+        with Deadline({seconds}).enforced():
+            time.sleep(0.01)
+            while {seconds} < 1.0:
+                pass
+    except OutOfTime:
+        pass
+
+thread = threading.Thread(target=work)
+thread.start()
+thread.join()
+sys.setprofile(lambda frame, event, what: None)  # 3.11 hangs here where an exception was withdrawn
+(lambda: 0)()
+sys.setprofile(None)
+work()  # in the main thread, by the alarm
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
 def test_within_another_deadline_the_inner_one_counts_and_the_outer_one_goes_on() -> None:
