@@ -67,6 +67,11 @@ class Qpsolvers(sr.Solver, sr.Options):
         """The solver that was chosen."""
         return self.solver
 
+    @property
+    def aborts(self) -> bool:  # type: ignore[override]
+        """Whether the solver that was chosen does."""
+        return self._chosen.aborts
+
     @field_validator("solver")
     @classmethod
     def _is_there(cls, name: str) -> str:
@@ -230,7 +235,7 @@ def _made(name: str) -> type[Through]:
     made: Any = create_model(
         name, __base__=parent, __module__=__name__, __doc__=f"{name}, through qpsolvers.", **fields
     )
-    made.called = name
+    made.called, made.aborts = name, known.aborts
     kind: type[Through] = made
     return kind
 

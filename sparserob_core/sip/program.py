@@ -142,8 +142,8 @@ class ConstraintFamily:
     in the numbers of the rows as they are stated: rows of 1e-10 are to be divided by that. The rest is optional, and
     used when offered:
 
-    ``scale(x)``      the size of the smallest row at a decision, in the numbers of the rows: where it is below 1, a
-        proof may excuse only `TOLERANCE` of it (`allowed`);
+    ``scale(x)``      of what a proof may excuse `TOLERANCE` at a decision, in the numbers of the rows (`allowed`): 1
+        unless a row is smaller than that, or is an equality in a finer unit;
 
     ``chosen(indices (k, d), rows (k,))``  one row of each index, ``(G (k, n), h (k,))``, where all would take longer;
     ``worst(x)``      exact separation (a `Separation`);
@@ -285,7 +285,7 @@ class ConstraintFamily:
 
     def allowed(self, x: Array) -> float:
         """Return the violation that a proof at the decision ``x (n,)`` may count as none."""
-        return TOLERANCE if self.scale is None else TOLERANCE * min(1.0, self.scale(x))
+        return TOLERANCE if self.scale is None else TOLERANCE * self.scale(x)
 
     def measure(self, row: int | None = None) -> str:
         """What a violation of a row is measured in, or, without one, that of any of them, such as ``m or m/s``; empty

@@ -15,10 +15,11 @@ from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.experiment.terminal.table import result_rows
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
 from tests.support.amplified import Amplified, drawn, exceeded
+from tests.support.draws import taken
 
 PENDULUM = np.array([[0.0, 1.0], [9.0, 0.0]])
 CHEAP = (4, 10, 14, 18, 31, 32, 36, 38, 107)  # of less than a second each; the checker could not tell the last one
-COUNT = 200  # the time of which is 4 minutes
+COUNT = taken(200)
 
 
 def amplified(horizon: float, policy: str, **more: Any) -> Amplified:
@@ -128,7 +129,7 @@ def test_equalities_of_an_open_loop_rest_on_proven_errors(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "number", [pytest.param(n, marks=() if n in CHEAP else pytest.mark.slow) for n in range(COUNT)]
+    "number", [pytest.param(n, marks=() if n in CHEAP else pytest.mark.slow) for n in sorted({*CHEAP, *range(COUNT)})]
 )
 def test_no_claim_of_a_random_plant_is_wrong_by_more_than_its_excuse(number: int, tmp_path: Path) -> None:
     problem = drawn(number)

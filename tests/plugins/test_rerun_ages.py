@@ -34,7 +34,7 @@ PANELS = (
     "/physics/plots",
     "/physics/phase",
     "/landscape/map",
-    "/search/g",
+    "/search/stages",
     "/violation/plots",
     "/rounds/picture/bounds",
     "/verdict",

@@ -32,20 +32,6 @@ def read(file: Path) -> dict[str, list[Any]]:
     return found
 
 
-def properties(file: Path) -> dict[str, Any]:
-    """What a recording says of itself: the values of its properties by name."""
-    from rerun.chunk import RrdReader
-
-    found = dict[str, Any]()
-    for chunk in RrdReader(str(file)).stream():
-        if chunk.entity_path.startswith("/__properties"):
-            batch = chunk.to_record_batch()
-            for name, column in zip(batch.schema.names, batch.columns, strict=True):
-                entries = [entry for entry in column.to_pylist() if isinstance(entry, list) and entry]
-                found |= {name.rpartition(":")[2]: entry[0] for entry in entries[-1:]}
-    return found
-
-
 def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
     """Times ``(k,)`` and values ``(k, series)`` of an entity, in the order of a timeline."""
     times, values = [], []
@@ -55,21 +41,6 @@ def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
         values += [np.array(row, dtype=float) for row in batch.column("Scalars:scalars").to_pylist()]
     order = np.argsort(times, kind="stable")
     return np.array(times)[order], np.array(values)[order]
-
-
-def line_of(chunks: list[Any], trace: sr.SearchTrace) -> np.ndarray:
-    """What a line over the evaluations shows at each of them, whose corners are recorded; NaN where there is none. No
-    line goes from one search to the next."""
-    at, values = scalars(chunks, "evaluation")
-    shown = np.full(trace.value.size, np.nan)
-    for outer in np.unique(trace.outer):
-        mine = np.flatnonzero(trace.outer == outer)
-        inside = (at > mine[0]) & (at <= mine[-1] + 1) & np.isfinite(values[:, 0])
-        if inside.any():
-            shown[mine] = np.interp(mine + 1, at[inside], values[inside, 0], left=np.nan)
-        if mine[0]:
-            assert np.isnan(values[at == mine[0], 0]).any()
-    return shown
 
 
 def texts(chunks: list[Any], component: str) -> list[str]:

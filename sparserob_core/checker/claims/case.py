@@ -6,6 +6,7 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, final, get_args
 
@@ -512,10 +513,13 @@ class Case:
         """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``: 0 without one.
 
         They are seen where every piece of the control begins to act, of ``rows (k, d)`` and ``gains (k, m)``, and never
-        too large.
+        too large. Under feedback, rows of the state alone count what deviations do too.
         """
         if self.certificate.get("decision") is None:
             return np.zeros(len(rows))
+        if self.looped and not gains.any():
+            answers = import_module("sparserob_core.checker.claims.answers")  # which is about a case
+            return np.asarray(answers.answers_of(self).sizes(rows))
         d = self.problem.system.states
         z = np.array([[(float(x.mid()), float(x.rad())) for x in one.entries()] for one in self.nominal_states])
         seen = np.delete(z, d, axis=1)  # without the 1

@@ -36,8 +36,8 @@ class Source(ABC):
         units, where its own are ``units``."""
 
     def scale(self, x: Array) -> float:
-        """Return the size of the smallest row at the decision ``x (n,)``, infinite where no row is smaller than 1."""
-        return float("inf")
+        """Return the size of the smallest row at the decision ``x (n,)``, 1 where no row is smaller."""
+        return 1.0
 
     @property
     def of_state(self) -> Source | None:

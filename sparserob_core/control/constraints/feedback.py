@@ -131,7 +131,13 @@ class FeedbackConstraint(Source):
         return self.flat.normals_in(units)
 
     def scale(self, x: Array) -> float:
-        return self.flat.scale(x)
+        rows, sizes = self.flat.sized_rows
+        small = sizes < 1.0
+        if self.flat.gains is not None or not (small.any() or self.exact):
+            return self.flat.scale(x)
+        found = np.maximum(sizes, self.loop.sizes(x, rows))[small | self.exact]
+        least = float(found[found > 0.0].min(initial=np.inf))  # a row of a state that rests at 0 is met exactly
+        return least if self.exact and np.isfinite(least) else min(1.0, least)
 
     @property
     def of_state(self) -> FlatConstraint:
@@ -144,6 +150,7 @@ class FeedbackConstraint(Source):
         begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
         source = self if self.exact else self.flat
         family = indexed(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], source)
+        family = replace(family, scale=self.scale)
         return replace(family, scaled=self.scaled) if self.loop.scales else family
 
     def scaled(self, factor: float) -> ConstraintFamily:
@@ -380,7 +387,7 @@ class FeedbackControl(Source):
 
     def scale(self, x: Array) -> float:
         sizes = stated_sizes(self.H, self.h)
-        return float(sizes[(sizes > 0.0) & (sizes < 1.0)].min(initial=np.inf))
+        return float(sizes[sizes > 0.0].min(initial=1.0))
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""

@@ -162,15 +162,15 @@ class StateConstraint(Source):
         return np.maximum(sizes, self._along(x, rows))
 
     def scale(self, x: Array) -> float:
-        """The least of the `sizes` at a decision ``x (n,)``, infinite where none is below 1, whatever the decision."""
+        """The least of the `sizes` at a decision ``x (n,)``, 1 where none is below that."""
         rows, sizes = self.sized_rows
         small = sizes < 1.0
         if not small.any():
-            return np.inf
+            return 1.0
         key = x.tobytes()
         if key not in self._scales:
             self._scales.clear()
-            self._scales[key] = float(np.maximum(sizes, self._along(x, rows))[small].min())
+            self._scales[key] = float(np.maximum(sizes, self._along(x, rows))[small].min(initial=1.0))
         return self._scales[key]
 
     def _along(self, x: Array, rows: Array) -> Array:

@@ -261,6 +261,11 @@ class ClosedLoop:
     def _errors(self) -> dict[bytes, tuple[Array, Array, Array]]:
         return {}
 
+    def sizes(self, x: Array, rows: Array) -> Array:
+        """Return the largest ``|c'x|`` at the breakpoints under any deviation, ``(r,)`` of ``rows (r, d)``."""
+        along = rows @ self.path(x)[0]
+        return np.asarray(np.maximum(self.height(along), self.height(-along)).max(axis=0))
+
     def _flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
         """What the first ``durations (k,)`` of ``pieces (k,)`` of the grid make of a state, and of what drives it."""
         if self.motion is None:

@@ -159,6 +159,10 @@ class _Solver(Solver):
     def conic(self) -> bool:  # type: ignore[override]
         return self._solver.conic
 
+    @property
+    def aborts(self) -> bool:  # type: ignore[override]
+        return self._solver.aborts
+
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         claim = asked(self.origin, "solve", lambda: self._solver.solve(program, accuracy), Claim)
         if claim.status not in ("solved", "infeasible", "failed"):

@@ -19,8 +19,9 @@ from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.experiment.solve import PIECES, Choice, careful, component, dictionary, indicators
 from sparserob_core.sip.convexity import Regulariser
 from sparserob_core.sip.events import Event, ignore
+from sparserob_core.sip.limits.deadline import Deadline, as_seconds
 from sparserob_core.sip.maximiser import Maximiser
-from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Deadline, Method, Tools, as_seconds, require_suited
+from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Method, Tools, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import remarked as remarked_program

@@ -15,7 +15,7 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ProofProgress, ignore
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 
 CELLS = 400_000  # cells examined per family before the proof is given up
@@ -58,8 +58,12 @@ def prove(
     budgets = {
         family.name: cells if isinstance(cells, int) else cells.get(family.name, 0) for family in program.families
     }
-    proven = (family.reduced or family for family in program.families)
-    found = [(one, prove_family(one, x, notify, budgets[one.name], time_left)) for one in proven]
+    proven = [family.reduced or family for family in program.families]
+    found: list[tuple[ConstraintFamily, Proof]] = []
+    try:
+        found.extend((one, _prove(one, x, notify, budgets[one.name], time_left)) for one in proven)
+    except OutOfTime as error:  # of families that are left not even one look would come to its end
+        found += [(one, _begun_only(one, error, time_left)) for one in proven[len(found) :]]
     return tuple(
         replace(
             proof,
@@ -105,20 +109,34 @@ def prove_family(
     """
     time_left = deadline or Deadline()
     try:
+        return _prove(family, x, notify, cells, time_left)
+    except OutOfTime as error:
+        return _begun_only(family, error, time_left)
+
+
+def _prove(family: ConstraintFamily, x: Array, notify: Notify, cells: int, deadline: Deadline) -> Proof:
+    """`prove_family`; raises `OutOfTime` where not even one look comes to its end by the deadline."""
+    try:
         if family.enclosure is None:
             return _by_separation(family, x)
         try:
-            return _branch_and_bound(
-                family, x, Course(family, notify, cells, time_left), NoViolation(family.allowed(x))
-            )[0]
+            course = Course(family, notify, cells, deadline)
+            return _branch_and_bound(family, x, course, NoViolation(family.allowed(x)))[0]
         except NotEnclosable as error:
-            if time_left.passed:
+            if deadline.passed:
                 return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: {error}")
             return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
+    except OutOfTime:
+        raise
     except KeyboardInterrupt as error:
-        time_left.interrupt(error)
-        reason = f"{family.name}: its proof had begun only; {more(time_left)}"
-        return Proof(family.name, "undecided", np.inf, reason=reason)
+        return _begun_only(family, error, deadline)
+
+
+def _begun_only(family: ConstraintFamily, error: KeyboardInterrupt, deadline: Deadline) -> Proof:
+    """The proof of a family that was interrupted, of which the deadline takes note."""
+    deadline.interrupt(error)
+    reason = f"{family.name}: its proof had begun only; {more(deadline)}"
+    return Proof(family.name, "undecided", np.inf, reason=reason)
 
 
 def more(deadline: Deadline) -> str:

@@ -22,7 +22,7 @@ from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
 from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import SMALL_COST
 from sparserob_core.sip.solver import ROUNDING, Asked, Solver
@@ -370,7 +370,8 @@ class RelaxedProgram:
         self, finite: FiniteProgram, guess: FiniteSolution | None = None, small: float = np.inf
     ) -> FiniteSolution:
         """The checked solution of a finite program by the solver, whose answer is counted; see `solve_finite`."""
-        solution = solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
+        counted = self.counted.until(self.deadline)
+        solution = solve_finite(finite, counted, tolerance=self.tolerance, guess=guess, small=small)
         self.count(solution.by)
         if solution.unanswered:
             self.counted.failures.add(RELAXED, solution.unanswered, solution.by)

@@ -11,7 +11,8 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import EvaluationsFinished, forwarded
-from sparserob_core.sip.method import Deadline, Tools
+from sparserob_core.sip.limits.deadline import Deadline
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 
 if TYPE_CHECKING:

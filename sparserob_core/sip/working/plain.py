@@ -15,6 +15,7 @@ from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
@@ -227,6 +228,9 @@ class PlainRows(Working):
                 continue
             looked = separate(program, other, ledger.tools, ALLOWED, number)
             beyond = [one for family, separation in looked if (one := above(family, separation))[1].size]
+            room = 0.5 * min(0.0, worst_of(found).violation)
+            if self.allowed and worst_of(looked).violation > room:
+                continue  # a proof has asked for room, which the answer leaves and this one does not
             if not beyond:
                 value = program.cost(other) if answer.epsilon == 0.0 else answer.value
                 kept = replace(answer, solution=replace(answer.solution, x=other), value=value), looked

@@ -135,7 +135,8 @@ def or_proven(ledger: Ledger, result: Result) -> Result:
     if result.status not in ("refuted", "undecided") or ledger.proven is None:
         return result
     secured, found, proofs = ledger.proven
-    return ledger.judged(secured, worst_of(found), proofs, ledger.tools.deadline.reason)
+    why = ledger.tools.deadline.reason or f"of a decision that costs less it is not proven: {result.message}"
+    return ledger.judged(secured, worst_of(found), proofs, why)
 
 
 def _secure(

@@ -234,7 +234,7 @@ def placed(term: W, where: str, setting: Setting) -> W:
     """The constraint with its ``stop`` and its reference as numbers; raises `InputError` that begins with ``where``
     for a window that is none."""
     horizon = setting.horizon
-    start, stop = float(term.start), horizon if term.stop is None else float(term.stop)
+    start, stop = float(term.start), end_of(term.stop, horizon)
     if not 0.0 <= start <= stop <= horizon:
         raise InputError(
             path=where,
@@ -254,6 +254,17 @@ def placed(term: W, where: str, setting: Setting) -> W:
             raise InputError(path=f"{where}.relative_to", expected=expected, got=got)
     placed: W = replace(cast("Any", term), **told)
     return placed
+
+
+class UntilHorizon(float):
+    """The horizon as the end of a window that was given none: where the horizon is another one, so is the end."""
+
+    __slots__ = ()
+
+
+def end_of(stop: float | None, horizon: float) -> float:
+    """The end of a window: its ``stop``, and the horizon unless that was given."""
+    return UntilHorizon(horizon) if stop is None or isinstance(stop, UntilHorizon) else float(stop)
 
 
 def columns(rows: Any, count: int) -> Array:
