@@ -345,11 +345,13 @@ class Spread:
     """The set of deviations ``w (Q,)`` from the middle ``(Q,)``: a product of ``sets``, each so many times, in order.
 
     A deviation is what a point of its set has beyond the set's ``middle``; 0 is one. ``missed``: of its size, by how
-    much what is written down of a deviation may miss it.
+    much what is written down of a deviation may miss it. ``still (Q,)``: entries that nothing answers, since they
+    deviate by no more than doubles resolve; they count like all others, but nobody names them in a proof.
     """
 
     sets: tuple[tuple[int, ConvexSet], ...]
     missed: float = 0.0
+    still: np.ndarray | None = None
 
     @cached_property
     def parts(self) -> tuple[tuple[slice, int, ConvexSet, Array], ...]:
@@ -411,13 +413,21 @@ class Spread:
 
     def within(self, a: Array) -> Array:
         """What ``a (..., Q)`` is within the span of the set, along which all deviations are; 0 on entries that do not
-        deviate."""
-        found = a * (self.chords > 0.0)
+        deviate, or are `still`."""
+        return self._projected(a) * (self.chords > 0.0) * (1.0 if self.still is None else ~self.still)
+
+    def named(self, w: Array) -> Array:
+        """Deviations ``w (..., Q)`` that a proof may name instead of others: those within the span of the set, and none
+        of what is `still`. Of sets with an interior these are they themselves."""
+        return self._projected(w) * (1.0 if self.still is None else ~self.still)
+
+    def _projected(self, a: Array) -> Array:
+        found = np.array(a)
         for (part, count, convex, _), within in zip(self.parts, self._projectors, strict=True):
             if not np.array_equal(within, np.diag(np.diag(within))):
                 blocks = a[..., part].reshape(*a.shape[:-1], count, convex.dimension)
                 found[..., part] = (blocks @ within).reshape(*a.shape[:-1], -1)
-        return np.asarray(found)
+        return found
 
     @property
     def is_box(self) -> bool:

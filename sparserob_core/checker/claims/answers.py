@@ -401,7 +401,7 @@ class Answers:
         period that an entry names, which must be in its set; none where there is one initial state."""
         from flint import arb
 
-        calm = [[arb(0) for _ in block] for block in named.z[: named.loop.begun]]
+        calm = named.loop.rests[: named.loop.begun]
         if self.case.problem.initial_set is None:
             return Named(self.case, named.loop, calm)
         point = numbers(entry.get("following"), f"{name}: following")
@@ -447,12 +447,15 @@ class Named:
 
     @property
     def innovations(self) -> list[list[arb]]:
-        """What is seen of them at every breakpoint, ``(K, p)``."""
+        """What is seen of them at every breakpoint, ``(K, p)``, beside what is seen of points of their sets next to the
+        middles: differences of points of a set without an interior are in its span, those from a middle that was
+        rounded are not. The nominal control stands for that under these points."""
         from flint import arb
 
+        z = [[x - r for x, r in zip(*pair, strict=True)] for pair in zip(self.z, self.loop.rests, strict=True)]
         return [
             [
-                sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(self.z[block])), arb(0))
+                sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), arb(0))
                 for s in range(self.loop.outputs)
             ]
             for seen in self.loop.seen

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.flow import OwnUnits, flows, held, middles, stacked
@@ -46,7 +47,7 @@ def arb_of(value: float) -> arb:
 
 
 def middle(shape: ConvexSet) -> Array:
-    """The middle ``(d,)`` of a bounded set."""
+    """The middle ``(d,)`` of a bounded set; of one without an interior floats next to it."""
     found = shape.middle()  # any point of the set would be right: what is claimed is claimed of deviations from it
     if known(shape).member(found) is None:
         raise Unchecked(f"the middle of the {shape.kind} is not shown to be in it")
@@ -117,6 +118,18 @@ class ClosedLoop:
         noise = None if self.measured is None else self.measured.noise
         held += [] if noise is None else [(noise, middle(noise))] * self.noises
         return held if self.initial is None else [*held, (self.initial, middle(self.initial))]
+
+    @cached_property
+    def rests(self) -> list[list[arb]]:
+        """Of every block of the deviations one from its middle, to a point that is in its set whatever was rounded: 0
+        where the middle is."""
+        found: dict[int, list[arb]] = {}
+        for shape, about in self.sets:
+            if id(shape) not in found:
+                point = known(shape).member(about)
+                assert point is not None
+                found[id(shape)] = [x - m for x, m in zip(point, balls(about), strict=True)]
+        return [found[id(shape)] for shape, _ in self.sets]
 
     @property
     def noises(self) -> int:

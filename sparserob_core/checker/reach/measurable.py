@@ -64,7 +64,7 @@ class Side:
                 found.append([[end if j == i else arb(0) for j in range(seen.dimension)] for end in ends])
         elif isinstance(seen, Segments):
             found = [[[arb(float(c)) - m for c, m in zip(seen.source.centre, about, strict=True)]]]
-            for segment in seen.segments:
+            for segment in seen.generators:
                 end = [arb(fmpq(x.numerator, x.denominator)) for x in segment]
                 found.append([end, [-x for x in end]])
         elif isinstance(seen, Cornered):

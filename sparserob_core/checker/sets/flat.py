@@ -148,27 +148,32 @@ class Cornered(Flat):
     @cached_property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
         """From one corner to others, which are in the set with what is between."""
-        first, *others = self.corners
-        longest = sorted(([a - b for a, b in zip(x, first, strict=True)] for x in others), key=_size, reverse=True)
-        chosen = _apart(longest)
-        if len(chosen) == self.dimension:
+        chosen = _apart(self._offsets)
+        if len(chosen) == self.dimension or (len(chosen) > 1 and len(_independent(self._offsets)) > len(chosen)):
             return None
-        self._sums = longest[:1] if len(chosen) == 1 else longest
-        if len(chosen) > 1 and len(_independent(longest)) > len(chosen):
-            raise Unchecked(f"a {self.source.kind} is thin, but not flat, in more than one direction")
         return [(vector, Fraction(1)) for vector in chosen]
+
+    @cached_property
+    def _offsets(self) -> list[list[Fraction]]:
+        """What takes the first corner to the others, the longest first."""
+        first, *others = self.corners
+        return sorted(([a - b for a, b in zip(x, first, strict=True)] for x in others), key=_size, reverse=True)
 
     def nearest(self, point: Array) -> list[arb]:
         """A mean of corners."""
         from scipy.optimize import nnls
 
         assert self.segments is not None
-        first, offsets = self.corners[0], [[Fraction(0)] * self.dimension, *self._sums]
+        along = self._offsets if len(self.segments) > 1 else [vector for vector, _ in self.segments]
+        first, offsets = self.corners[0], [[Fraction(0)] * self.dimension, *along]
         table = np.array([[float(x) for x in offset] for offset in offsets])
         size = float(np.abs(table).max(initial=0.0)) or 1.0
         away = (point - np.array([float(x) for x in first])) / size
-        weights = nnls(np.vstack([table.T / size, np.ones(len(table))]), np.append(away, 1.0))[0]
-        shares = [Fraction(float(w)) / sum(Fraction(float(v)) for v in weights) for w in weights]
+        weights = [
+            Fraction(float(w)) for w in nnls(np.vstack([table.T / size, np.ones(len(table))]), np.append(away, 1.0))[0]
+        ]
+        whole = sum(weights)
+        shares = [w / whole for w in weights]
         columns = zip(first, zip(*offsets, strict=True), strict=True)
         return [rational(x + sum(w * v for w, v in zip(shares, column, strict=True))) for x, column in columns]
 
@@ -298,10 +303,8 @@ class Segments(Flat):
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
         """Those of the segments that it is a sum of, the longest first, as many as are apart."""
         chosen = _apart(self._sums)
-        if len(chosen) == self.dimension:
+        if len(chosen) == self.dimension or len(_independent(self._sums)) > len(chosen):
             return None
-        if len(_independent(self._sums)) > len(chosen):
-            raise Unchecked(f"a {self.source.kind} is thin, but not flat, in more than one direction")
         return [(vector, Fraction(2)) for vector in chosen]
 
     @cached_property
@@ -324,6 +327,11 @@ class Segments(Flat):
                 found.append(row)
         return sorted(found, key=_size, reverse=True)
 
+    @property
+    def generators(self) -> list[list[Fraction]]:
+        """The segments that it is a sum of ``(q, d)``, exactly."""
+        return [[Fraction(float(v)) for v in row] for row in self.source.generators if row.any()]
+
     def nearest(self, point: Array) -> list[arb]:
         """So much of every segment, none of them more than whole."""
         from scipy.optimize import lsq_linear
@@ -333,7 +341,7 @@ class Segments(Flat):
             return balls(middle)
         table = np.array([[float(v) for v in row] for row in self._sums])
         size = np.abs(table).max()
-        found = np.clip(lsq_linear(table.T / size, offset / size, (-1.0, 1.0), tol=1e-15).x, -1.0, 1.0).tolist()
+        found = np.clip(lsq_linear(table.T / size, offset / size, (-1.0, 1.0), method="bvls").x, -1.0, 1.0).tolist()
         columns = zip(middle.tolist(), zip(*self._sums, strict=True), strict=True)
         return [
             rational(Fraction(m) + sum(Fraction(s) * v for s, v in zip(found, column, strict=True)))
@@ -405,8 +413,9 @@ def _independent(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
         rest = row
         for lead, other in reduced:
             rest = [a - rest[lead] * b for a, b in zip(rest, other, strict=True)]
-        lead = next((i for i, v in enumerate(rest) if v), None)
-        if lead is not None:
+        places = [i for i, v in enumerate(rest) if v]
+        if places:
+            lead = places[0]
             reduced.append((lead, [v / rest[lead] for v in rest]))
             chosen.append(row)
     return chosen

@@ -58,6 +58,25 @@ def innovations_seen(
     return np.concatenate([D.reshape(K, d, -1), begun], axis=2)
 
 
+def unfelt(response: Response, model: DisturbanceModel, far: Array, least: float) -> np.ndarray:
+    """Which entries of a disturbance of at most ``far (mw,)`` bring no state further than ``least`` by any breakpoint,
+    block by block, ``(blocks, mw)``."""
+    grid, steps = response.grid, response.steps(KNOWN)
+    assert model.starts is not None
+    block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
+    pushes = steps.Gamma[0, response.which] @ grid.of_modes(steps.E[0])[grid.modes]
+    pushes = pushes * far
+    nodes = np.zeros((response.initial_state.size, model.block_count, pushes.shape[2]))
+    most = np.zeros(nodes.shape[1:])
+    if (np.abs(pushes).max(axis=(0, 1)) > least).all():
+        return most > 0.0
+    for piece in range(grid.pieces):
+        nodes = np.tensordot(steps.Phi[0, response.which[piece]], nodes, axes=1)
+        nodes[:, block[piece]] += pushes[piece]
+        most = np.maximum(most, np.abs(nodes).max(axis=0))
+    return most <= least
+
+
 def _measurable(response: Response, control: Dictionary, pieces: MeasurablePieces) -> Array:
     """The same of what measurable disturbances make of the state at the end of every piece."""
     grid, K = response.grid, control.pieces
@@ -114,12 +133,13 @@ class Answers:
         return bool(np.unique(at).size == at.size and (value == 1.0).all())
 
 
-def answers(D: Array, mask: np.ndarray, channels: int) -> Answers:
+def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None) -> Answers:
     """The coordinates of gains that answer innovations ``D (K, d, Q)``, each piece those of its row of the truth values
     ``mask (K, K)``; in units in which states and deviations are of ordinary size. Variables are numbered piece by piece
-    of the control, and then channel by channel of everything that hangs together."""
+    of the control, and then channel by channel of everything that hangs together. Where more is ``seen (K, d, Q)`` than
+    is to be answered, gains have effects there too."""
     K, d, Q = D.shape
-    alike = list(_alike(D, mask))
+    alike = list(_alike(D, mask, D if seen is None else seen))
     sizes = np.zeros((K, 1 + max((one.cluster for one in alike), default=0)), dtype=int)
     for one in alike:
         sizes[one.pieces, one.cluster] = channels * one.free.size
@@ -155,8 +175,9 @@ class _Alike:
     G: Array
 
 
-def _alike(D: Array, mask: np.ndarray) -> Iterator[_Alike]:
+def _alike(D: Array, mask: np.ndarray, every: Array) -> Iterator[_Alike]:
     """All pieces of the control that answer anything, cluster by cluster."""
+    plain = np.array_equal(D, every)
     for number, cluster in enumerate(_clusters((D != 0.0).any(axis=1))):
         choices, which = np.unique(mask[:, cluster], axis=0, return_inverse=True)
         for place, chosen in enumerate(choices):
@@ -164,6 +185,10 @@ def _alike(D: Array, mask: np.ndarray) -> Iterator[_Alike]:
                 continue
             seen = cluster[chosen]
             columns, free, Z, G = _coordinates(D[seen])
+            if not plain:
+                flat = every[seen].reshape(-1, every.shape[2])
+                columns = np.flatnonzero(flat.any(axis=0))
+                Z = G @ flat[:, columns]
             if free.size:
                 yield _Alike(np.flatnonzero(which.ravel() == place), number, seen, columns, free, Z, G)
 

@@ -15,7 +15,7 @@ from sparserob_core.control.constraints.feedback import FeedbackConstraint, Feed
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
-from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
+from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen, unfelt
 from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
 from sparserob_core.control.feedback.observer import Observer, between, innovations_of
 from sparserob_core.control.feedback.zonoid import has_corners
@@ -24,13 +24,13 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.measurable import MISSED
-from sparserob_core.control.transcription.own_units import added_up, fixed, units_of_steps
+from sparserob_core.control.transcription.own_units import THIN, added_up, fixed, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import CLOSED, Array, Box, ConvexSet
+from sparserob_core.sip.convex_set import CLOSED, Array, ConvexSet
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import Formulation
 
@@ -43,8 +43,8 @@ FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: i
 class Seen:
     """What a control sees and answers, in one set of units: the coordinates of its ``answers``; the ``pieces`` on which
     measurable disturbances are the deviations, and the ``observer`` of outputs, where there are such; the terminal
-    equalities, ``fixed``, as rows ``H x(T) <= h``, the second half of them the opposites of the first. ``still (d,)``:
-    which entries of the initial state deviate by no more than doubles resolve of it.
+    equalities, ``fixed``, as rows ``H x(T) <= h``, the second half of them the opposites of the first. ``still (Q,)``:
+    which entries of the deviations do no more than doubles resolve.
 
     In own units ``deviations (Q,)``, what one of each is in the user's, and ``steps (r,)``, what the rows of the
     control's steps are divided by.
@@ -212,11 +212,9 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
     outputs is in these."""
     problem, disturbance, begins = own.problem, own.functionals.disturbance, own.problem.initial_set is not None
     pieces = measurable_pieces(own.functionals)
-    still = np.zeros(problem.system.states, dtype=bool)
-    if problem.initial_set is not None:
-        axes = np.eye(still.size)
-        still = problem.initial_set.support(axes) + problem.initial_set.support(-axes) <= CLOSED
-    spread = _spread(own, pieces, still)
+    spread = _spread(own, pieces, None)
+    still = _still(own, spread)
+    spread = replace(spread, still=still)
     blocks = 0 if disturbance is None else disturbance.block_count
     deviations = np.tile(units.disturbances[: problem.system.disturbances], blocks)
     deviations = deviations if pieces is None else np.ones(pieces.size)
@@ -229,8 +227,8 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
         deviations = np.append(deviations, np.tile(outputs, own.control.pieces if observer.noisy else 0))
     anew = _begins_anew(own)
     deviations = np.concatenate([deviations, begun, *[begun] * anew])
-    seen = spread.within(innovations_of(seen, begun.size, observer, anew))  # else not answered
-    coordinates, (H, h) = answers(seen, mask, problem.system.controls), fixed(problem)
+    seen = innovations_of(seen, begun.size, observer, anew) * (spread.radii > 0.0)
+    coordinates, (H, h) = answers(spread.within(seen), mask, problem.system.controls, seen), fixed(problem)
     small = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
     ends = _equal(H / small[:, None], h / small)
     return Seen(coordinates, pieces, observer, ends, still, deviations, _step_units(problem)), outputs
@@ -252,6 +250,9 @@ def refuse(
     curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     bound, measurable = problem.disturbance, classes == {"measurable"}
+    slanted = [
+        one.kind for one in (None if measurable else bound, problem.initial_set) if one is not None and _is_slanted(one)
+    ]
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
@@ -268,6 +269,9 @@ def refuse(
         f"set with flat sides for states and controls under measurable disturbances, which the "
         f"{' and the '.join(curved)} has not": measurable and bool(curved),
         "cost other than worst under measurable disturbances": measurable and cost == "worst",
+        f"set of disturbances and of initial states with an interior, or with sides that can be listed, which the"
+        f" {' and the '.join(slanted)} has not: a flat set is a box of its own coordinates, whose directions are the"
+        " columns of E": bool(slanted),
         "disturbance that takes any value on each of its pieces": bool(classes)
         and not measurable
         and not disturbance.is_complete,
@@ -291,6 +295,13 @@ def refuse(
             raise InputError(f"feedback needs a {wanted}", path="policy.name")
 
 
+def _is_slanted(convex: ConvexSet) -> bool:
+    """Whether a set has no length along an axis within its span, though it deviates along it: then no gain on that
+    entry of a deviation is bounded."""
+    spread = Spread(((1, convex),))
+    return bool(((spread.chords <= 0.0) & (spread.radii > 0.0)).any())
+
+
 def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
     """The same coordinates of gains in the user's units, in which one of what is ``measured (d,)`` and of the
     ``deviations (Q,)`` is that; powers of two change no number but its exponent."""
@@ -302,24 +313,33 @@ def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
     return replace(own, effect=effect, gain=gain)
 
 
-def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray) -> Spread:
-    """The deviations of a problem's disturbance and of its initial state, of which some entries are ``still (d,)``."""
+def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | None) -> Spread:
+    """The deviations of a problem's disturbance and of its initial state, of which some entries are ``still (Q,)``."""
     problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _begins_anew(posed)
-    initial = problem.initial_set if problem.initial_set is None else _held(problem.initial_set, still)
     if acting is not None:
-        return Spread((*acting.sets, *deviations_of(None, 0, initial, periods=periods).sets), MISSED)
+        sets = (*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets)
+        return Spread(sets, MISSED, still)
     blocks = 0 if disturbance is None else disturbance.block_count
     noise = None if problem.measurements is None else problem.measurements.noise
-    return deviations_of(problem.disturbance, blocks, initial, noise, posed.control.pieces, periods)
+    found = deviations_of(problem.disturbance, blocks, problem.initial_set, noise, posed.control.pieces, periods)
+    return replace(found, still=still)
 
 
-def _held(initial: ConvexSet, still: np.ndarray) -> ConvexSet:
-    """A set of initial states with some entries at their middle: gains on what they deviate by would be without
-    measure, and what they do is less than a claim excuses."""
-    if not still.any() or not (still.all() or initial.is_box):
-        return initial
-    box, middle = initial.bounding_box(), initial.middle()
-    return Box(np.where(still, middle, box.lower), np.where(still, middle, box.upper))
+def _still(own: Posed, spread: Spread) -> np.ndarray:
+    """Which entries ``(Q,)`` of the disturbance do no more to any state, and of the initial state deviate by no more,
+    than doubles resolve: gains on these would be without measure. All of a set, or of a box those entries."""
+    initial, disturbance, bound = own.problem.initial_set, own.functionals.disturbance, own.problem.disturbance
+    found = np.zeros(spread.size, dtype=bool)
+    if initial is not None:
+        still = initial.support(np.eye(initial.dimension)) + initial.support(-np.eye(initial.dimension)) <= CLOSED
+        if still.all() or initial.is_box:
+            found[spread.size - still.size :] = still
+    if bound is not None and disturbance is not None and disturbance.kind == "piecewise_constant":
+        far = bound.support(np.eye(bound.dimension)) + bound.support(-np.eye(bound.dimension))
+        still = unfelt(own.functionals.response, disturbance, far, THIN)
+        still = still if bound.is_box else np.repeat(still.all(axis=1, keepdims=True), bound.dimension, axis=1)
+        found[: still.size] = still.ravel()
+    return found
 
 
 def _begins_anew(posed: Posed) -> bool:

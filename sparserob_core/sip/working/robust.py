@@ -290,10 +290,11 @@ class RobustRows(Working):
             at = None
         elif at is None and (self.program.P is not None or self.program.finite.blocks is not None):
             at = np.zeros(self.program.n)
-        bound, size = robust_bound(self.program.finite, blocks, answer.y, answer.deviations, answer.mu, priced, at)
+        named = self.counterpart.spread.named(answer.deviations)
+        bound, size = robust_bound(self.program.finite, blocks, answer.y, named, answer.mu, priced, at)
         cuts = tuple(
             replace(cut, index=np.concatenate([cut.index, w]), multiplier=float(y), formulation="literal")
-            for cut, y, w in zip(self.cuts, answer.y, answer.deviations, strict=True)
+            for cut, y, w in zip(self.cuts, answer.y, named, strict=True)
             if y > 0.0
         )
         return Dual(bound - (ROUNDING + self.counterpart.spread.missed) * size, cuts, answer.mu, at=at)
