@@ -411,6 +411,11 @@ class Spread:
         """Of every set the orthogonal projector ``(q, q)`` onto its span."""
         return [projector(convex.span) for _, _, convex, _ in self.parts]
 
+    @property
+    def leans(self) -> bool:
+        """Whether a set has no interior, nor is one of fewer coordinates."""
+        return any(not _is_diagonal(within) for within in self._projectors)
+
     def within(self, a: Array) -> Array:
         """What ``a (..., Q)`` is within the span of the set, along which all deviations are; 0 on entries that do not
         deviate, or are `still`."""
@@ -424,7 +429,7 @@ class Spread:
     def _projected(self, a: Array) -> Array:
         found = np.array(a)
         for (part, count, convex, _), within in zip(self.parts, self._projectors, strict=True):
-            if not np.array_equal(within, np.diag(np.diag(within))):
+            if not _is_diagonal(within):
                 blocks = a[..., part].reshape(*a.shape[:-1], count, convex.dimension)
                 found[..., part] = (blocks @ within).reshape(*a.shape[:-1], -1)
         return found
@@ -465,6 +470,10 @@ class Spread:
             blocks = a[..., part].reshape(*a.shape[:-1], count, convex.dimension)
             found[..., part] = (convex.support_point(blocks) - middle).reshape(*a.shape[:-1], part.stop - part.start)
         return found
+
+
+def _is_diagonal(matrix: Array) -> bool:
+    return np.array_equal(matrix, np.diag(np.diag(matrix)))
 
 
 def gathered(

@@ -1,5 +1,5 @@
-"""Random problems with sets that have no interior, or none that doubles resolve, and what they cost: a linear program in
-coordinates of the span of the set, with exact transitions, by HiGHS. Nothing of the package is used.
+"""Random problems with sets that have no interior, or none that doubles resolve, and what they cost: a linear program
+in coordinates of the span of the set, with exact transitions, by HiGHS. Nothing of the package is used.
 
 A set is ``{c + V s}``, ``V (d, r)``, where ``|s_i| <= 1``, thickened by a ball of `THICK` or not at all. A ball that is
 so small is a point, ``r = 0``.
@@ -30,7 +30,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem of two states that begins in ``x``, with pieces of equal length, as numbers."""
+    """A problem of two or three states that begins in ``x``, with pieces of equal length, as numbers."""
 
     A: np.ndarray
     B: np.ndarray
@@ -85,15 +85,16 @@ def draw(seed: int) -> Problem:
         PLACES[seed // 15 % 4],
         POLICIES[seed // 60 % 2],
     )
-    d, pieces = 2, int(rng.integers(4, 7))
-    A = np.array([[0.0, 1.0], [0.0, 0.0]]) + (rng.normal(scale=0.4, size=(2, 2)) if rng.random() < 0.7 else 0.0)
-    B, x = np.array([[0.0], [1.0]]), rng.choice([-1.0, 1.0]) * np.array([1.0, rng.uniform(-0.3, 0.3)])
-    horizon, control = 2.0, 4.0
+    d, pieces = 2 + int(seed % 3 == 2), int(rng.integers(4, 7))
+    A = np.eye(d, k=1) + (rng.normal(scale=0.4, size=(d, d)) if rng.random() < 0.7 else 0.0)
+    B = np.eye(d)[:, d - 1 :]
+    x = rng.choice([-1.0, 1.0]) * np.append(1.0, rng.uniform(-0.3, 0.3, size=d - 1))
+    horizon, control = 2.0, 4.0 ** (d - 1)
     small = 0.03 if place in ("disturbance", "initial") else 0.15
-    r = 0 if kind in POINTS else int(rng.integers(0, 2)) if kind != "zonotope" or rng.random() < 0.2 else 1
+    r = 0 if kind in POINTS else int(rng.integers(kind == "zonotope" and rng.random() < 0.8, d))
     V = small * rng.uniform(0.4, 1.0, size=(d, r)) * rng.choice([-1.0, 1.0], size=(d, r))
-    if kind == "box" and r:
-        V[int(rng.integers(0, 2)), 0] = 0.0
+    if kind == "box":
+        V = V * np.eye(d)[:, rng.permutation(d)[:r]]
     centred = place in ("disturbance", "initial")
     centre = (np.zeros(d) if rng.random() < 0.5 else 0.02 * rng.normal(size=d)) if centred else 0.1 * rng.normal(size=d)
     span = Span(centre, V)
@@ -135,16 +136,64 @@ def draw(seed: int) -> Problem:
     return Problem(A, B, x, horizon, pieces, control, policy, kind, thick, place, noise, initial, rows, ends, config)
 
 
-def value(problem: Problem) -> float:
-    """What the thin sets cost where they have no thickness at all; infinite where nothing is feasible."""
+class Rows:
+    """Rows of a linear program over ``n`` variables, and one more for every absolute value in them."""
+
+    def __init__(self, n: int) -> None:
+        self.n = self.size = n
+        self.least: list[tuple[np.ndarray, list[tuple[int, float]], float]] = []
+        self.equal: list[tuple[np.ndarray, float]] = []
+
+    def bounded(self, linear: np.ndarray, row: np.ndarray, constant: np.ndarray, limit: float) -> None:
+        """``linear'z + sum_q |row_q'z + constant_q| <= limit``."""
+        sizes = [q for q in range(len(constant)) if row[q].any()]
+        places = range(self.size, self.size + len(sizes))
+        self.size += len(sizes)
+        for place, q in zip(places, sizes, strict=True):
+            for sign in (1.0, -1.0):
+                self.least.append((sign * row[q], [(place, -1.0)], -sign * constant[q]))
+        rest = float(np.abs(np.delete(constant, sizes)).sum())
+        self.least.append((linear, [(place, 1.0) for place in places], limit - rest))
+
+    def solved(self, cost: np.ndarray, bounds: list[tuple[float | None, float | None]]) -> float:
+        """The least cost; infinite where nothing is feasible."""
+        table, rhs = np.zeros((len(self.least), self.size)), np.array([limit for *_, limit in self.least])
+        for row, (linear, more, _) in zip(table, self.least, strict=True):
+            row[: self.n] = linear
+            for place, coefficient in more:
+                row[place] = coefficient
+        equal = np.zeros((len(self.equal), self.size))
+        equal[:, : self.n] = np.array([linear for linear, _ in self.equal]).reshape(-1, self.n)
+        costs = np.append(cost, np.zeros(self.size - self.n))
+        every = bounds + [(None, None)] * (self.size - len(bounds))
+        ends = np.array([limit for _, limit in self.equal])
+        found = linprog(costs, table, rhs, equal, ends, bounds=every, method="highs")
+        return float(found.fun) if found.status == 0 else np.inf
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The state at the end of every piece, linear in ``n`` variables ``z``: ``base + nominal z``, and by how much every
+    one of ``Q`` numbers between -1 and 1 moves it, ``given + answers z``. ``first``: where the answers of every piece
+    to ``known`` of these numbers begin."""
+
+    n: int
+    known: list[int]
+    first: np.ndarray
+    base: list[np.ndarray]
+    nominal: list[np.ndarray]
+    given: list[np.ndarray]
+    answers: list[np.ndarray]
+
+
+def motion(problem: Problem) -> Motion:
+    """That of a problem: its variables are the control, the peaks, and what is answered."""
     d, K, step = len(problem.A), problem.pieces, problem.horizon / problem.pieces
     noise = problem.disturbance or Span(np.zeros(d), np.zeros((d, 0)))
     begun = problem.initial or Span(np.zeros(d), np.zeros((d, 0)))
     big = expm(step * np.block([[problem.A, problem.B, np.eye(d)], [np.zeros((1 + d, 2 * d + 1))]]))
     Phi, Gamma, Delta = big[:d, :d], big[:d, d : d + 1], big[:d, d + 1 :]
-    # variables: v (K), peaks (K), and of every piece k its answers to every known number of deviations
-    blocks = [begun.V.shape[1], *[noise.V.shape[1]] * K]
-    offsets = np.cumsum([0, *blocks])
+    offsets = np.cumsum([0, begun.V.shape[1], *[noise.V.shape[1]] * K])
     Q = int(offsets[-1])
     known = [int(offsets[k + 1]) if problem.policy == "affine" else 0 for k in range(K)]
     first = 2 * K + np.cumsum([0, *known])
@@ -152,64 +201,40 @@ def value(problem: Problem) -> float:
     nominal, answers = [np.zeros((d, n))], [np.zeros((d, Q, n))]
     base, given = [problem.x + begun.c], [np.concatenate([begun.V, np.zeros((d, Q - begun.V.shape[1]))], axis=1)]
     for k in range(K):
-        one = Phi @ nominal[-1]
+        one, many, push = Phi @ nominal[-1], np.einsum("ij,jqn->iqn", Phi, answers[-1]), Phi @ given[-1]
         one[:, k] += Gamma[:, 0]
-        many = np.einsum("ij,jqn->iqn", Phi, answers[-1])
         for q in range(known[k]):
             many[:, q, first[k] + q] += Gamma[:, 0]
-        push = Phi @ given[-1]
         push[:, offsets[k + 1] : offsets[k + 2]] += Delta @ noise.V
         nominal, answers, given = [*nominal, one], [*answers, many], [*given, push]
         base.append(Phi @ base[-1] + Delta @ noise.c)
-    A_ub, b_ub, A_eq, b_eq, extra = [], [], [], [], n
+    return Motion(n, known, first, base, nominal, given, answers)
 
-    def bounded(linear: np.ndarray, row: np.ndarray, constant: np.ndarray, limit: float) -> None:
-        """``linear'z + sum_q |row_q'z + constant_q| <= limit``, with a variable more for every absolute value."""
-        nonlocal extra
-        sizes = [q for q in range(len(constant)) if row[q].any()]
-        rest = float(np.abs(np.delete(constant, sizes)).sum())
-        total = {"linear": linear, "more": list(range(extra, extra + len(sizes)))}
-        for place, q in zip(total["more"], sizes, strict=True):
-            for sign in (1.0, -1.0):
-                A_ub.append((sign * row[q], [(place, -1.0)]))
-                b_ub.append(-sign * constant[q])
-        A_ub.append((linear, [(place, 1.0) for place in total["more"]]))
-        b_ub.append(limit - rest)
-        extra += len(sizes)
+
+def value(problem: Problem) -> float:
+    """What the thin sets cost where they have no thickness at all; infinite where nothing is feasible."""
+    of, K = motion(problem), problem.pieces
+    rows = Rows(of.n)
+
+    def kept(k: int, c: np.ndarray, limit: float) -> None:
+        at_most = limit - float(c @ of.base[k])
+        rows.bounded(c @ of.nominal[k], np.einsum("i,iqn->qn", c, of.answers[k]), c @ of.given[k], at_most)
 
     for k in range(K):
-        row = np.zeros((known[k], n))
-        row[np.arange(known[k]), first[k] + np.arange(known[k])] = 1.0
+        answered = np.eye(of.n)[of.first[k] : of.first[k] + of.known[k]]
         for sign in (1.0, -1.0):
-            linear = np.zeros(n)
-            linear[k], linear[K + k] = sign, -1.0
-            bounded(linear, row, np.zeros(known[k]), 0.0)
+            rows.bounded(sign * np.eye(of.n)[k] - np.eye(of.n)[K + k], answered, np.zeros(of.known[k]), 0.0)
     for k, H, h in problem.rows:
         for c, limit in zip(H, h, strict=True):
-            bounded(c @ nominal[k], np.einsum("i,iqn->qn", c, answers[k]), c @ given[k], limit - c @ base[k])
+            kept(k, c, limit)
     for k, span in problem.ends:
         r = span.V.shape[1]
-        across = np.linalg.svd(span.V.T)[2][r:] if r else np.eye(d)
-        for c in across:
-            A_eq.append(c @ nominal[k])
-            b_eq.append(c @ (span.c - base[k]))
-            for q in range(Q):
-                A_eq.append(c @ answers[k][:, q])
-                b_eq.append(-c @ given[k][:, q])
+        for c in np.linalg.svd(span.V.T)[2][r:] if r else np.eye(len(span.c)):
+            rows.equal.append((c @ of.nominal[k], c @ (span.c - of.base[k])))
+            rows.equal += [(c @ of.answers[k][:, q], -c @ push) for q, push in enumerate(of.given[k].T)]
         for c in np.linalg.pinv(span.V) if r else []:
-            for sign in (1.0, -1.0):
-                away = sign * c @ (base[k] - span.c)
-                bounded(
-                    sign * c @ nominal[k], np.einsum("i,iqn->qn", sign * c, answers[k]), sign * c @ given[k], 1.0 - away
-                )
-    table = np.zeros((len(A_ub), extra))
-    for row, (linear, more) in zip(table, A_ub, strict=True):
-        row[:n] = linear
-        for place, coefficient in more:
-            row[place] += coefficient
-    cost = np.zeros(extra)
-    cost[K : 2 * K] = step
-    bounds = [(-problem.control, problem.control)] * K + [(0.0, problem.control)] * K + [(None, None)] * (extra - 2 * K)
-    equal = np.hstack([np.array(A_eq).reshape(-1, n), np.zeros((len(A_eq), extra - n))]) if A_eq else None
-    found = linprog(cost, table, b_ub, equal, b_eq if A_eq else None, bounds=bounds, method="highs")
-    return float(found.fun) if found.status == 0 else np.inf
+            kept(k, c, 1.0 + c @ span.c)
+            kept(k, -c, 1.0 - c @ span.c)
+    cost = np.zeros(of.n)
+    cost[K : 2 * K] = problem.horizon / K
+    return rows.solved(cost, [(-problem.control, problem.control)] * K + [(0.0, problem.control)] * K)

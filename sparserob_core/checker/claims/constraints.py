@@ -86,13 +86,15 @@ def bounded(case: Case, window: Window) -> str:
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     if found.bound < 0:
         return f"kept, with a margin of at least {-found.bound:.1e}{_unit(case, window)} ({size})"
-    return f"kept to {found.bound:.1e}{_unit(case, window)}{_excused(case, window)} ({size})"
+    return f"kept to {found.bound:.1e}{_unit(case, window)}{_excused(case, window, normals)} ({size})"
 
 
-def _excused(case: Case, window: Window) -> str:
-    """In words, the largest violation that counts as none."""
+def _excused(case: Case, window: Window, normals: Array) -> str:
+    """In words, the largest violation that counts as none; of a curved set the largest along its normals."""
     if window.seen.facets is None:
-        return f" of its gauge, where {TOLERANCE:g} is excused"
+        curved = Curved(window.seen, normals, case.units(window).least)
+        axes = np.eye(len(normals))
+        return f" of its gauge, where {max(curved.true(z).slack for z in np.vstack([axes, -axes])):.2g} is excused"
     return f", where {TOLERANCE * float(case.units(window).rows.max(initial=0.0)):.1e}{_unit(case, window)} is excused"
 
 

@@ -163,8 +163,8 @@ class Cornered(Flat):
         """A mean of corners."""
         from scipy.optimize import nnls
 
-        assert self.segments is not None
-        along = self._offsets if len(self.segments) > 1 else [vector for vector, _ in self.segments]
+        single = self.segments is not None and len(self.segments) == 1
+        along = self._offsets[:1] if single else self._offsets
         first, offsets = self.corners[0], [[Fraction(0)] * self.dimension, *along]
         table = np.array([[float(x) for x in offset] for offset in offsets])
         size = float(np.abs(table).max(initial=0.0)) or 1.0
@@ -337,12 +337,13 @@ class Segments(Flat):
         from scipy.optimize import lsq_linear
 
         offset, middle = point - self.source.centre, self.source.centre
-        if not self._sums:
+        sums = self.generators if self.segments is None else self._sums
+        if not sums:
             return balls(middle)
-        table = np.array([[float(v) for v in row] for row in self._sums])
+        table = np.array([[float(v) for v in row] for row in sums])
         size = np.abs(table).max()
         found = np.clip(lsq_linear(table.T / size, offset / size, (-1.0, 1.0), method="bvls").x, -1.0, 1.0).tolist()
-        columns = zip(middle.tolist(), zip(*self._sums, strict=True), strict=True)
+        columns = zip(middle.tolist(), zip(*sums, strict=True), strict=True)
         return [
             rational(Fraction(m) + sum(Fraction(s) * v for s, v in zip(found, column, strict=True)))
             for m, column in columns

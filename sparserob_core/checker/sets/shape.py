@@ -51,26 +51,29 @@ class Shape(ABC):
 
     def contains(self, point: Sequence[float] | Array) -> bool:
         """Whether an exact point is proven to be in the set; raises `Unchecked` for one that rounding may have taken
-        out of a set without an interior."""
+        out of it."""
         if self.holds(balls(point)):
             return True
         if self.member(point) is not None:
-            raise Unchecked(f"floats seldom name a point of a {self.source.kind} without an interior")
+            raise Unchecked(f"rounding may have taken a point out of the {self.source.kind}")
         return False
 
     def member(self, point: Sequence[float] | Array) -> list[arb] | None:
-        """The point of the set that an exact one stands for: itself, or of a set without an interior, in which floats
-        seldom are, one that is next to it along its `segments`. ``None`` where there is none."""
-        if self.segments is None:
-            return balls(point) if self.holds(balls(point)) else None
+        """The point of the set that an exact one stands for: itself, or one of the set next to it, since floats are
+        seldom in a thin one; of a set without an interior one along its `segments`. ``None`` where there is none."""
+        if self.segments is None and self.holds(balls(point)):
+            return balls(point)
         near = self.nearest(np.asarray(point, dtype=float))
+        if near is None:
+            return None
         size = NEAR * max(max(self.radius, default=0.0), float(np.abs(point).max(initial=0.0)))
         far = total(abs(a - b) for a, b in zip(near, balls(point), strict=True))
         return near if far <= size else None
 
-    def nearest(self, point: Array) -> list[arb]:
-        """A point of the set next to another one, in what its `segments` span."""
-        raise Unchecked(f"the checker cannot tell who is in a {self.source.kind} without an interior")
+    def nearest(self, point: Array) -> list[arb] | None:
+        """A point of the set next to another one, in what its `segments` span where it has some; ``None`` of a kind
+        that has no answer."""
+        return None
 
     @property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:

@@ -250,9 +250,9 @@ def refuse(
     curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     bound, measurable = problem.disturbance, classes == {"measurable"}
-    slanted = [
-        one.kind for one in (None if measurable else bound, problem.initial_set) if one is not None and _is_slanted(one)
-    ]
+    uncertainty = [one for one in (None if measurable else bound, problem.initial_set) if one is not None]
+    slanted = [one.kind for one in uncertainty if _is_slanted(one)]
+    leaning = [one.kind for one in uncertainty if fixed(problem)[1].size and Spread(((1, one),)).leans]
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
@@ -272,6 +272,8 @@ def refuse(
         f"set of disturbances and of initial states with an interior, or with sides that can be listed, which the"
         f" {' and the '.join(slanted)} has not: a flat set is a box of its own coordinates, whose directions are the"
         " columns of E": bool(slanted),
+        f"set of disturbances and of initial states with an interior, or of axes that are points, beside fixed final"
+        f" states, which the {' and the '.join(leaning)} has not: a small box of final states does": bool(leaning),
         "disturbance that takes any value on each of its pieces": bool(classes)
         and not measurable
         and not disturbance.is_complete,
@@ -327,9 +329,12 @@ def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | N
 
 def _still(own: Posed, spread: Spread) -> np.ndarray:
     """Which entries ``(Q,)`` of the disturbance do no more to any state, and of the initial state deviate by no more,
-    than doubles resolve: gains on these would be without measure. All of a set, or of a box those entries."""
+    than doubles resolve: gains on these would be without measure. All of a set, or of a box those entries. None beside
+    fixed final states, which hold at every deviation."""
     initial, disturbance, bound = own.problem.initial_set, own.functionals.disturbance, own.problem.disturbance
     found = np.zeros(spread.size, dtype=bool)
+    if fixed(own.problem)[1].size:
+        return found
     if initial is not None:
         still = initial.support(np.eye(initial.dimension)) + initial.support(-np.eye(initial.dimension)) <= CLOSED
         if still.all() or initial.is_box:

@@ -507,17 +507,18 @@ def test_a_point_that_is_known_to_a_ball_is_as_far_out_as_the_ball_may_be():
 
 
 def test_a_kind_of_set_without_an_answer_says_so():
-    flat, segment = known(SETS["triangle"]), known(sr.Zonotope(np.zeros(2), np.array([[1.0, 1.0]])))
+    many = known(sr.Zonotope(np.zeros(2), np.random.default_rng(5).normal(size=(501, 2))))
+    flat, round_ = known(SETS["triangle"]), known(SETS["ellipsoid"])
     for question in (
         lambda: flat.centre,
         lambda: flat.gauge(balls([1.0, 0.0])),
         lambda: flat.far(balls([1.0, 0.0])),
         lambda: known(SETS["ellipsoid"]).shares(np.ones(2)),
-        lambda: segment.holds(balls([0.0, 0.0])),
+        lambda: many.holds(balls([0.0, 0.0])),
     ):
         with pytest.raises(Unchecked):
             question()
-    assert flat.round is None
+    assert flat.round is None and round_.nearest(np.zeros(2)) is None
 
 
 def test_a_product_is_bounded_and_holds_points_part_by_part():

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparserob_core.control.feedback.innovations import answers
+import sparserob_core as sr
+from sparserob_core.control.feedback.innovations import answers, unfelt
 from sparserob_core.control.policies.affine import AffinePolicy
 
 
@@ -76,3 +77,39 @@ def test_of_any_choice_of_measurements_the_effects_are_all_that_gains_of_them_ca
     for k in range(K):
         rank = 0 if not mask[k].any() else np.linalg.matrix_rank(D[mask[k]].reshape(-1, Q))
         assert np.count_nonzero(known.piece == k) == rank
+
+
+def test_gains_have_effects_on_all_that_is_seen_though_they_answer_less() -> None:
+    """What is answered chooses the gains; what they do to the rest of what is seen is theirs too."""
+    rng, K, d, Q = np.random.default_rng(3), 4, 2, 8
+    D = innovations(rng, K, d, Q)
+    less = D * (np.arange(Q) % 3 != 0)
+    known = answers(less, np.tril(np.ones((K, K), dtype=bool)), 2, D)
+    numbers = rng.normal(size=known.variables)
+    F, M = known.effects(numbers), known.gains(numbers)
+    assert known.variables and np.isin(known.entry % 3, [1, 2]).all() and F[..., ::3].any()
+    np.testing.assert_allclose(np.einsum("kjid,jdq->kiq", M, D), F, atol=1e-12 * np.abs(M).max())
+    np.testing.assert_allclose(F[known.piece, known.channel, known.entry], numbers)
+    same = answers(D, np.tril(np.ones((K, K), dtype=bool)), 2, D)
+    assert same.variables == answers(D, np.tril(np.ones((K, K), dtype=bool)), 2).variables
+
+
+def test_what_a_disturbance_does_to_no_state_by_any_breakpoint_is_unfelt() -> None:
+    """``x' = 3 x + w``: what acts early grows; a second entry acts on a state that forgets."""
+    problem = {
+        "name": "linear",
+        "system": {"A": [[3.0, 0.0], [0.0, -3.0]], "B": [[1.0], [1.0]]},
+        "horizon": 2.0,
+        "initial_state": [0.0, 0.0],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [1.0, 1.0]},
+    }
+    options = {"problem": problem, "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}}}
+    functionals = sr.transcribe(options).functionals
+    pushed = (np.exp(1.5) - 1.0) / 3.0 * np.exp(1.5 * np.arange(3, -1, -1))
+    forgot = (1.0 - np.exp(-1.5)) / 3.0
+    for least in (*(pushed * 1.001), *(pushed * 0.999), forgot * 1.001, forgot * 0.999):
+        found = unfelt(functionals.response, functionals.disturbance, np.ones(2), least)
+        assert found.tolist() == [[one <= least, forgot <= least] for one in pushed.tolist()]
+    found = unfelt(functionals.response, functionals.disturbance, np.array([0.0, 1.0]), 1e-12)
+    assert found.tolist() == [[True, False]] * 4

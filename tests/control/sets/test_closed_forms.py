@@ -194,7 +194,10 @@ def test_a_sum_of_segments_is_the_hull_of_its_corners():
             + 1e-13
         )
     plane = Zonotope(np.zeros(2), np.array([[1.0, 1.0], [-2.0, -2.0], [0.0, 0.0]]))
-    assert plane.halfspaces() is None
+    H, h = plane.halfspaces()
+    assert H[:, 0] ** 2 == pytest.approx([0.5] * 4) and np.abs(np.diff(H @ np.array([1.0, 1.0]))).max() < 3.0
+    assert np.where(np.abs(H @ [1.0, 1.0]) > 1.0, h - 3.0 * np.sqrt(2.0), h) == pytest.approx([0.0] * 4, abs=1e-13)
+    assert (h >= plane.support(H)).all()
     assert plane.linearisation_excess(np.array([[1.0, -1.0]]), np.array([[[0.0, 0.25]]]))[0] == 0.75
     line = Zonotope(np.ones(1), np.array([[2.0], [0.5]]))
     H, h = line.halfspaces()

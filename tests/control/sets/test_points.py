@@ -72,14 +72,52 @@ def test_a_segment_of_disturbances_costs_what_its_coordinate_does(tmp_path: Path
     assert is_verified(segment)
 
 
-def test_a_segment_of_disturbances_is_not_answered_but_its_coordinate_is(tmp_path: Path) -> None:
-    """Gains along a segment have no bound, were left out, and what was left was certified at 1.104."""
+def test_a_segment_of_disturbances_is_answered_as_its_coordinate_is(tmp_path: Path) -> None:
+    """Gains along a segment were left out, and what was left was certified at 1.104."""
     end = [{"box": [0.12, 0.1]}]
-    with pytest.raises(sr.InputError, match="the columns of E"):
-        solved(tmp_path / "segment", policy="affine", terminal=end, disturbance=SEGMENT)
+    segment = solved(tmp_path / "segment", policy="affine", terminal=end, disturbance=SEGMENT)
     span = solved(tmp_path / "span", policy="affine", terminal=end, disturbance={"box": [1.0]}, system=SPAN)
-    assert span.status == "certified" and span.summary["cost"] == pytest.approx(1.0233333, rel=1e-6)
-    assert is_verified(span)
+    for outcome in (segment, span):
+        assert outcome.status == "certified" and is_verified(outcome)
+        assert outcome.summary["cost"] == pytest.approx(1.0233333, rel=1e-6)
+        assert outcome.summary["lower_bound"] == pytest.approx(1.0233333, rel=1e-6)
+
+
+def test_a_flat_set_whose_sides_are_too_many_to_list_is_not_answered(tmp_path: Path) -> None:
+    """No gain on it is bounded: its coordinates are answered instead."""
+    angles = np.linspace(0.0, np.pi, 502)
+    many = 1e-4 * np.stack([np.cos(angles), np.sin(angles), np.cos(angles)], axis=1)
+    with pytest.raises(sr.InputError, match="the columns of E"):
+        solved(
+            tmp_path / "many",
+            policy="affine",
+            system={"A": np.eye(3, k=1).tolist(), "B": [[0], [0], [1]]},
+            initial_state=[1.0, 0.0, 0.0],
+            disturbance={"zonotope": {"generators": many.tolist()}},
+        )
+
+
+@pytest.mark.parametrize("ends", [[0, 0], [0, None]])
+def test_a_segment_is_refused_beside_fixed_final_states_and_its_box_is_not(ends: list[Any], tmp_path: Path) -> None:
+    """What is fixed is so at every deviation, coordinate by coordinate."""
+    segment = {"centre": [1.0, 0.0], "zonotope": {"generators": [[0.02, 0.03]]}}
+    with pytest.raises(sr.InputError, match="beside fixed final states, which the zonotope has not"):
+        solved(tmp_path / "segment", policy="affine", terminal=[{"equals": ends}], initial_state=segment)
+    axis = {"centre": [1.0, 0.0], "zonotope": {"generators": [[0.02, 0.0]]}}
+    outcome = solved(tmp_path / "axis", policy="affine", terminal=[{"equals": ends}], initial_state=axis)
+    assert outcome.status == "certified" and is_verified(outcome)
+
+
+def test_what_a_thin_set_deviates_by_counts_though_nothing_answers_it(tmp_path: Path) -> None:
+    """The terminal box is kept for all of it: the cost is what the thickness adds, 1e-10 times the price of the box."""
+    costs = {}
+    for thick in (0.0, 1e-10):
+        begun = {"centre": [1.0, 0.0], "box": [thick, 0.03]}
+        outcome = solved(tmp_path / f"{thick}", policy="affine", initial_state=begun, terminal=[{"box": [0.3, 0.3]}])
+        assert outcome.status == "certified" and is_verified(outcome)
+        costs[thick] = outcome.summary["cost"]
+    assert costs[1e-10] - costs[0.0] == pytest.approx(0.0, abs=1e-8)
+    assert costs[1e-10] > costs[0.0] + 1e-11
 
 
 def test_a_box_with_a_coordinate_that_is_a_point_is_answered(tmp_path: Path) -> None:
