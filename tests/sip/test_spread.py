@@ -78,7 +78,7 @@ def test_what_is_answered_is_within_the_span_and_what_is_still_is_not_answered()
 
 def test_a_proof_names_deviations_within_the_span_and_those_of_other_sets_as_they_are() -> None:
     spread = Spread(((1, THIN), (1, sr.Box([-1.0, 0.0], [1.0, 0.0]))))
-    w = np.append(G + [-8e-12, 6e-12], [0.5, 0.0])
+    w = np.concatenate([G + np.array([-8e-12, 6e-12]), [0.5, 0.0]])
     assert spread.named(w)[:2] == pytest.approx(G, rel=1e-15) and spread.named(w)[2:].tolist() == [0.5, 0.0]
     plain = Spread(((1, sr.Zonotope(np.zeros(2), np.array([[0.5, 0.25], [-0.25, 1.0]]))),))
     assert plain.named(np.array([0.3, 0.7])).tolist() == [0.3, 0.7]

@@ -452,7 +452,11 @@ class Named:
         rounded are not. The nominal control stands for that under these points."""
         from flint import arb
 
-        z = [[x - r for x, r in zip(*pair, strict=True)] for pair in zip(self.z, self.loop.rests, strict=True)]
+        pairs = zip(self.z, self.loop.rests, strict=True)
+        z = [
+            [arb(0)] * len(mine) if mine is rest else [x - r for x, r in zip(mine, rest, strict=True)]
+            for mine, rest in pairs
+        ]
         return [
             [
                 sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), arb(0))

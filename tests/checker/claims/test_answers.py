@@ -11,19 +11,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flint import arb, ctx
+from flint import arb, ctx, fmpq
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
-from sparserob_core.checker.claims.answers import Answers, _chords, _reach, _width, answers_of
+from sparserob_core.checker.claims.answers import Answers, _chords, _reach, _segments, _width, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
+from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Product
+from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Polytope, Product
 
 REACH = 0.25
 TOO_MUCH, NOTHING = 5e-9, 3e-10  # of a unit: more and less than what counts as none
@@ -488,3 +489,48 @@ def test_the_effort_is_looked_for_where_deviations_go(monkeypatch):
     assert reach == pytest.approx([0.2, 0.2]) and float(limit) == 9.0
     assert [float(x.mid()) for x in a] == pytest.approx([0.3, -0.2])
     assert [[float(x.mid()) for x in row] for row in A] == [pytest.approx([0.0, 0.0]), pytest.approx([-0.5, 0.0])]
+
+
+def test_innovations_of_a_flat_set_are_those_of_differences_of_its_points():
+    """Its middle was rounded out of it: what no gain has a bound across is no part of what is seen."""
+    line, normal = np.array([0.3, 0.7]), np.array([0.7, -0.3])
+    H = np.array([normal, -normal, line, -line])
+    flat = Polytope(H, np.array([0.1, -0.1, 0.9, -0.2]))
+    plane = {
+        "system": LinearSystem(np.zeros((2, 2)), np.ones((2, 1)), E=np.eye(2)), "initial_state": [0.5, 0.0],
+        "gains": np.zeros((2, 2, 1, 2)), "disturbance": flat,
+    }  # fmt: skip
+    case = case_of(**plane)
+    loop, (shape, about) = answers_of(case).loop_at_rest, answers_of(case).loop_at_rest.sets[0]
+    named = answers_of(case).named({"disturbance": np.tile(flat.support_point(line), (2, 1)).T.tolist()}, "row")
+    exact = [arb(fmpq(*float(v).as_integer_ratio())) for v in normal]
+    with ctx.workprec(96):
+        limit = arb(0.1)
+        for point in (
+            [arb(float(m)) + r for m, r in zip(about, loop.rests[0], strict=True)],
+            [arb(float(m)) + z for m, z in zip(about, named.z[0], strict=True)],
+        ):
+            assert float(abs(sum(a * x for a, x in zip(exact, point, strict=True)) - limit).upper()) < 1e-26
+        assert known(shape).member(about) is not None and not known(shape).holds(balls(about))
+        seen = named.innovations[1]  # a piece of length 1 after which the state is what the disturbance was
+        assert [float(x.mid()) for x in seen] == pytest.approx(flat.support_point(line) - about)
+        assert float(abs(sum(a * x for a, x in zip(exact, seen, strict=True))).upper()) < 1e-26
+        calm = answers_of(case).following(named, {}, "row")
+        assert all(x.is_zero() for row in calm.innovations for x in row)
+
+
+def test_chords_of_a_thin_set_are_those_of_its_segments_and_else_along_the_axes():
+    line = np.array([0.3, 0.7])
+    ((vector, length),) = _segments(sr.Zonotope(np.zeros(2), line[None]), np.zeros(2))
+    assert [float(v) for v in vector] == line.tolist() and float(length.mid()) == 2.0
+    every = _segments(Box([-1.0, 0.0], [1.0, 0.0]), np.zeros(2))
+    assert [([float(v) for v in vector], float(length.mid())) for vector, length in every] == [([1.0, 0.0], 2.0)]
+    both = _segments(Product((sr.Zonotope(np.zeros(2), line[None]), Box([-1.0], [2.0]))), np.zeros(3))
+    assert [[float(v) for v in vector] for vector, _ in both] == [[0.3, 0.7, 0.0], [0.0, 0.0, 1.0]]
+    assert _segments(NormBall(2.0, 0.0, [0.0, 0.0]), np.zeros(2)) == []
+    H = np.array([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    plate = Polytope(
+        np.vstack([H, -H]), np.array([1e-10, 1.0, 1.0] * 2)
+    )  # next to a plane, of which no corner is known
+    with pytest.raises(Unchecked, match="how long the polytope is along the axes"):
+        _segments(plate, np.zeros(3))

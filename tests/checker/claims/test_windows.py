@@ -825,6 +825,25 @@ def test_a_round_set_of_disturbances_takes_the_state_as_far_in_units_of_any_size
         kept(case_of(Box([-9.0 * size] * 2, [1.7499 * size, 9.0 * size]), **plane))
 
 
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_a_wall_is_judged_as_a_point_where_it_is_thinner_than_doubles_resolve(share):
+    """Beside numbers of 3 and 2.5 that are added up, a slab of 2^-34 of these; what is excused of a point is a
+    billionth of what its row does, or of its bound."""
+    plane = {
+        "system": LinearSystem(np.zeros((2, 2)), np.eye(2)), "initial_state": [1.0, 0.5], "disturbance": None,
+        "control": Box([-1.0] * 2, [1.0] * 2), "decision": ((0.5, -0.5), (0.0, 0.0)),
+    }  # fmt: skip
+    half = 0.5 * share * 2.0**-34 * np.array([3.0, 2.5])
+    case = case_of(Box(np.array([1.0, 0.5]) - half, np.array([1.0, 0.5]) + half), **plane)
+    told = case.units(case.windows[0])
+    reach, floor = np.tile([3.0, 2.5], 2), RESOLVED * np.tile([3.0, 2.5], 2)
+    assert told.resolved == pytest.approx(reach if share < 1.0 else floor, rel=1e-6)
+    assert told.rows == pytest.approx([1.5, 0.5, 1.5, 0.5] if share < 1.0 else floor, rel=1e-6)
+    single = case_of(Polytope(np.array([[1.0, 0.0]]), np.array([share * 2.0**-34 * 3.0])), **plane)
+    bound = single.units(single.windows[0]).resolved  # of a wall by itself the same, next to 0
+    assert bound == pytest.approx([3.0 if share < 1.0 else RESOLVED * 3.0], rel=1e-6)
+
+
 def test_a_direction_of_a_curved_wall_is_allowed_a_billionth_of_its_width_or_of_what_double_precision_resolves():
     plane = {
         "system": LinearSystem(np.zeros((2, 2)), np.eye(2)), "initial_state": [1.0, 0.5], "disturbance": None,

@@ -9,6 +9,9 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.control.feedback.innovations import answers, unfelt
 from sparserob_core.control.policies.affine import AffinePolicy
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box
+from sparserob_core.control.transcription.transcribe import prepare
 
 
 def innovations(rng: np.random.Generator, K: int, d: int, Q: int) -> np.ndarray:
@@ -96,16 +99,15 @@ def test_gains_have_effects_on_all_that_is_seen_though_they_answer_less() -> Non
 
 def test_what_a_disturbance_does_to_no_state_by_any_breakpoint_is_unfelt() -> None:
     """``x' = 3 x + w``: what acts early grows; a second entry acts on a state that forgets."""
-    problem = {
-        "name": "linear",
-        "system": {"A": [[3.0, 0.0], [0.0, -3.0]], "B": [[1.0], [1.0]]},
-        "horizon": 2.0,
-        "initial_state": [0.0, 0.0],
-        "control": {"box": 1.0},
-        "disturbance": {"box": [1.0, 1.0]},
-    }
-    options = {"problem": problem, "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}}}
-    functionals = sr.transcribe(options).functionals
+    problem = sr.OptimalControlProblem(
+        system=LinearSystem(np.diag([3.0, -3.0]), np.ones((2, 1))),
+        horizon=2.0,
+        initial_state=[0.0, 0.0],
+        control=Box([-1.0], [1.0]),
+        disturbance=Box([-1.0, -1.0], [1.0, 1.0]),
+    )
+    grid = sr.Dictionary.indicators(np.linspace(0.0, 2.0, 5))
+    functionals = prepare(problem, grid, grid).functionals
     pushed = (np.exp(1.5) - 1.0) / 3.0 * np.exp(1.5 * np.arange(3, -1, -1))
     forgot = (1.0 - np.exp(-1.5)) / 3.0
     for least in (*(pushed * 1.001), *(pushed * 0.999), forgot * 1.001, forgot * 0.999):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.assemble import assemble
+from sparserob_core.experiment.config.load import load_config
 
 
 def problem(**more: Any) -> dict[str, Any]:
@@ -125,3 +127,47 @@ def test_a_box_with_a_coordinate_that_is_a_point_is_answered(tmp_path: Path) -> 
         tmp_path / "run", policy="affine", terminal=[{"box": [0.3, 0.3]}], disturbance={"box": [0.0, 0.03]}
     )
     assert outcome.status == "certified" and is_verified(outcome)
+
+
+@pytest.mark.parametrize("thick", [0.0, 1e-12])
+@pytest.mark.parametrize("place", ["disturbance", "initial_state"])
+def test_effects_are_those_of_the_gains_on_all_that_is_seen(place: str, thick: float) -> None:
+    """Of a thin set too, whose thickness nothing answers: what gains make of it is no less their doing."""
+    convex = {"zonotope": {"generators": [[0.02, 0.03], [-0.03 * thick, 0.02 * thick]]}}
+    more = {place: convex if place == "disturbance" else {"centre": [1.0, 0.0], **convex}}
+    options = {
+        "problem": problem(terminal=[{"box": [0.3, 0.3]}], **more),
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+        "policy": {"name": "affine", "cost": "peak"},
+    }
+    loop = assemble(load_config(options)).model.feedback.loop  # type: ignore[union-attr]
+    x = np.random.default_rng(1).normal(size=loop.variables)
+    effects = np.einsum("kjid,jdq->kiq", loop.gains(x), loop.innovations)
+    assert loop.effects(x) == pytest.approx(effects, abs=1e-12) and effects.any()
+    assert loop.spread.support(effects[-1]) == pytest.approx(loop.spread.support(loop.effects(x)[-1]), abs=1e-14)
+
+
+def test_what_is_still_is_what_no_state_feels() -> None:
+    """Of initial states widths of 1e-9, of disturbances what moves no state by 2^-37; none beside fixed final states,
+    all of a ball or nothing, but every side of a box for itself."""
+    options: dict[str, Any] = {
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+        "policy": {"name": "affine", "cost": "peak"},
+    }
+
+    def still(**more: Any) -> list[bool]:
+        model = assemble(load_config({**options, "problem": problem(**more)})).model
+        assert model.feedback is not None
+        found: list[bool] = model.feedback.loop.spread.still.tolist()  # type: ignore[union-attr]
+        return found
+
+    end = [{"box": [0.3, 0.3]}]
+    assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "box": [1e-12, 0.03]}) == [True, False]
+    assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "box": [1e-7, 0.03]}) == [False, False]
+    assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "norm": {"p": 2, "radius": 1e-12}}) == [True] * 2
+    assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "norm": {"p": 2, "radius": 1e-6}}) == [False] * 2
+    assert still(terminal=end, disturbance={"box": [1e-13, 0.03]}) == [True, False] * 4
+    assert still(terminal=end, disturbance={"box": [1e-9, 0.03]}) == [False, False] * 4
+    assert still(terminal=end, disturbance={"zonotope": {"generators": [[1e-13, 0], [0, 0.03]]}}) == [False] * 8
+    fixed = [{"equals": [0, 0]}]
+    assert still(terminal=fixed, initial_state={"centre": [1.0, 0.0], "box": [1e-12, 0.03]}) == [False, False]

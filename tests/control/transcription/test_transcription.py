@@ -9,11 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sparserob_core as sr
+import sparserob_core.checker.outcome as checked
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.sets.sets import Ellipsoid, Equality, NormBall, Polytope
+from sparserob_core.control.transcription.own_units import THIN, units_of_sides
 from sparserob_core.control.transcription.transcribe import transcribe
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Box
@@ -249,3 +251,16 @@ def test_a_control_that_answers_has_the_nominal_entries_and_the_units_of_one_tha
         assert literal is not None and literal.reduced is not None and literal.reduced.row_units is not None
         assert literal.index_units is not None and literal.index_units.size == literal.index_set.dimension
         assert literal.index_units.min() < 1.0 < literal.index_units.max()
+
+
+def test_the_unit_of_a_slab_that_doubles_do_not_resolve_is_how_far_its_row_reaches() -> None:
+    """2^-37 of the sums, less than what the checker calls thin; a sixteenth of the reach, since a claim may excuse no
+    more than what the row does. A unit is 1.2 to 2.5 times below that."""
+    assert THIN < checked.THIN
+    H, added = np.array([[1.0], [-1.0]]), np.full(2, 4.0)
+    for share, unit in ((0.99, 2.0**-4 * 3.0), (1.01, 2.0**-18 * 4.0)):
+        half = 0.5 * share * 2.0**-37 * 4.0
+        units = units_of_sides(H, np.array([2.0 + half, -2.0 + half]), np.full(2, 3.0), added)
+        assert (1.2 * units <= unit).all() and (unit <= 2.5 * units).all()
+    alone = units_of_sides(H[:1], np.array([0.99 * 2.0**-37 * 4.0]), np.array([3.0]), added[:1])
+    assert 1.2 * alone[0] <= 3.0 <= 2.5 * alone[0]  # of a wall beside 0 the reach, as of one at 0
