@@ -18,7 +18,7 @@ from sparserob_core.control.transcription.transcribe import from_state, in_own_u
 from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
 from sparserob_core.experiment.initial_states.feasible_set import ON_EDGE, InitialStates
 from sparserob_core.experiment.initial_states.search import InitialStatesSearch
