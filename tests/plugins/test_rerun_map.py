@@ -369,6 +369,84 @@ def test_a_value_of_a_policy_is_computed_in_the_programs_own_units_and_given_up_
     assert np.isnan(g.at(everywhere))
 
 
+def drawn_of(g: Any, *tuples: list[list[float]]) -> tuple[list[tuple[sr.Landscape, Any]], Any]:
+    """What an explorer draws of tuples that it is asked for one after the other, each to its end."""
+    from sparserob_rerun.options import LandscapeOptions
+    from sparserob_rerun.search.explorer import Aim, Explorer
+
+    found: list[tuple[sr.Landscape, Any]] = []
+    view: Any = SimpleNamespace(relaxed_value=lambda count, epsilon: g)
+    explorer = Explorer(lambda shown, aim: found.append((shown, aim)), view, LandscapeOptions(grid=8))
+    for number, slots in enumerate(tuples):
+        explorer.aim(Aim(np.array(slots), 0.1, float(number), ""))
+        explorer.finish(60.0)
+    return found, explorer
+
+
+def plain(value: Callable[[np.ndarray], float], kinds: tuple[str, ...], moves: tuple[int, ...] | None = None) -> Any:
+    """A function of tuples in the place of ``g``."""
+    width = len(kinds)
+    g: Any = SimpleNamespace(at=value, slot=sr.Box(np.zeros(width), np.ones(width)), kinds=kinds, interchangeable=True)
+    g.names = tuple(f"{kind[0]}{k}" for k, kind in enumerate(kinds))
+    g.coordinates = tuple(range(width)) if moves is None else moves
+    g.deciding = lambda: np.array([0, 1, -1, -1])
+    return g
+
+
+KINDS = ("time", "parameter", "parameter")
+
+
+@pytest.mark.parametrize(
+    ("value", "axes"),
+    [
+        (lambda s: s[0, 0] + 9 * s[0, 1] + 5 * s[1, 2], ((0, 1), (1, 2))),
+        (lambda s: 3 * s[0, 0] + 2 * s[1, 0] + s[0, 1], ((0, 0), (1, 0))),
+        (lambda s: np.inf if s[0, 2] > 0.9 else 4 * s[1, 0], ((1, 0), (0, 2))),
+        (lambda s: -abs(s[0, 1] - 0.5) - abs(s[0, 2] - 0.4) + 0.1 * s[0, 0], ((0, 1), (0, 2))),
+        (lambda s: 1.0, ((0, 0), (1, 0))),
+    ],
+)
+def test_axes_are_the_coordinates_along_which_g_moves_most(value: Any, axes: tuple[tuple[int, int], ...]) -> None:
+    found, _ = drawn_of(plain(value, KINDS), [[0.2, 0.5, 0.5], [0.7, 0.5, 0.5]])
+    landscape = found[-1][0]
+    assert (landscape.first, landscape.second) == axes and landscape.level == 1
+    low, high = landscape.limits
+    assert landscape.flat or high - low > 0.5
+
+
+def test_a_tuple_without_a_map_is_not_the_end_of_the_map_and_one_index_has_one_more_beside_it() -> None:
+    found, explorer = drawn_of(plain(lambda s: 1.0, ("time",), ()), [[0.2]])
+    assert not found and "no coordinate of the indices can move" in explorer.wrong and explorer.left > 0
+
+    def value(slots: np.ndarray) -> float:
+        if (slots[:, 0] > 2.0).any():
+            raise sr.InputError("the first tuple has no value")
+        return float(np.max(slots[:, 0]))
+
+    g = plain(value, ("time",))
+    g.slot = sr.Box(np.zeros(1), np.full(1, 3.0))
+    found, explorer = drawn_of(g, [[2.5]])
+    assert not found and "the first tuple has no value" in explorer.wrong
+    found, explorer = drawn_of(plain(lambda s: float(np.max(s)), ("time",)), [[0.4]], [[0.2]])
+    assert explorer.wrong == "" and {float(shown.value) for shown, _ in found} == {0.4, 0.2}
+    shown = found[-1][0]
+    assert shown.level == 1 and shown.anchor.shape == (2, 1) and shown.limits == (0.0, 1.0)
+
+
+def test_what_is_drawn_last_is_never_coarser_than_what_was_drawn_before_where_it_is_hardly_higher() -> None:
+    from sparserob_rerun.search.explorer import LARGE, Aim
+
+    found, explorer = drawn_of(plain(lambda s: s[0, 0] + s[1, 0], ("time",)), [[0.2], [0.7]])
+    height = 2.0
+    assert [shown.level for shown, _ in found][-1] == 1
+    for gain, more in ((0.5 * LARGE * height, 0), (2.0 * LARGE * height, 1)):
+        count = len(found)
+        explorer.aim(Aim(np.array([[0.3], [0.7 + gain]]), 0.1, gain, ""))
+        explorer.left = 1000  # of the next one there is the coarsest only
+        explorer.finish(0.2)
+        assert len(found) == count + more
+
+
 def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of_a_better_tuple() -> None:
     from sparserob_rerun.options import LandscapeOptions
     from sparserob_rerun.search.explorer import Aim, Explorer

@@ -245,14 +245,14 @@ class Recorder:
         return self.explorer.urgent
 
     def finish(self) -> None:
-        """A short run waits for its landscape; a long one had it meanwhile, and waits for a coarse one of its last
-        tuple; one that broke off does not wait."""
+        """A run waits for the landscape of its last tuple, to be as fine as there is time for; one that broke off does
+        not wait."""
         explorer = self.explorer
         if self.opening.landscape is not None and self.over >= 0.0:
-            shown, waits = self.terrain.known is not None, self.opening.waits
+            waits = self.opening.waits
             # of a run that is shown again every landscape may take as long; another one wants to end
             left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
-            self.draw(LANDSCAPE, explorer.finish, left - (0.5 * self.over if shown and not waits else 0.0))
+            self.draw(LANDSCAPE, explorer.finish, left)
             if explorer.waiting is not None or explorer.urgent:
                 left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
                 self.draw(LANDSCAPE, explorer.finish, left, 16, COARSE)  # any level is one

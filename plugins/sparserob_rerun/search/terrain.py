@@ -87,6 +87,7 @@ class Terrain:
                 sought=[aim.value],
                 epsilon=[landscape.epsilon],
                 level=[landscape.level],
+                names=list(landscape.names()),
             ),
         )
         self._mesh(landscape, (low, high))
