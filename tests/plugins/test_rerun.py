@@ -3,11 +3,13 @@ run."""
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 import socket
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import main
 from tests.support.places import CONFIGS
-from tests.support.recordings import read, scalars, texts, viewer, walk_of
+from tests.support.recordings import properties, read, scalars, texts, viewer, walk_of
 from tests.support.stub import STUB
 
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
@@ -113,10 +115,13 @@ def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(
     assert (values[:, 0] == trace.value[tried - 1]).all() and (others[:, 0] == trace.value[refused - 1]).all()
     assert (refused == numbers[trace.notes["accepted"] == 0.0]).all()
     evaluations, best = scalars(found["/search/g/best"], "evaluation")
-    assert (evaluations == numbers).all()
-    for outer in np.unique(trace.outer):
-        mine = trace.outer == outer
-        assert (best[mine, 0] == np.maximum.accumulate(trace.value[mine])).all()
+    for outer in np.unique(trace.outer):  # the line through what is there is the best so far at every evaluation
+        mine = np.flatnonzero(trace.outer == outer)
+        inside = (evaluations > mine[0]) & (evaluations <= mine[-1] + 1) & np.isfinite(best[:, 0])
+        line = np.interp(mine + 1, evaluations[inside], best[inside, 0])
+        assert (line == np.maximum.accumulate(trace.value[mine])).all()
+        if mine[0]:  # and there is none from one search to the next
+            assert np.isnan(best[evaluations == mine[0], 0]).any()
     proven = scalars(found["/search/g/bound"], "evaluation")[1][:, 0]
     proven = proven[np.isfinite(proven)]
     assert (np.diff(proven) >= 0).all()
@@ -171,7 +176,8 @@ def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.Fi
     }
     search = {
         "/search/g/walk",
-        "/search/stages/walk",
+        "/landscape/map/bar",
+        "/landscape/words",
         "/search/notes/temperature",
         "/search/notes/accepted",
         "/search/moves/t",
@@ -180,6 +186,54 @@ def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.Fi
     assert common | (search if kind == "searched" else set()) <= set(found)
     rows = sum(chunk.num_rows for chunk in found["/physics/plots/curve"])
     assert rows == len(outcome.result.history) + 1
+
+
+def test_a_recording_has_a_name_and_says_of_what_it_is_and_how_it_ended(exchanged: sr.Outcome) -> None:
+    said = properties(exchanged.directory / "recording.rrd")
+    result = exchanged.result
+    assert said["name"] == said["title"] == json.loads(said["config"])["title"]
+    assert said["status"] == "certified" and said["cost"] == result.cost and said["lower_bound"] == result.lower_bound
+    assert json.loads(said["config"])["problem"]["name"] == "linear" and said["seed"] == 0
+
+
+def test_what_is_arranged_otherwise_has_another_place_in_the_viewer() -> None:
+    from sparserob_rerun.options import LandscapeOptions
+    from sparserob_rerun.recording.recorder import shown_of
+
+    configs = ["experiment1_repaired", "experiment1_reduced", "experiment1_feedback", "atv_box", "experiment2_repaired"]
+    seen = [shown_of(inspection(f"{config}.yaml", {}), LandscapeOptions()) for config in configs]
+    names = [one.application for one in seen]
+    assert len(set(names)) == len(names) and all(name.startswith("sparserob ") for name in names)
+    assert names[1] == replace(seen[1], told=frozenset({"depth"}), stages=((0, 1.0),)).application
+
+
+def test_the_chunks_of_a_recording_are_as_few_as_the_format_wants_and_nothing_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import rerun as rr
+
+    from sparserob_rerun.recording import sinks
+
+    file = tmp_path / "x.rrd"
+    stream = rr.RecordingStream("sparserob test", recording_id="one")
+    stream.set_sinks(rr.FileSink(str(file)))
+    for number in range(300):
+        stream.set_time("evaluation", sequence=number)
+        stream.log("here", rr.Scalars(float(number)))
+        if number % 10 == 0:
+            stream.flush(timeout_sec=5.0)
+    stream.disconnect()
+    before, size = read(file)["/here"], file.stat().st_size
+    monkeypatch.setattr(sinks, "viewer", lambda: Path("nowhere"))
+    sinks.compact(file)
+    assert file.stat().st_size == size  # what cannot be joined stays as it is
+    monkeypatch.undo()
+    sinks.compact(file)
+    after = read(file)["/here"]
+    assert len(before) >= 20 and len(after) <= 2 and file.stat().st_size < 0.5 * size
+    assert [path.name for path in tmp_path.iterdir()] == ["x.rrd"]
+    for one, other in zip(scalars(before, "evaluation"), scalars(after, "evaluation"), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_the_last_page_and_the_log_tell_the_verdict(exchanged: sr.Outcome) -> None:
@@ -241,6 +295,10 @@ def inspection(config: str = "experiment1_reduced.yaml", changes: dict[str, obje
     return sr.Inspection(load_config(CONFIGS / config, changes))
 
 
+def landscape_up(landscape: sr.Landscape, cell: int, cells: int) -> float:
+    return float(landscape.axes[1][0] + np.ptp(landscape.axes[1]) * (cell + 0.5) / cells)
+
+
 def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
     anchor = np.array([[0.5], [0.9], [3.0], [4.9]])
     found = []
@@ -259,7 +317,10 @@ def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
     assert np.ptp(found[0]) > 1e-3
     picture = landscape.picture(50)
     assert picture.min() >= landscape.limits[0] - 1e-12 and picture.max() <= landscape.limits[1] + 1e-12
-    assert picture[0, 0] == found[0][0, 0] and picture[-1, -1] == found[0][-1, -1]
+    even = (landscape.axes[0] - landscape.axes[0][0]) / np.ptp(landscape.axes[0]) * 50 - 0.5
+    for i, j in ((12, 30), (24, 3), (49, 49)):  # each the value in the middle of its cell, in straight lines
+        one = np.array([np.interp(i, even, column) for column in found[0].T])
+        assert picture[i, j] == pytest.approx(np.interp(landscape_up(landscape, j, 50), landscape.axes[1], one))
 
 
 def test_coordinates_of_the_landscape_are_named_as_in_the_config_or_refused_with_what_there_is() -> None:

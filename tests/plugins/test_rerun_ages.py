@@ -34,7 +34,7 @@ PANELS = (
     "/physics/plots",
     "/physics/phase",
     "/landscape/map",
-    "/search/stages",
+    "/search/g",
     "/violation/plots",
     "/rounds/picture/bounds",
     "/verdict",

@@ -46,6 +46,7 @@ def test_the_page_moves_to_another_port_where_its_own_is_taken(monkeypatch: pyte
         chosen = sinks.look(None, None, False, True)
         assert chosen.web != taken.getsockname()[1]
         assert f"127.0.0.1:{chosen.web}/" in chosen.page
+        assert chosen.page.endswith("&hide_welcome_screen=1&theme=dark")  # no welcome, and no white frame
     assert sinks.look(None, None, False, True).web == sinks.WEB_PORT
 
 

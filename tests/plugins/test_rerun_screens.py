@@ -209,7 +209,7 @@ def test_what_a_drawing_has_no_more_is_taken_away() -> None:
     assert gone == {"here/bound", "here/dots"}
 
 
-@pytest.mark.parametrize(("horizon", "left"), [(5.0, -72.0), (7200.0, -108.0), (0.5, -90.0)])
+@pytest.mark.parametrize(("horizon", "left"), [(5.0, -54.0), (7200.0, -90.0), (0.5, -72.0)])
 def test_the_map_has_room_for_the_numbers_of_its_times(horizon: float, left: float) -> None:
     from sparserob_rerun.search.views import landscape
 
@@ -431,17 +431,12 @@ def test_of_three_numbers_for_which_there_is_no_room_the_one_between_is_left_out
     assert low.tolist() == [-2.0, 2.0] and high.tolist() == [-2.0, 0.0, 2.0]
 
 
-def test_decades_are_whole_and_a_search_that_gains_nothing_more_has_numbers_that_can_be_told_apart() -> None:
-    from sparserob_rerun.drawing.canvas import _apart, ticks
-    from sparserob_rerun.search.climb import _limits
+def test_decades_are_whole() -> None:
+    from sparserob_rerun.drawing.canvas import _apart
 
     for low, high in ((-1.0, 0.0), (-2.0, 0.0), (-9.0, 1.0)):
         found = _apart(Axes(0.0, 0.0, 100.0, 136.0, (0.0, 1.0), (low, high)), 34.0, True)
         assert found.size > 1 and (found == np.rint(found)).all()
-    for value in (0.6380821, 2.6840191, 19.3710512, -4.5):
-        none = np.full(3, np.nan)
-        numbers = [f"{one:.7g}" for one in ticks(*_limits(np.full(3, value), none, np.full(3, value), []), 3)]
-        assert len(set(numbers)) == len(numbers) > 0 and max(map(len, numbers)) <= 6
 
 
 def test_a_system_in_a_plane_is_drawn_there_with_the_arcs_on_which_its_control_acts() -> None:

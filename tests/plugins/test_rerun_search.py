@@ -158,8 +158,8 @@ def test_a_recorder_that_is_killed_changes_no_bit_and_leaves_a_file_that_opens(
     found = read(file)
     assert len(found["/search/g/best"]) and texts(found["/log"], "TextLog:text")
     evaluations, best = scalars(found["/search/g/best"], "evaluation")
-    assert evaluations.size > 300
-    assert (best[:, 0] <= plain.result.trace.value.max() + 1e-12).all()
+    assert evaluations[-1] > 300
+    assert (best[np.isfinite(best[:, 0]), 0] <= plain.result.trace.value.max() + 1e-12).all()
     subprocess.run([viewer(), "rrd", "stats", file], check=True, capture_output=True)
 
 
@@ -212,5 +212,5 @@ def test_a_panel_that_fails_is_named_in_the_log_and_costs_nothing_else(
     log = texts(found["/log"], "TextLog:text")
     assert len([line for line in log if "the landscape could not be drawn: ValueError: cannot reshape" in line]) == 1
     assert f"**{outcome.status}**" in texts(found["/verdict"], "TextDocument:text")[-1]
-    assert {"/search/g/walk", "/search/stages/best", "/physics/plots/curve"} <= set(found)
+    assert {"/search/g/walk", "/physics/plots/curve"} <= set(found)
     assert ["the landscape could not be drawn" in record.getMessage() for record in caplog.records] == [True]

@@ -32,6 +32,20 @@ def read(file: Path) -> dict[str, list[Any]]:
     return found
 
 
+def properties(file: Path) -> dict[str, Any]:
+    """What a recording says of itself: the values of its properties by name."""
+    from rerun.chunk import RrdReader
+
+    found = dict[str, Any]()
+    for chunk in RrdReader(str(file)).stream():
+        if chunk.entity_path.startswith("/__properties"):
+            batch = chunk.to_record_batch()
+            for name, column in zip(batch.schema.names, batch.columns, strict=True):
+                entries = [entry for entry in column.to_pylist() if isinstance(entry, list) and entry]
+                found |= {name.rpartition(":")[2]: entry[0] for entry in entries[-1:]}
+    return found
+
+
 def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
     """Times ``(k,)`` and values ``(k, series)`` of an entity, in the order of a timeline."""
     times, values = [], []

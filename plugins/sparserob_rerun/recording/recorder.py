@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections import deque
 from collections.abc import Callable
@@ -20,8 +21,7 @@ from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
 from sparserob_rerun.recording.layout import Shown, layout
-from sparserob_rerun.recording.waiting import BOUNDS, CLASH, CLIMB, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
-from sparserob_rerun.search.climb import Climb
+from sparserob_rerun.recording.waiting import BOUNDS, CLASH, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
 from sparserob_rerun.search.explorer import Aim, Explorer
 from sparserob_rerun.search.projection import Projector
 from sparserob_rerun.search.search import SearchView
@@ -29,9 +29,13 @@ from sparserob_rerun.search.terrain import Terrain
 from sparserob_rerun.search.way import Stage
 
 SEEN = 10  # evaluations between two pictures of the way
-PICTURE_EVERY, SPARE = 0.5, 20.0
+PICTURE_EVERY, SPARE = 1.0, 20.0
 """Seconds between them, and how many times the processor time of one. Ten times as many, and the climb stands still for
 seconds; a tenth, and pictures take as much of a processor as the search."""
+ARRANGED = 100
+"""Evaluations of a search after which its panels are arranged: then the maximiser has told all that it tells. With a
+tenth they are arranged again for every word of it, in as many kilobytes as a minute of the search takes; with ten times
+as many a search of another weight has no panel for seconds."""
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
 PROOF = "proof of"
 LATE = 8.0
@@ -80,10 +84,11 @@ class Recorder:
         self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
         self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
-        self.terrain = Terrain(rr, stream, "" if problem is None else problem.names.time, shown.searches)
+        time_unit, cost_unit = ("", "") if problem is None else (problem.names.time, problem.cost_unit)
+        self.terrain = Terrain(rr, stream, time_unit, cost_unit)
         self.explorer = Explorer(self._landscape, inspection, opening.landscape, opening.waits)
         self.search, self.projector = SearchView(rr, stream, self.timelines), Projector()
-        self.climb, self.stages = Climb(rr, stream), list[Stage]()
+        self.stages = list[Stage]()
         self.shown, self.searches, self.began = shown, shown.searches, 0.0
         self.best_value, self.unseen, self.behind, self.way = -np.inf, 0, False, False
         self.heard = self.next = time.monotonic()
@@ -99,7 +104,25 @@ class Recorder:
         self.waiting = Waiting(rr, stream, shown)
         stream.log("howto", rr.TextDocument(words.SIGNALS), static=True)
         self.say(f"run: {opening.title}")
+        self._describe(opening.title)
         self._page("solving", [])
+
+    def _describe(self, title: str) -> None:
+        """Give the recording its name, and say of what it is."""
+        self.stream.send_recording_name(title)
+        known: dict[str, Any] = {"title": [title]}
+        if self.inspection is not None:
+            config = self.inspection.config
+            known |= {"config": [json.dumps(config, default=str)], "seed": [config.get("seed", 0)]}
+        self.stream.send_property("run", self.rr.AnyValues(**known))
+
+    def _conclude(self, event: sr.RunFinished) -> None:
+        """Say how the run has ended."""
+        result, known = event.result, dict[str, Any](status=[event.status], seconds=[event.seconds])
+        if result is not None:
+            known |= {"lower_bound": [result.lower_bound], "upper_bound": [result.upper_bound]}
+            known |= {"cost": [float(result.cost)]} if result.decision is not None else {}
+        self.stream.send_property("result", self.rr.AnyValues(**known))
 
     def receive(self, event: sr.Event) -> None:
         """Log one event; one of evaluated tuples is a thin one (`thin`)."""
@@ -190,12 +213,9 @@ class Recorder:
         if not self.stages:
             return
         stage, self.way = self.stages[-1], True
-        self.draw(CLIMB, self.climb.draw, self.stages, self.exact)
         self.draw("the way of the search", self.terrain.visit, stage)
-        told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
-        if not (told <= self.shown.told and moved <= self.shown.moved):
-            self.shown = replace(self.shown, told=self.shown.told | told, moved=self.shown.moved | moved)
-            self.draw("the arrangement of the search", self.stream.send_blueprint, layout(self.shown))
+        if stage.values.size >= ARRANGED or np.isfinite(self.ended):
+            self._arrange()
         weight = f"epsilon = {stage.epsilon:.3g}, " if np.isfinite(stage.epsilon) else ""
         if not self.exact:
             done = self.timelines.evaluation - stage.base
@@ -204,6 +224,15 @@ class Recorder:
             self.lower = max(self.lower, stage.lower_bound)
             self._page("solving", [line])
         self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.thread_time() - began))
+
+    def _arrange(self) -> None:
+        """Give what the search has told since the last arrangement its panels."""
+        told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
+        begun = tuple((one.base, one.epsilon) for one in self.stages)
+        if not (told <= self.shown.told and moved <= self.shown.moved and begun == self.shown.stages):
+            told, moved = self.shown.told | told, self.shown.moved | moved
+            self.shown = replace(self.shown, told=told, moved=moved, stages=begun)
+            self.draw("the arrangement of the search", self.stream.send_blueprint, layout(self.shown))
 
     def _landscape(self, landscape: sr.Landscape, aim: Aim) -> None:
         """Draw a landscape at the moment at which it is there, and the way on it."""
@@ -314,6 +343,7 @@ class Recorder:
         if result is not None:
             self.lower, self.upper = result.lower_bound, result.upper_bound
             self.exact = result.value if event.status == "certified" else None
+        self._conclude(event)
         self._page(event.status, lines)  # before anything that takes time
         if result is not None:
             if event.status != "infeasible":
@@ -341,7 +371,13 @@ class Recorder:
             {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(event.status, "INFO"),
         )
         if self.exact is not None and self.stages:
-            self.draw("the search", self.search.exact, self.exact, result.epsilon if result is not None else 0.0)
+            self.draw(
+                "the search",
+                self.search.exact,
+                self.exact,
+                result.epsilon if result is not None else 0.0,
+                self.stages[-1].base,
+            )
         self._way()
         self._page(event.status, lines)
 

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +18,10 @@ import sparserob_core as sr
 
 PORT, WEB_PORT = 9876, 9090
 STARTING = 15.0  # seconds that a viewer may take until it listens
+JOINING = 20.0
+"""Seconds that the chunks of a finished recording may be joined for. Ten times as many, and a run waits for a large
+file; with a tenth a busy machine leaves it four times as large."""
+TOGETHER = "1e9"  # how many times as large as another one a component may be in the same chunk: none is set apart
 MEMORY = "25%"  # of the machine's, for a viewer that is started
 
 
@@ -42,7 +47,8 @@ class Destinations:
     @property
     def page(self) -> str:
         """The page that a browser is to open."""
-        return f"http://127.0.0.1:{self.web}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{self.serve}%2Fproxy"
+        source = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{self.serve}%2Fproxy"
+        return f"http://127.0.0.1:{self.web}/?url={source}&hide_welcome_screen=1&theme=dark"
 
 
 def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> Destinations:
@@ -131,6 +137,19 @@ def sinks_of(rr: Any, chosen: Destinations, started: Started) -> tuple[list[Any]
             wrong.append("the viewer did not start")
     sinks += [rr.GrpcSink(f"rerun+http://{host}:{port}/proxy") for host, port in addresses]
     return sinks, wrong
+
+
+def compact(file: Path) -> None:
+    """Join what is in a finished recording to chunks as large as the format wants: live, each is as small as what has
+    happened in a moment. Where that cannot be done, the recording stays as it is."""
+    joined = file.with_name(f".{file.name}.joined")
+    command = [str(viewer()), "rrd", "optimize", str(file), "-o", str(joined), "--split-size-ratio", TOGETHER]
+    with suppress(OSError, subprocess.SubprocessError):
+        if file.is_file():
+            subprocess.run(command, check=True, timeout=JOINING, capture_output=True, stdin=subprocess.DEVNULL)
+            joined.replace(file)
+    with suppress(OSError):
+        joined.unlink(missing_ok=True)
 
 
 def _unwritable(file: Path) -> str:

@@ -11,9 +11,9 @@ from sparserob_rerun.physics import physics
 from sparserob_rerun.physics.pages import pages
 from sparserob_rerun.physics.phase import pair_of
 from sparserob_rerun.recording.layout import PHASE, Shown
-from sparserob_rerun.search import climb, views
+from sparserob_rerun.search import views
 
-CONTROL, LANDSCAPE, CLIMB = "control and states", "the landscape", "the climb"
+CONTROL, LANDSCAPE = "control and states", "the landscape"
 VIOLATIONS, BOUNDS, CLASH = "the violations", "the bounds", "what clashes"
 
 
@@ -35,8 +35,6 @@ class Waiting:
         if shown.landscape:
             tuples = "the first tuple is evaluated" if shown.searches else "the first constraints are active"
             self._write(LANDSCAPE, "landscape/map", views.EXTENT, f"the landscape of g is drawn when {tuples}")
-        if shown.searches:
-            self._write(CLIMB, "search/stages", climb.EXTENT, "the climb begins with the first evaluations of g")
         self._write(
             VIOLATIONS,
             "violation/plots",

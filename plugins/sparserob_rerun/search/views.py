@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, Literal
+
+import numpy as np
 
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import ticks, view
-from sparserob_rerun.search import climb as stages
 from sparserob_rerun.search.search import LOGARITHMIC, NOTES
+from sparserob_rerun.search.terrain import BAR, HEIGHT
 
 FIRST = ("temperature", "depth", "constant", "radius", "reach", "spread", "slope")  # of what is noted, for the overview
 SHARES = ("accepted", "rejected", "local")
@@ -27,13 +29,23 @@ def landscape(searches: bool, answers: bool, horizon: float = 1.0) -> Any:
     return view("/landscape/map", f"{name}: when the run is over" if answers else name, (left, *EXTENT[1:]))
 
 
-EXTENT = (-72.0, 1090.0, -94.0, 520.0)
+EXTENT = (-54.0, BAR[0] + BAR[1] + 100.0, -64.0, HEIGHT + 82.0)
 LETTER, LETTERS = 18.0, 2  # how much room a letter takes, and how many have it within the `EXTENT`
+MOST = 4  # searches whose climbs are beside one another; of more the last ones
+CLIMB = ("tried", "refused", "walk", "best", "exact")
 
 
-def climb() -> Any:
-    """The climb, one panel for each weight epsilon."""
-    return view("/search/stages", "g (up) over the evaluations (across), one panel for each epsilon", stages.EXTENT)
+def climb(rrb: Any, stages: Sequence[tuple[int, float]]) -> Any:
+    """The climb, a plot for each search on a scale of its own. ``stages``: how many evaluations there were before it,
+    and its weight epsilon."""
+    shown = list(stages)[-MOST:] or [(0, np.nan)]
+    ends = [base for base, _ in shown[1:]] + [None]
+    plots = []
+    for (base, epsilon), end in zip(shown, ends, strict=True):
+        name = f"epsilon {epsilon:.3g}: g" if np.isfinite(epsilon) and epsilon > 0.0 else "g over the evaluations"
+        plot = series(rrb, "/search/g", name, [f"+ /search/g/{one}" for one in CLIMB], evaluations=(base + 1, end))
+        plots.append(plot)
+    return rrb.Horizontal(*plots) if len(plots) > 1 else plots[0]
 
 
 def series(
@@ -43,13 +55,20 @@ def series(
     contents: list[str] | None = None,
     legend: Literal["left", "right", "below"] = "right",
     limits: tuple[float, float] | None = None,
+    evaluations: tuple[int, int | None] | None = None,
 ) -> Any:
     """A plot against the timeline that shows the whole of it, however long it is. ``legend``: the corner in which
     the names of its lines are, an upper one or the lower left one; ``limits``: of the axis upwards, where they are
-    known before."""
+    known before; ``evaluations``: the first and the last that are shown, and decide its height, ``None`` for the last
+    that there is."""
     from rerun.encodings import TimeRange
 
-    everything = TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+    first, last = (None, None) if evaluations is None else evaluations
+    start, end = (
+        rrb.TimeRangeBoundary.infinite() if place is None else rrb.TimeRangeBoundary.absolute(seq=place)
+        for place in (first, last)
+    )
+    shown = None if first is None else rrb.VisibleTimeRange("evaluation", start=start, end=end)
     return rrb.TimeSeriesView(
         origin=origin,
         contents=contents or ["+ $origin/**"],
@@ -60,7 +79,8 @@ def series(
             ],
             visible=contents is None,
         ),
-        axis_x=rrb.TimeAxis(view_range=everything),
+        axis_x=rrb.TimeAxis(view_range=TimeRange(start=start, end=end)),
+        time_ranges=None if shown is None else [shown],
         axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
     )
 
@@ -79,9 +99,9 @@ def _note(rrb: Any, name: str) -> Any:
     return series(rrb, "/search/notes", words[0].upper() + words[1:], [f"+ /search/notes/{name}"], limits=limits)
 
 
-def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:
-    """The tab of a search: what the maximiser has ``told`` of itself, and the coordinates that have ``moved``, each on
-    an axis of its own."""
+def tab(rrb: Any, told: Collection[str], moved: Collection[str], stages: Sequence[tuple[int, float]]) -> Any:
+    """The tab of a search: the climb of its ``stages``, what the maximiser has ``told`` of itself, and the coordinates
+    that have ``moved``, each on an axis of its own."""
     order = [name for name in (*LOGARITHMIC, *NOTES) if name in told]
     names = [*dict.fromkeys([*order, *sorted(told)])]
     mine = [_note(rrb, name) for name in names]
@@ -89,7 +109,7 @@ def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:
         series(rrb, "/search/moves", f"Where it moves: {name}", [f"+ /search/moves/{name}"]) for name in sorted(moved)
     ]
     left = rrb.Vertical(
-        climb(),
+        climb(rrb, stages),
         series(rrb, "/search/g", "g, with the share of the regulariser, over the evaluations", legend="below"),
         row_shares=[3, 2],
     )

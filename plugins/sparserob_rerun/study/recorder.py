@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import shorten
 from typing import Any, final
+from zlib import crc32
 
 import numpy as np
 
@@ -41,6 +42,11 @@ class StudyOpening:
     event: sr.SweepStarted
     waits: bool = False
 
+    @property
+    def application(self) -> str:
+        """The name of the viewer's application: it keeps one arrangement for each."""
+        return f"sparserob study {crc32(repr((list(self.event.axes), self.event.arrangement)).encode()):08x}"
+
 
 @final
 class StudyRecorder:
@@ -58,6 +64,8 @@ class StudyRecorder:
         self.text = "its points are found on the way" if searched else self._done()
         self.over = ""
         self.seconds, self.next = 0.0, 0.0
+        stream.send_recording_name(self.event.title)
+        stream.send_property("study", rr.AnyValues(title=[self.event.title], axes=list(self.event.axes)))
         self._tell(f"study: {self.event.title}")
         if self.rows:
             self._tell(f"{len(self.rows)} points were finished before")

@@ -184,12 +184,12 @@ class Landscape:
         return bool(np.isfinite(self.shown[2]).all() and high - low <= FLAT * max(1.0, abs(high)))
 
     def picture(self, size: int) -> Array:
-        """The values ``(size, size)`` on an even grid, between those that are known in straight lines; beside an
-        infinite value as the nearest of them."""
+        """The values ``(size, size)`` in the middles of even cells, between those that are known in straight lines;
+        beside an infinite value as the nearest of them."""
         across, up, values = self.shown
         shares = []
         for axis in (across, up):
-            even = np.linspace(axis[0], axis[-1], size)
+            even = axis[0] + (axis[-1] - axis[0]) * (np.arange(size) + 0.5) / size
             left = np.clip(np.searchsorted(axis, even, side="right") - 1, 0, axis.size - 2)
             shares.append((left, (even - axis[left]) / (axis[left + 1] - axis[left])))
         (i, s), (j, t) = shares
