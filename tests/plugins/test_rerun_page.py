@@ -31,10 +31,14 @@ def variable(name: str) -> str:
     return found.group(1)
 
 
-def test_make_live_watches_the_papers_annealing_with_keys_that_exist() -> None:
-    config = load_config(ROOT / variable("LIVE")).config
-    assert (config.method.name, config.maximiser.name) == ("sparserob", "simulated_annealing")
-    assert config.method.options["formulation"] == "literal"
+def test_make_live_watches_an_annealing_with_keys_that_exist_and_the_literal_one_beside_it() -> None:
+    changes = variable("ANNEALING").split()
+    for config, overrides, formulation in (("LIVE", changes, "reduced"), ("LITERAL_LIVE", [], "literal")):
+        found = load_config(ROOT / variable(config), overrides).config
+        assert (found.method.name, found.maximiser.name) == ("sparserob", "simulated_annealing")
+        assert found.method.options["formulation"] == formulation
+        assert found.dictionaries.control is not None
+        assert found.dictionaries.control.options["pieces"] == 100
     assert "live: $(INSTALLED)" in (ROOT / "Makefile").read_text()
 
 

@@ -117,7 +117,7 @@ def _recorded(
     if sinks and not within(ENDING, partial(stream.set_sinks, *sinks, default_blueprint=blueprint)):
         return Account(wrong, "nothing could be sent" if chosen.save is None else broken(chosen.save))
     guard.open(stream, chosen.connect is None and not started)
-    ending, broke_off = Ending(), ""
+    ending, broke_off, recorder = Ending(), "", None
     try:
         recorder = begin()
         ending = _listen(messages, recorder, guard, wrong)
@@ -128,7 +128,7 @@ def _recorded(
     finally:
         broke_off = guard.close()
         if chosen.save is not None and not broke_off:
-            compact(chosen.save)
+            compact(chosen.save, recorder.arrangement if recorder is not None else blueprint)
         if servers(chosen, started):
             _look_on(ending.keep, messages)
     if guard.wrong and not broke_off:  # of the flush: a viewer that went away

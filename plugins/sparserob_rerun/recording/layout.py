@@ -26,7 +26,8 @@ PHASE = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the phase
 class Shown:
     """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
     the landscape; of a search what the maximiser has ``told`` of itself, the coordinates that have ``moved``, and of
-    every search so far (``stages``) the evaluations before it and its weight epsilon.
+    every search, once all are over (``stages``), the evaluations before it and its weight epsilon; ``budget``: the
+    evaluations of one, 0 where that is not known.
     ``clash``, once a run is infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn;
     ``drawn``: whether there were decisions before that; ``maps``: how many families have a map of their violation;
     ``answers``: whether the control answers what it measures."""
@@ -42,6 +43,7 @@ class Shown:
     maps: int = 0
     answers: bool = False
     stages: tuple[tuple[int, float], ...] = ()
+    budget: int = 0
 
     @property
     def application(self) -> str:
@@ -64,7 +66,7 @@ def layout(shown: Shown) -> Any:
     overview = rrb.Horizontal(*columns, name="Overview", column_shares=shares)
     tabs = [overview, _exchange(rrb, shown)]
     if shown.searches:
-        tabs.insert(1, search.tab(rrb, shown.told, shown.moved, shown.stages))
+        tabs.insert(1, search.tab(rrb, shown.told, shown.moved, search.climb(rrb, shown.stages, shown.budget)))
     if shown.problem is not None and len(pages(shown.problem)) > 1:
         tabs.insert(1, _further(rrb, shown.problem))
     if shown.landscape:
@@ -90,13 +92,13 @@ def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
     words = [rrb.TextDocumentView(origin="/verdict", name="What is known")]
     plane = [_phase(rrb, shown.problem)] if shown.problem is not None and shown.problem.system.states > 1 else []
     map_words = [rrb.TextDocumentView(origin="/landscape/words", name="What the map shows")] if shown.landscape else []
-    plots = [] if shown.problem is None else [_plots(shown.problem)]
+    plots = [] if shown.problem is None else [_plots(shown.problem, shown.searches)]
     if shown.searches:  # the search is what is seen first: its map has more than half of the screen
         terrain = [_terrain(shown)] if shown.landscape else []
-        left = rrb.Vertical(*terrain, search.climb(rrb, shown.stages), row_shares=[4, 1][-1 - len(terrain) :])
-        texts = rrb.Horizontal(*words, *map_words)
-        right = [texts, *plots, *plane]
-        return [left, rrb.Vertical(*right, row_shares=[5, 6, 4][: len(right)])], [9, 5]
+        below = rrb.Horizontal(search.climb(rrb, shown.stages, shown.budget), _lane(rrb), column_shares=[3, 1])
+        left = rrb.Vertical(*terrain, below, row_shares=[4, 1][-1 - len(terrain) :])
+        right = [rrb.Horizontal(*words, *map_words), *plots, *plane]
+        return [left, rrb.Vertical(*right, row_shares=[6, 6, 4][: len(right)])], [9, 5]
     numbers = [_violation(rrb, shown), _bounds(rrb)]
     middle = (
         rrb.Vertical(_terrain(shown), *numbers, row_shares=[10, _room(shown), 5])
@@ -108,9 +110,14 @@ def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
     return [*plots, middle, rrb.Vertical(*words, row_shares=heights)], ([5, 4, 3] if plots else [4, 3])
 
 
-def _plots(problem: sr.OptimalControlProblem) -> Any:
+def _plots(problem: sr.OptimalControlProblem, searches: bool) -> Any:
     first = pages(problem)[0]
-    return view(f"/{first.path}", heading(problem), physics.extent(len(first.plots)))
+    count = len(first.plots)
+    return view(f"/{first.path}", heading(problem, searches), physics.extent(count, physics.height(count, searches)))
+
+
+def _lane(rrb: Any) -> Any:
+    return rrb.StateTimelineView(origin="/state", name="What is going on")
 
 
 def _terrain(shown: Shown) -> Any:
@@ -223,4 +230,5 @@ def _exchange(rrb: Any, shown: Shown) -> Any:
         name = "Violation over time and the first parameter: red is forbidden"
         extent = rounds.extent_of_maps(shown.maps)
         right.append(view("/violation", name, extent, "/violation/maps/** /violation/names/**"))
+    right.append(_lane(rrb))
     return rrb.Horizontal(left, rrb.Vertical(*right), name="Exchange")

@@ -29,9 +29,9 @@ from sparserob_rerun.search.terrain import Terrain
 from sparserob_rerun.search.way import Stage
 
 SEEN = 10  # evaluations between two pictures of the way
-PICTURE_EVERY, SPARE = 1.0, 20.0
-"""Seconds between them, and how many times the processor time of one. Ten times as many, and the climb stands still for
-seconds; a tenth, and pictures take as much of a processor as the search."""
+PICTURE_EVERY, SPARE = 1.0, 10.0
+"""Seconds between them, and how many times the processor time of one. Ten times as many, and the control stands still
+for seconds; a tenth, and pictures take as much of a processor as the search."""
 ARRANGED = 100
 """Evaluations of a search after which its panels are arranged: then the maximiser has told all that it tells. With a
 tenth they are arranged again for every word of it, in as many kilobytes as a minute of the search takes; with ten times
@@ -83,7 +83,9 @@ class Recorder:
         self.rr, self.stream, self.opening, self.inspection = rr, stream, opening, inspection
         self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
-        self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
+        self.physics = (
+            Physics(rr, stream, inspection, shown.searches) if inspection is not None and problem is not None else None
+        )
         time_unit, cost_unit = ("", "") if problem is None else (problem.names.time, problem.cost_unit)
         self.terrain = Terrain(rr, stream, time_unit, cost_unit)
         self.explorer = Explorer(self._landscape, inspection, opening.landscape, opening.waits)
@@ -91,17 +93,23 @@ class Recorder:
         self.stages = list[Stage]()
         self.shown, self.searches, self.began = shown, shown.searches, 0.0
         self.best_value, self.unseen, self.behind, self.way = -np.inf, 0, False, False
+        self.relaxed: tuple[tuple[int, float], sr.RelaxedValue] | None = None
+        self.optimal: Floats = np.zeros((0, 0))  # the tuple whose control is shown
         self.heard = self.next = time.monotonic()
         self.ended = np.inf  # the moment at which the run was over, once it is
         self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
         self.lower, self.upper, self.over = -np.inf, np.inf, -1.0
         self.exact: float | None = None
+        self.concluded = False
         self.answerable = True  # whether it is known through which rows the landscape of a policy goes
         self.proofs: dict[str, int] = {}
         self.broken: dict[str, str] = {}
         self.drawn, self.said = False, deque[str](maxlen=LINES)
         self.timelines.move()
         self.waiting = Waiting(rr, stream, shown)
+        self.state = ""
+        names, colours = list(words.STATES), [list(colour) for colour in words.STATES.values()]
+        stream.log("state", rr.StateConfiguration(values=names, labels=names, colors=colours), static=True)
         stream.log("howto", rr.TextDocument(words.SIGNALS), static=True)
         self.say(f"run: {opening.title}")
         self._describe(opening.title)
@@ -118,6 +126,7 @@ class Recorder:
 
     def _conclude(self, event: sr.RunFinished) -> None:
         """Say how the run has ended."""
+        self.concluded = True
         result, known = event.result, dict[str, Any](status=[event.status], seconds=[event.seconds])
         if result is not None:
             known |= {"lower_bound": [result.lower_bound], "upper_bound": [result.upper_bound]}
@@ -127,6 +136,7 @@ class Recorder:
     def receive(self, event: sr.Event) -> None:
         """Log one event; one of evaluated tuples is a thin one (`thin`)."""
         self.heard = time.monotonic()
+        self._go_on(words.state_of(event, self.state))
         match event:
             case sr.EvaluationsFinished():
                 self._evaluations(event)
@@ -142,6 +152,12 @@ class Recorder:
                     )
             case sr.RunFinished():
                 self._finished(event)
+
+    def _go_on(self, state: str) -> None:
+        """Note on the lane what the run does from now on, where it is another thing than before."""
+        if state != self.state:
+            self.state = state
+            self.stream.log("state", self.rr.StateChange(state=state))
 
     def draw(self, panel: str, task: Callable[..., object], *arguments: Any) -> None:
         """Draw a panel; one that fails is named in the log, once, and is left out from then on."""
@@ -214,8 +230,10 @@ class Recorder:
             return
         stage, self.way = self.stages[-1], True
         self.draw("the way of the search", self.terrain.visit, stage)
-        if stage.values.size >= ARRANGED or np.isfinite(self.ended):
-            self._arrange()
+        if self.physics is not None and stage.best.size and not self.shown.answers:
+            self.draw(CONTROL, self._control, stage)
+        if stage.values.size >= ARRANGED or self.concluded:
+            self._arrange(stage)
         weight = f"epsilon = {stage.epsilon:.3g}, " if np.isfinite(stage.epsilon) else ""
         if not self.exact:
             done = self.timelines.evaluation - stage.base
@@ -225,14 +243,28 @@ class Recorder:
             self._page("solving", [line])
         self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.thread_time() - began))
 
-    def _arrange(self) -> None:
+    def _control(self, stage: Stage) -> None:
+        """Draw the control that is optimal for the best tuple so far, where it is another one."""
+        slots = stage.best.reshape(-1, stage.block)
+        if self.inspection is None or self.physics is None or np.array_equal(self.optimal, slots):
+            return
+        if self.relaxed is None or self.relaxed[0] != (len(slots), stage.epsilon):
+            key = (len(slots), stage.epsilon)
+            self.relaxed = key, self.inspection.relaxed_value(*key)
+        self.optimal, g = slots, self.relaxed[1]
+        g.at(slots)
+        known = g.optimum()
+        if known is not None:
+            self.physics.draw(*known, None)
+
+    def _arrange(self, stage: Stage) -> None:
         """Give what the search has told since the last arrangement its panels."""
         told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
-        begun = tuple((one.base, one.epsilon) for one in self.stages)
+        begun = tuple((one.base, one.epsilon) for one in self.stages) if self.concluded else ()
         if not (told <= self.shown.told and moved <= self.shown.moved and begun == self.shown.stages):
             told, moved = self.shown.told | told, self.shown.moved | moved
-            self.shown = replace(self.shown, told=told, moved=moved, stages=begun)
-            self.draw("the arrangement of the search", self.stream.send_blueprint, layout(self.shown))
+            self.shown = replace(self.shown, told=told, moved=moved, stages=begun, budget=stage.budget)
+            self.draw("the arrangement of the search", self.stream.send_blueprint, self.arrangement)
 
     def _landscape(self, landscape: sr.Landscape, aim: Aim) -> None:
         """Draw a landscape at the moment at which it is there, and the way on it."""
@@ -256,6 +288,11 @@ class Recorder:
         if self.pause == 0.0:
             self._way()
         self.draw(LANDSCAPE, self.explorer.step)
+
+    @property
+    def arrangement(self) -> Any:
+        """How everything is arranged now."""
+        return layout(self.shown)
 
     @property
     def pause(self) -> float:
@@ -291,7 +328,7 @@ class Recorder:
                 if not explorer.wrong:
                     self.say(f"no landscape: {PATIENT if self.answerable else KEPT}")
                 self.shown = replace(self.shown, landscape=False)
-                self.draw("the arrangement", self.stream.send_blueprint, layout(self.shown))
+                self.draw("the arrangement", self.stream.send_blueprint, self.arrangement)
         if explorer.wrong:
             self.say(explorer.wrong, "WARN")
 
@@ -390,7 +427,7 @@ class Recorder:
             drawn = self.drawn or bool(self.stages)
             seen = self.shown.landscape and self.terrain.known is not None
             self.shown = replace(self.shown, clash=extent(strips) if strips else (), drawn=drawn, landscape=seen)
-            self.stream.send_blueprint(layout(self.shown))
+            self.stream.send_blueprint(self.arrangement)
 
     @property
     def _formulation(self) -> str:

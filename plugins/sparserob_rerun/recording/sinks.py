@@ -3,6 +3,7 @@ is missing."""
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import subprocess
@@ -16,12 +17,14 @@ from typing import Any, TypeAlias, final
 
 import sparserob_core as sr
 
+logger = logging.getLogger("sparserob")
+
 PORT, WEB_PORT = 9876, 9090
 STARTING = 15.0  # seconds that a viewer may take until it listens
 JOINING = 20.0
 """Seconds that the chunks of a finished recording may be joined for. Ten times as many, and a run waits for a large
 file; with a tenth a busy machine leaves it four times as large."""
-TOGETHER = "1e9"  # how many times as large as another one a component may be in the same chunk: none is set apart
+PASSES = 50  # over the chunks, at most: they end where nothing is left to be joined
 MEMORY = "25%"  # of the machine's, for a viewer that is started
 
 
@@ -139,17 +142,31 @@ def sinks_of(rr: Any, chosen: Destinations, started: Started) -> tuple[list[Any]
     return sinks, wrong
 
 
-def compact(file: Path) -> None:
-    """Join what is in a finished recording to chunks as large as the format wants: live, each is as small as what has
-    happened in a moment. Where that cannot be done, the recording stays as it is."""
-    joined = file.with_name(f".{file.name}.joined")
-    command = [str(viewer()), "rrd", "optimize", str(file), "-o", str(joined), "--split-size-ratio", TOGETHER]
-    with suppress(OSError, subprocess.SubprocessError):
-        if file.is_file():
-            subprocess.run(command, check=True, timeout=JOINING, capture_output=True, stdin=subprocess.DEVNULL)
-            joined.replace(file)
-    with suppress(OSError):
-        joined.unlink(missing_ok=True)
+def compact(file: Path, arrangement: Any) -> None:
+    """Join what is in a finished recording to chunks as large as the format wants, with its last ``arrangement`` (a
+    blueprint) only: live, each is as small as what has happened in a moment. Where that cannot be done, the recording
+    stays as it is."""
+    from rerun.chunk import OptimizationProfile, RrdReader
+
+    if not file.is_file():
+        return
+    parts = [file.with_name(f".{file.name}.{part}") for part in ("joined", "chunks", "arrangement")]
+    joined, chunks, screen = parts
+    try:
+        reader = RrdReader(str(file))
+        (store,) = reader.recordings()
+        name, profile = store.application_id, OptimizationProfile(extra_passes=PASSES)
+        found = reader.stream(store=store).collect(optimize=profile)
+        found.write_rrd(chunks, application_id=name, recording_id=store.recording_id)
+        arrangement.save(name, screen)
+        command = [str(viewer()), "rrd", "merge", str(chunks), str(screen), "-o", str(joined)]
+        subprocess.run(command, check=True, timeout=JOINING, capture_output=True, stdin=subprocess.DEVNULL)
+        joined.replace(file)
+    except Exception:  # a large recording is better than none
+        logger.debug("the chunks of %s could not be joined", file, exc_info=True)
+    for part in parts:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def _unwritable(file: Path) -> str:

@@ -27,11 +27,14 @@ class Waiting:
         self.places = dict[str, list[str]]()
         first = "the first search ends" if shown.searches else "the first round ends"
         if shown.problem is not None:
-            for page in pages(shown.problem):
-                words = f"the control and the states are drawn when {first}"
-                self._write(CONTROL, page.path, physics.extent(len(page.plots)), words)
+            drawn = "the first tuple is evaluated" if shown.searches else first
+            for number, page in enumerate(pages(shown.problem)):
+                count = len(page.plots)
+                each = physics.HEIGHT if number else physics.height(count, shown.searches)
+                words = f"the control and the states are drawn when {drawn}"
+                self._write(CONTROL, page.path, physics.extent(count, each), words)
             if pair_of(shown.problem) is not None:
-                self._write(CONTROL, "physics/phase", PHASE, f"drawn when {first}")
+                self._write(CONTROL, "physics/phase", PHASE, f"drawn when {drawn}")
         if shown.landscape:
             tuples = "the first tuple is evaluated" if shown.searches else "the first constraints are active"
             self._write(LANDSCAPE, "landscape/map", views.EXTENT, f"the landscape of g is drawn when {tuples}")

@@ -54,6 +54,9 @@ SERIES: dict[str, tuple[str, Colour, float]] = {
 CLOUDS: dict[str, tuple[str, Colour]] = {"tried": ("tried", ink.SKY), "refused": ("tried, refused", ink.VERMILLION)}
 MEANS = ("accepted", "local")  # 0 or 1 at every evaluation, of which a mean says more
 WINDOW = 50
+STRAIGHT = 1e-9
+"""Of the largest value: what bends less is a straight line, for rounding bends more than a tenth of it; of ten times as
+much nothing is seen either."""
 
 
 @final
@@ -93,8 +96,8 @@ class SearchView:
         self._cloud("search/g/refused", at, np.where(refused, batch.values, np.nan), CLOUDS["refused"])
         walk, best = stage.walk[stage.values.size - count :], batch.best
         for name, values, which in (
-            ("walk", walk, np.arange(count)),
-            ("best", best, _changes(best)),
+            ("walk", walk, _corners(walk)),
+            ("best", best, _corners(best)),
             ("bound", np.full(count, event.lower_bound), np.array([0, count - 1] if count > 1 else [0])),
         ):
             if np.isfinite(values).any():
@@ -150,8 +153,8 @@ class SearchView:
                 self._kinds(event, path, where, values, at)
                 continue
             self._line(path, words, colour)
-            rows_shown = self.rr.Scalars.columns(scalars=_shown(values))
-            self.stream.send_columns(path, at(np.arange(values.size)), rows_shown)
+            few = _corners(values)
+            self.stream.send_columns(path, at(few), self.rr.Scalars.columns(scalars=_shown(values[few])))
 
     def _kinds(
         self,
@@ -237,11 +240,13 @@ def _few(moves: np.ndarray) -> np.ndarray:
     return moves[np.arange(len(moves)) - first < MOVES]
 
 
-def _changes(values: Floats) -> np.ndarray:
-    """Where the values ``(k,)`` of a batch change, with the ends of each level, so that a line through them has steps;
-    the first and the last in any case."""
-    steps = np.flatnonzero(np.diff(values) != 0.0)
-    return np.unique(np.concatenate([[0], steps, steps + 1, [values.size - 1]]))
+def _corners(values: Floats) -> np.ndarray:
+    """Which of the values ``(k,)`` of a batch a line needs: the first, the last, and those that are not between their
+    neighbours on a straight line."""
+    bends = np.abs(np.diff(values, 2))
+    scale = np.nanmax(np.abs(values)) if np.isfinite(values).any() else 1.0
+    kept = np.flatnonzero(~(bends <= STRAIGHT * scale)) + 1  # NaN, and what is beside it, stays
+    return np.unique(np.concatenate([[0], kept, [values.size - 1]]))
 
 
 def _shown(values: Floats) -> Floats:

@@ -21,8 +21,8 @@ WIDTH, HEIGHT = 600.0, 400.0
 BAR, STEPS = (640.0, 26.0), 64  # the left side of the colour bar and its width, and its numbers
 TRIED, LEG, LAST = 150, 400, 20  # points that stay visible, corners of the walk, and its last ones
 ABOUT = (
-    "**g of a tuple** is the least cost of a control that meets the constraints at the few indices of the tuple. Its"
-    " maximum over all tuples is the answer J\\*, the cost of a control that meets all of them."
+    "**g of a tuple**: the least cost of a control that meets the constraints at its few indices. Its maximum over all"
+    " tuples is J\\*, the least cost of a control that meets all."
 )
 """What a person who has never seen the map has to know first."""
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
@@ -71,7 +71,8 @@ class Terrain:
         two = landscape.first[0] != landscape.second[0]
         weight = [f"epsilon {landscape.epsilon:.3g}"] if landscape.epsilon > 0.0 else []
         both = ["over the two indices that decide most"] if two else []
-        self._say("map", [*both, *weight, aim.words, *_said(landscape), *_own(landscape, aim)])
+        about = [", ".join([*both, *weight])]
+        self._say("map", [*_own(landscape, aim), *_said(landscape), *about, aim.words])
         across, up, values = landscape.shown
         place = [landscape.axes[k][landscape.at[k]] for k in (0, 1)]
         self.stream.log(

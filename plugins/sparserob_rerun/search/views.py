@@ -35,17 +35,22 @@ MOST = 4  # searches whose climbs are beside one another; of more the last ones
 CLIMB = ("tried", "refused", "walk", "best", "exact")
 
 
-def climb(rrb: Any, stages: Sequence[tuple[int, float]]) -> Any:
-    """The climb, a plot for each search on a scale of its own. ``stages``: how many evaluations there were before it,
-    and its weight epsilon."""
-    shown = list(stages)[-MOST:] or [(0, np.nan)]
-    ends = [base for base, _ in shown[1:]] + [None]
-    plots = []
+def climb(rrb: Any, stages: Sequence[tuple[int, float]], budget: int) -> Any:
+    """The climb: of a search that goes on the last evaluations, as many as its ``budget`` (0: all of them); of one that
+    is over a plot for each of its ``stages``, of which each has how many evaluations there were before it, and its
+    weight epsilon."""
+    contents = [f"+ /search/g/{one}" for one in CLIMB]
+    if len(stages) < 2:
+        cursor = rrb.TimeRangeBoundary.cursor_relative
+        window = (cursor(seq=-budget), cursor(seq=0)) if budget else None
+        return series(rrb, "/search/g", "g over the last evaluations", contents, evaluations=window)
+    shown, plots = list(stages)[-MOST:], []
+    place = rrb.TimeRangeBoundary.absolute
+    ends = [place(seq=base) for base, _ in shown[1:]] + [rrb.TimeRangeBoundary.infinite()]
     for (base, epsilon), end in zip(shown, ends, strict=True):
-        name = f"epsilon {epsilon:.3g}: g" if np.isfinite(epsilon) and epsilon > 0.0 else "g over the evaluations"
-        plot = series(rrb, "/search/g", name, [f"+ /search/g/{one}" for one in CLIMB], evaluations=(base + 1, end))
-        plots.append(plot)
-    return rrb.Horizontal(*plots) if len(plots) > 1 else plots[0]
+        name = f"ε {epsilon:.3g}" if np.isfinite(epsilon) and epsilon > 0.0 else "g over the evaluations"
+        plots.append(series(rrb, "/search/g", name, contents, evaluations=(place(seq=base + 1), end)))
+    return rrb.Horizontal(*plots)
 
 
 def series(
@@ -55,20 +60,17 @@ def series(
     contents: list[str] | None = None,
     legend: Literal["left", "right", "below"] = "right",
     limits: tuple[float, float] | None = None,
-    evaluations: tuple[int, int | None] | None = None,
+    evaluations: tuple[Any, Any] | None = None,
 ) -> Any:
     """A plot against the timeline that shows the whole of it, however long it is. ``legend``: the corner in which
     the names of its lines are, an upper one or the lower left one; ``limits``: of the axis upwards, where they are
-    known before; ``evaluations``: the first and the last that are shown, and decide its height, ``None`` for the last
-    that there is."""
+    known before; ``evaluations``: the first and the last that are shown, and decide its height."""
     from rerun.encodings import TimeRange
 
-    first, last = (None, None) if evaluations is None else evaluations
-    start, end = (
-        rrb.TimeRangeBoundary.infinite() if place is None else rrb.TimeRangeBoundary.absolute(seq=place)
-        for place in (first, last)
-    )
-    shown = None if first is None else rrb.VisibleTimeRange("evaluation", start=start, end=end)
+    everything = rrb.TimeRangeBoundary.infinite()
+    start, end = evaluations or (everything, everything)
+    whole = start.kind != "cursor_relative"  # a range about the cursor is none of another timeline
+    shown = [rrb.VisibleTimeRange("evaluation", start=start, end=end)] if evaluations else None
     return rrb.TimeSeriesView(
         origin=origin,
         contents=contents or ["+ $origin/**"],
@@ -79,8 +81,8 @@ def series(
             ],
             visible=contents is None,
         ),
-        axis_x=rrb.TimeAxis(view_range=TimeRange(start=start, end=end)),
-        time_ranges=None if shown is None else [shown],
+        axis_x=rrb.TimeAxis(view_range=TimeRange(start=start, end=end)) if whole else None,
+        time_ranges=shown,
         axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
     )
 
@@ -99,8 +101,8 @@ def _note(rrb: Any, name: str) -> Any:
     return series(rrb, "/search/notes", words[0].upper() + words[1:], [f"+ /search/notes/{name}"], limits=limits)
 
 
-def tab(rrb: Any, told: Collection[str], moved: Collection[str], stages: Sequence[tuple[int, float]]) -> Any:
-    """The tab of a search: the climb of its ``stages``, what the maximiser has ``told`` of itself, and the coordinates
+def tab(rrb: Any, told: Collection[str], moved: Collection[str], climbs: Any) -> Any:
+    """The tab of a search: its ``climbs``, what the maximiser has ``told`` of itself, and the coordinates
     that have ``moved``, each on an axis of its own."""
     order = [name for name in (*LOGARITHMIC, *NOTES) if name in told]
     names = [*dict.fromkeys([*order, *sorted(told)])]
@@ -109,7 +111,7 @@ def tab(rrb: Any, told: Collection[str], moved: Collection[str], stages: Sequenc
         series(rrb, "/search/moves", f"Where it moves: {name}", [f"+ /search/moves/{name}"]) for name in sorted(moved)
     ]
     left = rrb.Vertical(
-        climb(rrb, stages),
+        climbs,
         series(rrb, "/search/g", "g, with the share of the regulariser, over the evaluations", legend="below"),
         row_shares=[3, 2],
     )

@@ -55,7 +55,7 @@ class StudyRecorder:
     rest, urgent, behind, ended = math.inf, False, False, math.inf
 
     def __init__(self, rr: Any, stream: Any, opening: StudyOpening) -> None:
-        self.rr, self.stream, self.event = rr, stream, opening.event
+        self.rr, self.stream, self.event, self.opening = rr, stream, opening.event, opening
         self.board, self.broken = Board(self.event), dict[str, str]()
         self.rows: dict[int, Mapping[str, Any]] = dict(self.event.rows)
         self.newest: deque[int] = deque(self.rows, maxlen=board.LINES)
@@ -93,6 +93,11 @@ class StudyRecorder:
             self._picture()
         else:
             self.rest = max(0.0, self.next - time.monotonic())
+
+    @property
+    def arrangement(self) -> Any:
+        """How everything is arranged."""
+        return layout(self.opening)
 
     def idle(self) -> None:
         """Draw what came since the last picture."""
