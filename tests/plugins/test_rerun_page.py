@@ -58,7 +58,15 @@ def test_the_page_moves_to_another_port_where_its_own_is_taken(monkeypatch: pyte
 def watching(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A search that takes minutes, as `make live` watches it on a machine without a display."""
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    command = [sys.executable, "-m", "sparserob_core", "watch", str(ROOT / variable("LIVE")), "--serve", "--no-figures"]
+    command = [
+        sys.executable,
+        "-m",
+        "sparserob_core",
+        "watch",
+        str(ROOT / variable("LITERAL_LIVE")),
+        "--serve",
+        "--no-figures",
+    ]
     process = subprocess.Popen(
         [*command, "maximiser.budget=100000", "--out", str(tmp_path / "run")],
         stdout=subprocess.PIPE,

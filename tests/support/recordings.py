@@ -57,6 +57,21 @@ def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(times)[order], np.array(values)[order]
 
 
+def line_of(chunks: list[Any], trace: sr.SearchTrace) -> np.ndarray:
+    """What a line over the evaluations shows at each of them, whose corners are recorded; NaN where there is none. No
+    line goes from one search to the next."""
+    at, values = scalars(chunks, "evaluation")
+    shown = np.full(trace.value.size, np.nan)
+    for outer in np.unique(trace.outer):
+        mine = np.flatnonzero(trace.outer == outer)
+        inside = (at > mine[0]) & (at <= mine[-1] + 1) & np.isfinite(values[:, 0])
+        if inside.any():
+            shown[mine] = np.interp(mine + 1, at[inside], values[inside, 0], left=np.nan)
+        if mine[0]:
+            assert np.isnan(values[at == mine[0], 0]).any()
+    return shown
+
+
 def texts(chunks: list[Any], component: str) -> list[str]:
     return [row[0] for chunk in chunks for row in chunk.to_record_batch().column(component).to_pylist()]
 

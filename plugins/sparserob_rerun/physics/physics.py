@@ -86,6 +86,7 @@ class Physics:
         if data.gains is not None:
             draw_feedback(rr, self.stream, data)
             send_effort(rr, self.stream, data)
+        self._bars(data)
         at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
         channels = len(data.control)
         names = [data.names.control(channel) for channel in range(channels)]
@@ -113,6 +114,20 @@ class Physics:
             values = np.stack([data.state[state], data.tube_lower[state], data.tube_upper[state]], axis=1)
             rows = rr.Scalars.columns(scalars=values.ravel()).partition([3] * len(values))
             self.stream.send_columns(f"signals/states/x{state + 1}", at, rows)
+
+    def _bars(self, data: sr.FigureData) -> None:
+        """The nominal control and states as bars over the time of the system, which are there on every timeline."""
+        rr, middles = self.rr, (data.breakpoints[:-1] + data.breakpoints[1:]) / 2
+        widths = np.diff(data.breakpoints)
+        for channel, values in enumerate(data.control):
+            colour = ink.legible(SHADES[channel % len(SHADES)])
+            bars = rr.BarChart(values, color=colour, abscissa=middles, widths=widths)
+            self.stream.log(f"signals/bars/controls/u{channel + 1}", bars, static=True)
+        for state in self.problem.names.corners.own(self.problem.system.states):
+            colour = ink.legible(SHADES[state % len(SHADES)])
+            width = np.gradient(data.times)
+            bars = rr.BarChart(data.state[state], color=colour, abscissa=data.times, widths=width)
+            self.stream.log(f"signals/bars/states/x{state + 1}", bars, static=True)
 
     def _control(self, drawing: Drawing, axes: Axes, data: sr.FigureData, channel: int, last: bool) -> None:
         name = data.names.control(channel)

@@ -51,7 +51,7 @@ class Shown:
         has another one."""
         kind = "search" if self.searches else "feedback" if self.answers else "exchange"
         problem = self.problem
-        parts = [self.families, self.maps, self.landscape]
+        parts: list[Any] = [self.families, self.maps, self.landscape]
         if problem is not None:
             parts += [problem.system.controls, problem.system.states, heading(problem), problem.names.in_plane]
             parts += [pages(problem), problem.names.state_units, problem.names.time]
@@ -177,14 +177,20 @@ def _signals(rrb: Any, answers: bool) -> Any:
     legend = rrb.Corner2D.RightTop
     effort = rrb.TimeSeriesView(origin="/signals/effort", name="Size of the controls under disturbances, over t",
                                 plot_legend=legend)  # fmt: skip
-    return rrb.Vertical(
-        rrb.TextDocumentView(origin="/howto", name="These series have a timeline of their own"),
-        rrb.TimeSeriesView(origin="/signals/control", name="Controls over t, in seconds", plot_legend=legend),
-        rrb.TimeSeriesView(origin="/signals/states", name="States over t, in seconds", plot_legend=legend),
+    bars = [
+        rrb.BarChartView(
+            origin="/signals/bars/controls", name="Controls of the last decision over t", plot_legend=legend
+        ),
+        rrb.BarChartView(origin="/signals/bars/states", name="Nominal states over t", plot_legend=legend),
+    ]
+    series = rrb.Vertical(
+        rrb.TextDocumentView(origin="/howto", name="The same as series, with what is uncertain"),
+        rrb.TimeSeriesView(origin="/signals/control", name="Controls on the timeline t", plot_legend=legend),
+        rrb.TimeSeriesView(origin="/signals/states", name="States on the timeline t", plot_legend=legend),
         *([effort] if answers else []),
         row_shares=[1, 5, 5, *([5] if answers else [])],
-        name="Signals (choose the timeline t)",
     )
+    return rrb.Horizontal(rrb.Vertical(*bars), series, column_shares=[3, 2], name="Signals")
 
 
 def _infeasible(rrb: Any, shown: Shown, clash: tuple[float, ...]) -> Any:

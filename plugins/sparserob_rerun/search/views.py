@@ -26,10 +26,16 @@ def landscape(searches: bool, answers: bool, horizon: float = 1.0) -> Any:
     name = "Landscape of g around the best tuple" + (", and the way of the search" if searches else "")
     letters = max(len(f"{time:.6g}") for time in ticks(0.0, horizon))
     left = EXTENT[0] - LETTER * max(0, letters - LETTERS)
-    return view("/landscape/map", f"{name}: when the run is over" if answers else name, (left, *EXTENT[1:]))
+    return view(
+        "/landscape/map",
+        f"{name}: when the run is over" if answers else name,
+        (left, *EXTENT[1:3], HEIGHT + BELOW[searches]),
+    )
 
 
-EXTENT = (-54.0, BAR[0] + BAR[1] + 100.0, -64.0, HEIGHT + 82.0)
+BELOW = {True: 82.0, False: 116.0}
+"""Units below the map, of a search, whose panel is large, and of the others: words are as high in both."""
+EXTENT = (-54.0, BAR[0] + BAR[1] + 100.0, -64.0, HEIGHT + BELOW[False])
 LETTER, LETTERS = 18.0, 2  # how much room a letter takes, and how many have it within the `EXTENT`
 MOST = 4  # searches whose climbs are beside one another; of more the last ones
 CLIMB = ("tried", "refused", "walk", "best", "exact")

@@ -45,11 +45,11 @@ class RelaxedValue:
 
     ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation, ``gradient()``
     the slopes ``(D, width)`` of ``g`` there, as far as it has some (`TupleValue.gradient`); ``deciding()`` are the
-    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`), ``optimum()`` is the decision ``(n,)`` of that
-    evaluation with the constraints that carry its multipliers, or ``None`` where there is none. ``interchangeable``: every index is imposed
-    as every other one, so that two beside one another say the same; those of a policy have a deviation each. ``slot``
-    is the box ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names`,
-    `Inspection.kinds`.
+    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``optimum()`` is the decision ``(n,)`` of
+    that evaluation with the constraints that carry its multipliers, or ``None`` where there is none.
+    ``interchangeable``: every index is imposed as every other one, so that two beside one another say the same; those
+    of a policy have a deviation each. ``slot`` is the box ``(width,)`` of one index, ``names`` and ``kinds`` say what
+    its coordinates are: see `Inspection.names`, `Inspection.kinds`.
     """
 
     at: Callable[[Array], float]

@@ -250,8 +250,8 @@ class LandscapeAxes:
         axes = sorted(axes_of(g, count), key=lambda axis: known.get(axis, (0.0, 0.0)), reverse=True)
         if len(axes) < 2:
             return None
-        (one, c), (other, k) = sorted(axes[:2], key=lambda axis: axis[::-1])
-        return cls((one, other), (c, k))
+        (rank, c), (next_rank, k) = sorted(axes[:2], key=lambda axis: axis[::-1])
+        return cls((rank, next_rank), (c, k))
 
     @staticmethod
     def measure(g: RelaxedValue, anchor: Array, pair: tuple[int, int], reach: dict[Axis, Reach]) -> Iterator[None]:
