@@ -30,9 +30,9 @@ MEANING = {
 FILES = {
     "config.yaml": "the complete, resolved config; `sparserob run` takes it",
     "result.json": (
-        "status, message, cost, value, epsilon, bounds, gap, worst constraint, equalities (what is missed of them, of"
-        " the numbers that are added up), tolerances (what was proven of each"
-        " constraint, and what counts as no violation of its rows, in the user's units), sparsity (with"
+        "status, message, cost, value, epsilon, bounds, gap, worst constraint, equalities (by how much fixed"
+        " final states are `missed` at most, and how much is `excused`), tolerances (what is proven of each constraint:"
+        " `kept` and, as `rows`, excused, of every row in the user's units), sparsity (with"
         " `fewest_active`: `lower` and `upper` of the least share of time that any admissible control"
         " must act, the mean over the `channels`), `units` (of time, states, cost, J, and of the rows of every"
         " constraint,"

@@ -31,6 +31,7 @@ from sparserob_core.control.transcription.transcribe import transcribe as transc
 from sparserob_core.sip.convex_set import Array as Array
 from sparserob_core.sip.convex_set import Box as Box
 from sparserob_core.sip.convex_set import ConvexSet as ConvexSet
+from sparserob_core.sip.inner.simplex.silence import silent as silent
 from sparserob_core.sip.program import ConstraintFamily as ConstraintFamily
 from sparserob_core.sip.program import Enclosure as Enclosure
 from sparserob_core.sip.program import SemiInfiniteProgram as SemiInfiniteProgram
@@ -111,8 +112,8 @@ from sparserob_core.workers import without_script as without_script
 from sparserob_core.sip.solver import Claim as Claim
 from sparserob_core.sip.solver import QuadraticProgram as QuadraticProgram
 from sparserob_core.sip.solver import Solver as Solver
-from sparserob_core.sip.regulariser import ControlImage as ControlImage
-from sparserob_core.sip.regulariser import Regulariser as Regulariser
+from sparserob_core.sip.convexity import ControlImage as ControlImage
+from sparserob_core.sip.convexity import Regulariser as Regulariser
 from sparserob_core.sip.maximiser import EvaluationError as EvaluationError
 from sparserob_core.sip.maximiser import Maximiser as Maximiser
 from sparserob_core.sip.maximiser import LinearBlocks as LinearBlocks

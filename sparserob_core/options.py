@@ -21,7 +21,19 @@ else:
 
 
 class Checked(ModelMetaclass):
-    """Says what is wrong with the keywords of a constructor, as an `InputError` with one line for each."""
+    """Says what is wrong with the keywords of a constructor, as an `InputError` with one line for each.
+
+    A class with an option whose name its bases use, or a method of its own, is refused when it is made: the option
+    would take the place of what is called by that name.
+    """
+
+    def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **keywords: Any) -> type:
+        if not isinstance(namespace.get("model_config", {}), Mapping):
+            raise InputError(f"{name}: the option 'model_config' bears a name that pydantic uses; rename it")
+        made: type = super().__new__(mcs, name, bases, namespace, **keywords)
+        for key, owner in _names_in_use(made):
+            raise InputError(f"{name}: the option {key!r} bears a name that {owner} uses; rename it")
+        return made
 
     def __call__(cls, *arguments: object, **keywords: object) -> Any:
         if arguments:
@@ -30,6 +42,17 @@ class Checked(ModelMetaclass):
             return super().__call__(**keywords)
         except ValidationError as error:
             raise InputError("\n".join(_sentences(cls.__name__, error))) from None
+
+
+def _names_in_use(model: type) -> Iterator[tuple[str, str]]:
+    """The options of a class that hide an attribute of one of its bases, or that a method of its own hides, with the
+    class that has the attribute."""
+    fields: Mapping[str, Any] = getattr(model, "model_fields", {})
+    for key, field in fields.items():
+        hidden = (base for base in model.__mro__[1:] if key in vars(base))
+        owner = next(hidden, model if inspect.isroutine(field.default) or isinstance(field.default, property) else None)
+        if owner is not None:
+            yield key, owner.__name__
 
 
 class Exact(BaseModel):

@@ -23,7 +23,9 @@ class Known:
     ``package`` is what is imported and ``pip`` what brings it, if pip does. ``asked``: the settings
     that an absolute accuracy stands for, as ``{setting: factor}``; ``fixed``: settings that are always given, unless a
     user gives others. ``settings``: all that it has, with their defaults; ``None`` where it does not say: whatever is
-    given then is passed on as it is. ``flags``: it writes 0 and 1 for false and true.
+    given then is passed on as it is. ``flags``: it writes 0 and 1 for false and true. ``aborts``: on some programs it
+    ends the process. ``scheduler``: its threads are begun once in each thread that calls it, and it writes to the
+    standard output.
     """
 
     package: str
@@ -33,6 +35,8 @@ class Known:
     settings: Callable[[], Settings] | None = None
     pip: str | None = None
     flags: bool = False
+    scheduler: bool = False
+    aborts: bool = False
 
 
 def _attributes(place: str) -> Callable[[], Settings]:
@@ -129,6 +133,8 @@ SOLVERS: Mapping[str, Known] = {
         {},
         {**_OF_HIGHS, "threads": 1, "qp_iteration_limit": 5_000},
         _attributes("highspy:HighsOptions"),
+        scheduler=True,
+        aborts=True,
     ),
     "hpipm": Known("hpipm_python", "interior point for optimal control, dense", {}, {}, pip=""),
     "jaxopt_osqp": Known("jaxopt", "operator splitting in JAX", {"tol": 1.0}, {}),

@@ -8,7 +8,9 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from difflib import get_close_matches
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
@@ -65,6 +67,11 @@ class Qpsolvers(sr.Solver, sr.Options):
         """The solver that was chosen."""
         return self.solver
 
+    @property
+    def aborts(self) -> bool:  # type: ignore[override]
+        """Whether the solver that was chosen does."""
+        return self._chosen.aborts
+
     @field_validator("solver")
     @classmethod
     def _is_there(cls, name: str) -> str:
@@ -98,7 +105,7 @@ def claimed(name: str, program: sr.QuadraticProgram, accuracy: float, given: Map
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            solution = qpsolvers.solve_problem(posed, name, **settings)
+            solution = _apart(partial(qpsolvers.solve_problem, posed, name, **settings), known)
         except (
             qpsolvers.exceptions.QPError,
             ValueError,
@@ -114,6 +121,15 @@ def claimed(name: str, program: sr.QuadraticProgram, accuracy: float, given: Map
     z, y, z_box = recover(solution)
     claim = sr.Claim(status, _vector(solution.x, program.q.size), z, y, z_box, f"{name}: {said or status}")
     return claim.judged(program, accuracy)
+
+
+def _apart(solve: Callable[[], Any], known: Known) -> Any:
+    """What the solver answers; one with a scheduler of threads (HiGHS) is asked in a new thread. Each thread has a
+    scheduler of its own, and refuses every number of threads but the one with which it was begun."""
+    if not known.scheduler:
+        return solve()
+    with ThreadPoolExecutor(1) as thread, sr.silent():
+        return thread.submit(solve).result()
 
 
 def _require(name: str) -> None:
@@ -219,7 +235,7 @@ def _made(name: str) -> type[Through]:
     made: Any = create_model(
         name, __base__=parent, __module__=__name__, __doc__=f"{name}, through qpsolvers.", **fields
     )
-    made.called = name
+    made.called, made.aborts = name, known.aborts
     kind: type[Through] = made
     return kind
 

@@ -16,9 +16,10 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError, TimeLimitError
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.plugins.guards import guarded
-from sparserob_core.sip.method import Deadline, OutOfTime, Tools
+from sparserob_core.sip.convexity import Regulariser
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.solver import AUTO, Auto, Solver, named
 
 if TYPE_CHECKING:
@@ -111,27 +112,61 @@ class PlainExperiment(Experiment):
         raise InputError(f"{expected}, got a semi-infinite program of another kind")
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class UntranscribedExperiment(Experiment):
+    """A control problem that was not transcribed in time. Its program demands nothing: all that is known is that no
+    term of its cost is negative."""
+
+    stated: OptimalControlProblem
+    reason: str
+
+    @property
+    def program(self) -> SemiInfiniteProgram:
+        return SemiInfiniteProgram(n=1, q=[0.0], lower=0.0, upper=0.0, families=[])
+
+    @property
+    def problem(self) -> OptimalControlProblem:
+        return self.stated
+
+    def of_control(self, expected: str) -> ControlExperiment:
+        raise TimeLimitError(self.reason)
+
+
+LATE = (
+    "{} while the problem was transcribed, before anything is known of it; fewer pieces and parameters take less, or"
+    " limits.seconds gives more"
+)
+
+
 def assemble(loaded: Loaded, deadline: Deadline | None = None) -> Experiment:
     """Build what a checked config describes, and its program; raises `ConfigError` with the place of the key at fault,
     and `TimeLimitError` when that is not done by the ``deadline``."""
-    if deadline is None:
-        return _assembled(loaded)
+    experiment = assemble_in_time(loaded, deadline or Deadline())
+    if isinstance(experiment, UntranscribedExperiment):
+        raise TimeLimitError(experiment.reason)
+    return experiment
+
+
+def assemble_in_time(loaded: Loaded, deadline: Deadline) -> Experiment:
+    """`assemble`, or an `UntranscribedExperiment` of a control problem that is not transcribed by the ``deadline``."""
     try:
         with deadline.enforced():
-            return _assembled(loaded)
-    except OutOfTime as late:
-        raise TimeLimitError(
-            f"{late} while the problem was transcribed, before anything is known of it; fewer pieces and parameters"
-            " take less, or limits.seconds gives more"
-        ) from late
-
-
-def _assembled(loaded: Loaded) -> Experiment:
-    from sparserob_core.control.transcription.transcribe import prepare
-
-    problem = problem_of(loaded)
+            problem = problem_of(loaded)
+    except OutOfTime as error:
+        raise TimeLimitError(LATE.format(error)) from error
     if isinstance(problem, SemiInfiniteProgram):
         return PlainExperiment(loaded, problem)
+    try:
+        with deadline.enforced():
+            return _transcribed(loaded, problem)
+    except OutOfTime as error:
+        return UntranscribedExperiment(loaded, problem, LATE.format(error))
+
+
+def _transcribed(loaded: Loaded, problem: OptimalControlProblem) -> Experiment:
+    from sparserob_core.control.transcription.transcribe import prepare
+
     policy: Policy = build(loaded, "policy", loaded.config.policy)
     control, disturbance = dictionaries_of(loaded, problem.horizon)
     try:

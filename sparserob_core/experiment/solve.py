@@ -19,8 +19,8 @@ from sparserob_core.experiment.plugins.guards import guarded, origin_of
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import ignore
+from sparserob_core.sip.limits.deadline import as_seconds
 from sparserob_core.sip.maximiser import Maximiser, Report
-from sparserob_core.sip.method import as_seconds
 
 if TYPE_CHECKING:
     from sparserob_core.sip.events import Notify

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.brief import brief
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.program import Formulation
+from sparserob_core.sip.program import TOLERANCE, Formulation
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +96,13 @@ class InfeasibleSubsystem:
 @dataclass(frozen=True, eq=False)
 class Proof:
     """What is known of one family at one decision: ``proven`` (no index violates it by more than
-    ``bound <= TOLERANCE``), ``refuted`` (``index``, ``row`` violate it by ``violation``) or ``undecided`` (``reason``).
+    ``bound <= allowed``), ``refuted`` (``index``, ``row`` violate it by ``violation``) or ``undecided`` (``reason``).
 
     ``leaves``: the lower and upper corners ``(k, d)`` of the closed cells that prove it, a subdivision of the family's
     ``cells``, in lexicographic order; ``None`` unless proven by branch and bound. ``formulation`` is that of the index.
     ``unit``: what a violation of 1 of that row is in the user's units, called ``measured`` where that is known, and
     ``units (r,)`` of all rows. ``bound`` is in the units of the program that was solved; ``share`` is what it was in
-    each row's own unit, once it is told in the user's.
+    each row's own unit, once it is told in the user's; ``allowed``: the violation that counts as none, likewise.
     """
 
     family: str
@@ -119,6 +119,7 @@ class Proof:
     measured: str = ""
     units: Array | None = None
     share: float | None = None
+    allowed: float = TOLERANCE
 
     __repr__ = brief
 

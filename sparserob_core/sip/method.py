@@ -1,32 +1,27 @@
-"""What a method is, the tools that it is handed, and the time that it may take."""
+"""What a method is, and the tools that it is handed."""
 
 from __future__ import annotations
 
-import signal
-import threading
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager
-from copy import copy
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from types import FrameType
 from typing import ClassVar, TypeAlias, final
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.errors import InputError
 from sparserob_core.options import Options
+from sparserob_core.sip.convexity import Regulariser
 from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Solver
 
-GRACE = 1.0  # seconds after a limit in which a method may end by itself
 ROUNDING = 1e-12  # relative: what a product of factors is off by; weights that are meant to differ do so by far more
 GAP_TOLERANCE = 1e-7  # relative gap at which the bounds have met, unless a method has another one
 
@@ -69,123 +64,6 @@ class Continuation(Options):
         if self.stop > self.start:
             raise InputError(path="stop", expected=f"at most start, which is {self.start!r}", got=f"{self.stop!r}")
         return self
-
-
-class OutOfTime(KeyboardInterrupt):
-    """The limit is reached. It travels like the interrupt from the keyboard that it stands for: whatever lets the one
-    pass (a foreign maximiser, a solver) lets the other."""
-
-
-class Deadline:
-    """The end of the time that a computation may take, ``seconds`` from now; without a number it has no end.
-
-    Whoever works in rounds asks `check` between them. An interrupt that was caught where something could be saved is
-    noted by `interrupt`: from then on the time is over for everyone who asks.
-    """
-
-    def __init__(self, seconds: float | None = None) -> None:
-        self.seconds = seconds
-        self._ends = np.inf if seconds is None else time.monotonic() + seconds
-        self._interrupted = ""
-        self.pressed = False
-        """Whether somebody has interrupted the computation, by a key or a signal, before the end of the time."""
-
-    @property
-    def bounded(self) -> bool:
-        """Whether there is a limit."""
-        return self.seconds is not None
-
-    @property
-    def reason(self) -> str:
-        """Why the time is over, in words; empty while it is not."""
-        if self._interrupted:
-            return self._interrupted
-        return f"the limit of {self.seconds:g} s is reached" if time.monotonic() >= self._ends else ""
-
-    @property
-    def left(self) -> float | None:
-        """The seconds that are left, a millisecond at least; none without a limit."""
-        return None if self.seconds is None else max(1e-3, self._ends - time.monotonic())
-
-    @property
-    def used(self) -> float:
-        """The share of the time that is over, 1 at most; 0 where there is no limit."""
-        left = self._ends - time.monotonic()
-        return 0.0 if self.seconds is None else 1.0 - max(0.0, left) / self.seconds if self.seconds > 0.0 else 1.0
-
-    @property
-    def passed(self) -> bool:
-        """Whether the time is over."""
-        return bool(self._interrupted) or time.monotonic() >= self._ends
-
-    def sooner(self, seconds: float) -> Deadline:
-        """The same, so many seconds earlier: for who leaves time to others before the limit."""
-        earlier = copy(self)
-        earlier._ends -= seconds
-        return earlier
-
-    def check(self) -> None:
-        """Raise `OutOfTime` when the time is over."""
-        if self.passed:
-            raise OutOfTime(self.reason)
-
-    @contextmanager
-    def enforced(self) -> Iterator[None]:
-        """Raise `OutOfTime` a second after the end of the time even where nobody asks, as a single step may take long.
-
-        By the alarm of the operating system, so in the main thread only, and only where nobody else uses it.
-        """
-        alarm = getattr(signal, "SIGALRM", None)
-        if (
-            alarm is None
-            or not self.bounded
-            or threading.current_thread() is not threading.main_thread()
-            or signal.getsignal(alarm) is not signal.SIG_DFL
-        ):
-            yield
-            return
-
-        rung = False
-
-        def ring(number: int, frame: FrameType | None) -> None:
-            nonlocal rung
-            rung = True
-            raise OutOfTime(self.reason)
-
-        signal.signal(alarm, ring)
-        signal.setitimer(signal.ITIMER_REAL, max(0.0, self._ends - time.monotonic()) + GRACE)
-        try:
-            yield
-        except SparseRobError:
-            raise
-        except Exception as error:
-            # A library in which the alarm rang may tell of an error of its own instead: numpy, which asks Python code
-            # how two records compare, says that they cannot be compared.
-            if rung:
-                raise OutOfTime(self.reason) from error
-            raise
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(alarm, signal.SIG_DFL)
-
-    def interrupt(self, error: KeyboardInterrupt) -> str:
-        """Take note of an interrupt, and return why the time is over: in the words of the error where it has some."""
-        self.pressed |= not isinstance(error, OutOfTime)
-        self._interrupted = self.reason or str(error) or "interrupted from the keyboard"
-        return self._interrupted
-
-
-def as_seconds(seconds: object) -> float | None:
-    """A limit as a user gives it: a positive number of seconds, or ``None`` for no limit; raises `InputError`."""
-    if seconds is None:
-        return None
-    if (
-        isinstance(seconds, bool)
-        or not isinstance(seconds, int | float | np.integer | np.floating)
-        or not 0.0 < seconds < np.inf
-    ):
-        raise InputError(f"seconds: expected a positive number of seconds, or None for no limit, got {seconds!r}")
-    return float(seconds)
 
 
 Rebuild: TypeAlias = Callable[[], tuple[SemiInfiniteProgram, Solver, Regulariser | None]]

@@ -6,20 +6,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
+from itertools import product
+from typing import ClassVar, Literal, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import brief
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Float, read_only, sealed, shaped
+from sparserob_core.shapes import Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
+from sparserob_core.sip.convexity import require_convex, sparse_matrix
 from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
-
 
 Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
 """What an index of a family says. ``reduced``: everything but the uncertainty that is maximised in closed form;
@@ -27,6 +25,9 @@ Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
 
 
 TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as none (docs/decisions/0016)
+OUTSIDE = 1e-9  # of its sides and its distance from 0: how far outside of an index set rounding may put an index
+NARROW = 1e-12  # of its side: a gap between two cells that is rounding of their corners
+PARTS = 4_000_000  # of a grid between the corners of all cells: 32 MB
 EQUALITY = 1e-12  # of the numbers that are added up: an equality that is missed by at most this counts as met
 
 
@@ -141,6 +142,9 @@ class ConstraintFamily:
     in the numbers of the rows as they are stated: rows of 1e-10 are to be divided by that. The rest is optional, and
     used when offered:
 
+    ``scale(x)``      of what a proof may excuse `TOLERANCE` at a decision, in the numbers of the rows (`allowed`): 1
+        unless a row is smaller than that, or is an equality in a finer unit;
+
     ``chosen(indices (k, d), rows (k,))``  one row of each index, ``(G (k, n), h (k,))``, where all would take longer;
     ``worst(x)``      exact separation (a `Separation`);
     ``enclosure(x, lower (k, d), upper (k, d))``  an `Enclosure` of the violation on cells, for proofs;
@@ -174,6 +178,7 @@ class ConstraintFamily:
     name: str
     index_set: Box
     rows: Callable[[Array], tuple[Array, Array]]
+    scale: Callable[[Array], float] | None = None
     chosen: Callable[[Array, np.ndarray], tuple[Array, Array]] | None = None
     worst: Callable[[Array], Separation] | None = None
     enclosure: Callable[[Array, Array, Array], Enclosure] | None = None
@@ -202,6 +207,12 @@ class ConstraintFamily:
     def __post_init__(self) -> None:
         sealed(self)
 
+    @property
+    def provable(self) -> bool:
+        """Whether anything could prove that a decision meets all of its constraints; of rows alone nothing can."""
+        proven = self.reduced or self
+        return proven.enclosure is not None or proven.worst is not None
+
     def formulated(self, formulation: Formulation) -> ConstraintFamily | None:
         """The same constraints with the indices of another formulation; ``None`` where the family does not have it.
 
@@ -213,6 +224,55 @@ class ConstraintFamily:
         return forms.get(formulation)
 
     @shaped
+    def separated(self, x: Float[Array, " n"]) -> Separation:
+        """What `worst` finds at ``x``; raises `InputError` where that is no separation of this family: violations that
+        are no numbers, indices outside of the index set, a bound below a violation."""
+        assert self.worst is not None
+        found, box = self.worst(x), self.index_set
+        indices, violations = np.asarray(found.indices, dtype=float), np.asarray(found.violations, dtype=float)
+        if indices.ndim != 2 or not len(indices) == np.size(found.rows) == violations.size:
+            raise self._wrong("worst", "indices (k, d), rows (k,) and violations (k,)", f"shape {indices.shape}")
+        if np.asarray(found.rows).dtype.kind not in "iu" or (np.asarray(found.rows) < 0).any():
+            raise self._wrong("worst", "numbers of rows, from 0", f"{np.asarray(found.rows).tolist()}")
+        if np.isnan(violations).any():
+            raise self._wrong("worst", "violations that are numbers", f"{violations.tolist()}")
+        if violations.size and found.bound < violations.max() - TOLERANCE:
+            raise self._wrong("worst", f"a bound of at least {violations.max():.6g}, its own", f"{found.bound:.6g}")
+        if indices.shape[1] != box.dimension:
+            raise self._wrong("worst", f"indices (k, {box.dimension})", f"shape {indices.shape}")
+        room = OUTSIDE * (box.upper - box.lower + np.abs(box.lower) + np.abs(box.upper))
+        outside = ~((indices >= box.lower - room) & (indices <= box.upper + room)).all(axis=1)
+        if outside.any():
+            raise self._wrong("worst", "indices of the index set", f"{indices[outside][0].tolist()}")
+        return found
+
+    @shaped
+    def enclosed(self, x: Float[Array, " n"], lower: Float[Array, "k d"], upper: Float[Array, "k d"]) -> Enclosure:
+        """What `enclosure` says of cells; raises `InputError` where that is not one bound for each. One that is no
+        number says nothing, and is infinite."""
+        assert self.enclosure is not None
+        found = self.enclosure(x, lower, upper)
+        if np.shape(found.bounds) != (len(lower),) or np.shape(found.split) != (len(lower),):
+            got = f"shapes {np.shape(found.bounds)} and {np.shape(found.split)}"
+            raise self._wrong("enclosure", f"bounds and coordinates ({len(lower)},)", got)
+        return replace(found, bounds=np.where(np.isnan(found.bounds), np.inf, found.bounds))
+
+    @cached_property
+    def partition(self) -> tuple[Array, Array]:
+        """The `cells`, or the whole index set; raises `InputError` where an index is in none of them."""
+        box = self.index_set
+        if self.cells is None:
+            return box.lower[None], box.upper[None]
+        lower, upper = self.cells
+        missing = uncovered(lower, upper, box)
+        if missing is not None:
+            raise self._wrong("cells", "cells that cover the index set", f"none around {missing.tolist()}")
+        return lower, upper
+
+    def _wrong(self, what: str, expected: str, got: str) -> InputError:
+        return InputError(f"family {self.name!r}: {what}: expected {expected}, got {got}")
+
+    @shaped
     def explanation(self, index: Float[Array, " d"], row: int) -> Explanation:
         """One constraint for people, by its number and index where the family does not explain itself."""
         if self.explain is not None:
@@ -222,6 +282,10 @@ class ConstraintFamily:
     def row_unit(self, row: int) -> float:
         """What a violation of 1 of a row is in the user's units."""
         return 1.0 if self.row_units is None else float(self.row_units[row])
+
+    def allowed(self, x: Array) -> float:
+        """Return the violation that a proof at the decision ``x (n,)`` may count as none."""
+        return TOLERANCE if self.scale is None else TOLERANCE * self.scale(x)
 
     def measure(self, row: int | None = None) -> str:
         """What a violation of a row is measured in, or, without one, that of any of them, such as ``m or m/s``; empty
@@ -239,12 +303,75 @@ class ConstraintFamily:
         return np.asarray(G @ x - h, dtype=float)
 
 
+def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
+    """A point ``(d,)`` of the box that is in none of the cells between corners ``(k, d)``; ``None`` where there is
+    none, or where all cells are on faces of the box, as those of a cube of directions, whose inner points are multiples
+    of others.
+
+    Between the corners of all cells the box is a grid, of which every part is in a cell or outside of it; a grid of
+    more than `PARTS` parts is not made, and then the volumes of the cells are compared with that of the box.
+    """
+    lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
+    if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1:] != box.lower.shape or not lower.size:
+        return box.lower
+    moves = np.flatnonzero(box.upper > box.lower)
+    low, sides = box.lower[moves], (box.upper - box.lower)[moves]
+    begins, ends = ((corners[:, moves] - low) / sides for corners in (lower, upper))
+    filled = np.prod(np.minimum(ends, 1.0) - np.maximum(begins, 0.0), axis=1)
+    if not np.isfinite(filled).all():
+        return box.lower
+    if ((begins == ends) & ((begins == 0.0) | (begins == 1.0))).any(axis=1).all() and moves.size:
+        return None
+    edges = [_apart(np.concatenate([begins[:, i], ends[:, i], [0.0, 1.0]])) for i in range(moves.size)]
+    middle = (box.lower + box.upper) / 2
+    if np.prod([float(one.size) for one in edges]) > PARTS:
+        return middle if filled.sum() < 1.0 - OUTSIDE else None
+    places = [
+        [np.searchsorted(edges[i], corners[:, i] - NARROW) for i in range(moves.size)] for corners in (begins, ends)
+    ]
+    count = np.zeros([one.size for one in edges], dtype=int)
+    for corner in product((0, 1), repeat=moves.size):
+        at = tuple(places[side][i] for i, side in enumerate(corner))
+        np.add.at(count, at, -1 if sum(corner) % 2 else 1)
+    for axis in range(moves.size):
+        count = np.cumsum(count, axis=axis)
+    empty = np.argwhere(count[(slice(None, -1),) * moves.size] <= 0)
+    if not empty.size:
+        return None
+    middle[moves] = low + sides * [(edges[i][at] + edges[i][at + 1]) / 2 for i, at in enumerate(empty[0])]
+    return middle
+
+
+def _apart(corners: Array) -> Array:
+    """Shares of a side in order, those outside of it moved to its ends, of which none are nearer than `NARROW`."""
+    edges = np.unique(np.clip(corners, 0.0, 1.0))
+    kept: Array = edges[np.append(True, np.diff(edges) > NARROW)]
+    return kept
+
+
+@dataclass(frozen=True, eq=False)
+class EqualityErrors:
+    """Upper bounds ``missed (e,)`` of the errors of equalities at a decision, with all rounding counted, and the errors
+    ``allowed (e,)`` that a claim may excuse. ``advice``: the reason for large bounds, and what would help."""
+
+    missed: Array
+    allowed: Array
+    advice: str = ""
+
+    @property
+    def kept(self) -> bool:
+        """Whether every equality holds up to what is allowed."""
+        return bool((self.missed <= self.allowed).all())
+
+
 @dataclass(frozen=True, eq=False)
 class SemiInfiniteProgram:
     """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant`` subject to ``lower <= S x <= upper``,
-    ``G x <= h``, ``A x = b`` and every constraint family at every index.
+    ``G x <= h``, ``A x = b`` and every constraint family at every index. A row with an ``h`` of infinity asks for
+    nothing.
 
-    ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
+    ``n`` is the number of decision variables; ``P (n, n)`` is symmetric and positive semidefinite but for rounding
+    (`require_convex`), or refused; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
     ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
     (piece lengths), ``(k,)``. ``activity``: what it counts, always in the user's units, that an entry of ``S x`` is not
     0, of the first entries or all, where that means something (`working.counting`).
@@ -259,7 +386,9 @@ class SemiInfiniteProgram:
     ``among``: a program with the same constraints and another cost, whose decision begins with so many of the same
     entries: which of the decisions that cost as little is to be returned;
     ``settle(x)``: a decision that meets the same constraints and costs no more, such as one whose bounds are no looser
-    than they must be.
+    than they must be;
+    ``errors(x)``: proven bounds of the errors of ``A x = b``, where the entries of ``A`` and ``b`` are rounded
+    (`EqualityErrors`).
     """
 
     n: int
@@ -284,6 +413,7 @@ class SemiInfiniteProgram:
     largest: float | None = None
     spread: Spread | None = None
     settle: Callable[[Array], Array] | None = None
+    errors: Callable[[Array], EqualityErrors] | None = None
     guide: tuple[SemiInfiniteProgram, int] | None = field(default=None, repr=False)
     among: tuple[SemiInfiniteProgram, int] | None = field(default=None, repr=False)
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
@@ -292,7 +422,8 @@ class SemiInfiniteProgram:
     def __post_init__(self) -> None:
         if not hasattr(self.n, "__index__") or self.n < 1:
             raise InputError(f"n: expected the number of decision variables, at least 1, got {self.n!r}")
-        S, P = _sparse("S", self.S, None), _sparse("P", self.P, self.n)
+        S = None if self.S is None else sparse_matrix("S", self.S)
+        P = None if self.P is None else require_convex("P", self.P, self.n)
         if S is not None and S.shape[1] != self.n:
             raise InputError(f"S: expected {self.n} columns, got shape {S.shape}")
         images = self.n if S is None else int(S.shape[0])
@@ -343,7 +474,7 @@ class SemiInfiniteProgram:
         rows = np.atleast_2d(np.asarray(matrix, dtype=float))
         if rows.ndim != 2 or rows.shape[1] != self.n or not np.isfinite(rows).all():
             raise InputError(f"{left}: expected finite numbers of shape (rows, {self.n}), got shape {rows.shape}")
-        return rows, _vector(right, bounds, rows.shape[0])
+        return rows, (_vector if left == "A" else _upper)(right, bounds, rows.shape[0])
 
     @property
     def own_units(self) -> OwnUnits | None:
@@ -445,18 +576,9 @@ def _vector(name: str, value: object, size: int) -> Array:
     return vector
 
 
-def _sparse(name: str, matrix: object, square: int | None) -> csc_array | None:
-    if matrix is None:
-        return None
-    from scipy.sparse import csc_array as sparse
-
-    try:
-        array = matrix if isinstance(matrix, sparse) else sparse(matrix)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected a matrix of numbers, got {matrix!r}") from error
-    if array.ndim != 2 or not np.isfinite(array.data).all():
-        raise InputError(f"{name}: expected a matrix of finite numbers, got shape {array.shape}")
-    if square is not None and array.shape != (square, square):
-        raise InputError(f"{name}: expected shape ({square}, {square}), got {array.shape}")
-    kept: csc_array = read_only(array)
-    return kept
+def _upper(name: str, value: object, size: int) -> Array:
+    """Right-hand sides of inequalities; infinity asks for nothing."""
+    vector = as_bound(name, value, size)
+    if (vector == -np.inf).any():
+        raise InputError(f"{name}: expected numbers, or inf for a row that asks for nothing, got {vector.tolist()}")
+    return vector

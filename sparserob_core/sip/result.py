@@ -13,7 +13,7 @@ from sparserob_core.brief import brief
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished, gains
 from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof, Sparsest
-from sparserob_core.sip.program import WorstConstraint
+from sparserob_core.sip.program import EqualityErrors, WorstConstraint
 from sparserob_core.sip.solver import Named, Solver, Unanswered
 
 if TYPE_CHECKING:
@@ -149,6 +149,7 @@ class Result:
     the interrupt that ended the method early, in words. ``ray (n,)``: a direction along which the cost falls for ever,
     where one was found. ``missed``: the most by which the decision misses an equality, relative to the numbers that are
     added up in it, where there are any; computed, not proven, and at most `EQUALITY` where something is claimed.
+    ``errors``: what is proven of that, where the program offers it and something is claimed.
     ``activity``: between what the least count of the
     program lies, where it has one. ``sparsest``: there where the cost is that count, not J.
     ``solved_by``: whose answers to relaxed programs were believed, and how many (`RelaxedProgram.solved_by`).
@@ -179,6 +180,7 @@ class Result:
     stopped: str = ""
     ray: Array | None = None
     missed: float | None = None
+    errors: EqualityErrors | None = None
     activity: Activity | None = None
     sparsest: Sparsest | None = None
 

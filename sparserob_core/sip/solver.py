@@ -16,6 +16,8 @@ from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import CLOSED_FORM, DUAL_NEWTON, HIGHS, SOLVER
+from sparserob_core.sip.limits.apart import POSSIBLE, call_apart
+from sparserob_core.sip.limits.deadline import Deadline
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -25,6 +27,10 @@ if TYPE_CHECKING:
 # an optimum to the last bit of numbers of a million is none; ten times more, and a digit that there is is given away.
 ROUNDING = 2.0**-46
 AUTO = "auto"  # the name of `Auto`
+# Multiplications in a factorisation, about, from which a program is solved in a process of its own where time is
+# limited: a tenth of a second for all iterations. Ten times as many take as long as a limit may be missed by on a busy
+# machine; for a tenth the process itself, some milliseconds, would be noticed.
+LONG = 1e7
 SHORTCUTS = frozenset({CLOSED_FORM, DUAL_NEWTON, HIGHS})
 NUMBERS = re.compile(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
 
@@ -59,6 +65,13 @@ class QuadraticProgram:
     cones: tuple[np.ndarray, ...] = ()
     """The variables of each second-order cone: the first is at least the Euclidean norm of the others. No variable is
     in two of them."""
+
+    @property
+    def work(self) -> float:
+        """About how many multiplications a factorisation takes: every entry of the rows meets those of its column, or
+        of its row where these are fewer; and a hundredth of those of a solver that makes everything dense."""
+        n, r = self.q.size, self.h.size + self.b.size
+        return float((self.G.nnz + self.A.nnz) * (1 + min(n, r)) + 0.01 * (n + r) ** 3)
 
     def slope_missed(self, slope: Array) -> Array:
         """By how much the slope ``(n,)`` of the Lagrangian of all that is no cone misses what it may be, ``(n,)``: 0,
@@ -154,12 +167,14 @@ class Solver(ABC):
     """An inner convex solver: one quadratic program in, one claim out.
 
     Capabilities, declared by the adapter: ``warm_start`` (starts from its last solution), ``sparse`` (exploits sparse
-    rows), ``conic`` (takes programs with ``cones``, second-order ones).
+    rows), ``conic`` (takes programs with ``cones``, second-order ones). ``aborts``: on some programs its compiled code
+    ends the process, so that it is asked in a process of its own where the system has one.
     """
 
     warm_start: ClassVar[bool] = False
     sparse: ClassVar[bool] = False
     conic: ClassVar[bool] = False
+    aborts: ClassVar[bool] = False
 
     @property
     def delegate(self) -> str:
@@ -300,6 +315,7 @@ class Asked(Solver):
         self.solver, self.name, self.quick, self.instead = solver, name, quick, instead
         self.cones = (solver, name) if cones is None and solver.conic else cones
         self.calls, self.failures = 0, Failures() if failures is None else failures
+        self.deadline = Deadline()
 
     @staticmethod
     def of(solver: Solver) -> Asked:
@@ -315,11 +331,20 @@ class Asked(Solver):
                 return Asked(solver.general, solver.called, cones=solver.of_cones)
         return Asked(solver)
 
+    def until(self, deadline: Deadline) -> Asked:
+        """Itself, no longer waited for from the ``deadline`` on, nor is who is asked instead."""
+        self.deadline = deadline
+        if self.instead is not None:
+            self.instead.until(deadline)
+        return self
+
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """See `Solver.solve`."""
         self.calls += 1
         self.failures.calls += 1
         asked = self.cones[0] if program.cones and self.cones is not None else self.solver
+        if POSSIBLE and (asked.aborts or (self.deadline.bounded and program.work > LONG)):
+            return call_apart(lambda: asked.solve(program, accuracy), self.deadline)
         return asked.solve(program, accuracy)
 
 

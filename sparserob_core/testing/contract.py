@@ -118,6 +118,17 @@ class Contract(ABC, Generic[Component]):
         return (getattr(import_module(module), name),)
 
     @without_output
+    def test_no_option_bears_a_name_that_the_framework_uses(self) -> None:
+        made = self.create()
+        if isinstance(made, Options):
+            taken = record_type(self.kind).taken(type(made))
+            demand(
+                not taken,
+                f"these options of {type(made).__name__} bear names that the framework uses itself: {', '.join(taken)}",
+                "rename them: in a config, or as an argument in Python, the framework's own key would be meant",
+            )
+
+    @without_output
     def test_every_option_is_documented(self) -> None:
         made = self.create()
         if isinstance(made, Options):

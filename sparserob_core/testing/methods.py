@@ -16,7 +16,8 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Event, RoundFinished
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.duality import dual_bound, farkas_margin
-from sparserob_core.sip.method import Continuation, Deadline, Method, Tools
+from sparserob_core.sip.limits.deadline import Deadline
+from sparserob_core.sip.method import Continuation, Method, Tools
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.result import MEANING, Result

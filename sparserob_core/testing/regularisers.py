@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convexity import ControlImage, Regulariser
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import ControlImage, Regulariser
 from sparserob_core.testing.contract import Contract, broken, demand, same
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.sip import method
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits import deadline as limits
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
 from tests.known_answers.test_walls import heating
@@ -94,7 +94,7 @@ def test_a_day_on_the_wall_beside_the_program_on_nodes(
     naive, seconds = timed(lambda: by_highs(program, rows))
 
     whole, ours = timed(lambda: sr.run(config, quiet=True, figures=False).result)
-    monkeypatch.setattr(method, "time", SimpleNamespace(monotonic=time.process_time, perf_counter=time.process_time))
+    monkeypatch.setattr(limits, "time", SimpleNamespace(monotonic=time.process_time, perf_counter=time.process_time))
     monkeypatch.setattr(Deadline, "enforced", lambda self: nullcontext())  # its alarm goes by the clock on the wall
     third, limited = timed(lambda: sr.run(config, {"limits.seconds": goal / 3}, quiet=True, figures=False).result)
     missed = max(one.violations[0] for one in (f.worst(naive) for f in program.families if f.worst is not None))

@@ -15,8 +15,8 @@ from sparserob_core.checker.arithmetic.jets import kepler_root
 from sparserob_core.checker.claims import case, cells, constraints
 from sparserob_core.checker.claims.answers import _chords, answers_of
 from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.cost import effort
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
-from sparserob_core.checker.reach import effort
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.reach.varying.flow import VaryingFlow

@@ -10,7 +10,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.sip.evidence import NO_BOUND
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.testing import MethodContract
 from sparserob_core.testing.methods import dipping
 from tests.support.faults import fails

@@ -15,8 +15,8 @@ from flint import arb
 from scipy.optimize import LinearConstraint, linprog, milp
 
 import sparserob_core as sr
+from sparserob_core.checker.cost.effort import at_most
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
-from sparserob_core.checker.reach.effort import at_most
 from sparserob_core.control.feedback.effort import largest_effort
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.experiment.check.check import check

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip import method
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits import deadline as limits
+from sparserob_core.sip.limits.deadline import Deadline
 from tests.support.draws import taken
 from tests.support.ridden import unseen
 
@@ -30,7 +30,7 @@ def test_a_wall_that_is_ridden_leaves_a_proven_control_after_seconds(
 ) -> None:
     """Seconds of the processor: a busy machine takes longer by the clock."""
     clock = SimpleNamespace(monotonic=time.process_time, perf_counter=time.process_time)
-    monkeypatch.setattr(method, "time", clock)
+    monkeypatch.setattr(limits, "time", clock)
     monkeypatch.setattr(Deadline, "enforced", lambda self: nullcontext())  # its alarm goes by the clock on the wall
     result = sr.run(unseen(seed).config, {"limits.seconds": 5}, quiet=True, figures=False).result
     assert result.status in ("certified", "verified")

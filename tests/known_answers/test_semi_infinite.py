@@ -443,6 +443,28 @@ def test_a_program_that_leaves_nothing_is_infeasible_whatever_else_is_free(name)
     assert result.message
 
 
+@pytest.mark.parametrize("more", [{}, {"lower": -10.0, "upper": 10.0}, {"P": [[1e-3]]}, {"A": [[0.0]], "b": [0.0]}])
+def test_a_right_hand_side_of_infinity_asks_for_nothing(more):
+    result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[-1.0], G=[[1.0], [1.0], [-1.0]], h=[1.0, np.inf, np.inf], **more))
+    finite = sr.solve(sr.SemiInfiniteProgram(n=1, q=[-1.0], G=[[1.0]], h=[1.0], **more))
+    assert result.status == finite.status == "certified"
+    assert abs(result.cost - finite.cost) <= 1e-10
+    assert result.dual.fixed[1:].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("sides", "said"),
+    [
+        ({"G": [[1.0]], "h": [-np.inf]}, r"h: expected numbers, or inf for a row that asks for nothing, got \[-inf\]"),
+        ({"G": [[1.0]], "h": [np.nan]}, "h: expected numbers, got NaN"),
+        ({"A": [[1.0]], "b": [np.inf]}, r"b: expected finite numbers, got \[inf\]"),
+    ],
+)
+def test_a_right_hand_side_that_nothing_meets_is_refused_by_name(sides, said):
+    with pytest.raises(sr.InputError, match=said):
+        sr.SemiInfiniteProgram(n=1, q=[-1.0], **sides)
+
+
 def test_a_failure_says_once_what_is_wrong_and_what_to_do():
     class Silent(sr.Solver):
         def solve(self, program, accuracy):

@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.experiment.run import run as run_module
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.methods import exchange, sparsest
 from sparserob_core.sip.proof.branch_and_bound import CELLS
 from sparserob_core.sip.working import securing

@@ -192,3 +192,32 @@ def test_the_command_lists_settings_and_what_is_missing(command: Command):
     listed = command("plugins").stdout
     gone = [name for name in SOLVERS if name not in ALL]
     assert all(f"solver '{name}': " in listed for name in gone)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_highs_answers_after_any_other_highs_of_the_process_and_prints_nothing(threads):
+    script = f"""
+import os, sys, threading
+out = os.dup(1); os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+import highspy
+def other():
+    one = highspy.Highs(); one.setOptionValue("output_flag", False); one.setOptionValue("threads", {threads})
+    one.addVar(0, 1); one.run()
+other() if {threads} == 2 else None
+sys.stdout.flush(); os.dup2(out, 1)
+from tests.plugins.test_qpsolvers import PROGRAMS, solver
+from sparserob_core.sip.inner.simplex.interruptible import run
+for _ in range(2):
+    assert solver("highs").solve(PROGRAMS["bounded"], 1e-6).status == "solved"
+def counterpart():
+    other()
+    linear = highspy.Highs(); linear.setOptionValue("output_flag", False)
+    linear.setOptionValue("threads", 3 - {threads})
+    linear.addVar(1, 2); run(linear)
+    answers.append(linear.getModelStatus())
+answers = []
+thread = threading.Thread(target=counterpart); thread.start(); thread.join()
+assert answers == [highspy.HighsModelStatus.kOptimal], answers
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr[-500:]

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers
 from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
+from sparserob_core.checker.cost.effort import at_most
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop
-from sparserob_core.checker.reach.effort import at_most
+from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import LoopBeside, MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
@@ -165,6 +165,16 @@ class Answers:
         apart."""
         every = [[row[0] + self.support(row[1:]) for row in (rows * part).tolist()] for part in parts]
         return [sum(heights[1:], heights[0]) for heights in zip(*every, strict=True)]
+
+    def sizes(self, rows: Array) -> Array:
+        """Return the largest ``|c'x|`` at the breakpoints of the grid under any deviation, ``(k,)`` of ``rows (k, d)``,
+        never too large."""
+        found = np.zeros(len(rows))
+        for node in self.loop.nodes:
+            for sign in (1.0, -1.0):
+                heights = self.heights([node], exactly(sign * rows))
+                found = np.maximum(found, [below(height) for height in heights])
+        return np.asarray(np.where(np.isfinite(found), found, 0.0))
 
     def added(self, state: int) -> float:
         """The size of the numbers that are added up in a state at the end: of what the system does without control, and

@@ -6,6 +6,7 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, final, get_args
 
@@ -20,10 +21,11 @@ from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.integrals import Running, integrating, spelt
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
-from sparserob_core.checker.reach.measurable import Execution, Side, Together
+from sparserob_core.checker.reach.measurable import Side, Together
 from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
@@ -34,7 +36,7 @@ from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.problem.terms.integral import Accumulated
@@ -452,7 +454,7 @@ class Case:
             raise Unchecked("the checker knows errors of execution of known systems, without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
         if self.changing is None:
-            return Execution(self.problem, shares, self.control.breakpoints, pieces)
+            return Execution(self.problem, shares, self.control.breakpoints, pieces, self.clock)
         acts = self.control.breakpoints
         if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
             begins = acts[:-1] + system.delay
@@ -489,7 +491,7 @@ class Case:
         shape = held[name] if name in held else None if name == EQUALS else self.window(name).shape
         if shape is not None and shape.halfspaces() is None:
             return ""
-        return measured_in(direction, self.problem.names, 0 if name in held else self.problem.system.states)
+        return unit_of_row(direction, self.problem.names, 0 if name in held else self.problem.system.states)
 
     def units(self, window: Window) -> RowUnits:
         """What violations of a constraint are judged by."""
@@ -503,8 +505,33 @@ class Case:
                 window.reference,
                 self._acting,
                 self.changing,
+                self.nominal_sizes,
             )
         return self._units[window]
+
+    def nominal_sizes(self, rows: Array, gains: Array) -> Array:
+        """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``: 0 without one.
+
+        They are seen where every piece of the control begins to act, of ``rows (k, d)`` and ``gains (k, m)``, and never
+        too large. Under feedback, rows of the state alone count what deviations do too.
+        """
+        if self.certificate.get("decision") is None:
+            return np.zeros(len(rows))
+        if self.looped and not gains.any():
+            answers = import_module("sparserob_core.checker.claims.answers")  # which is about a case
+            return np.asarray(answers.answers_of(self).sizes(rows))
+        d = self.problem.system.states
+        z = np.array([[(float(x.mid()), float(x.rad())) for x in one.entries()] for one in self.nominal_states])
+        seen = np.delete(z, d, axis=1)  # without the 1
+        both = np.zeros((len(rows), seen.shape[1]))
+        both[:, :d], both[:, d : d + gains.shape[1]] = rows, gains
+        sizes = np.abs(both @ seen[:, :, 0].T) - np.abs(both) @ seen[:, :, 1].T
+        return np.asarray(np.where(np.isfinite(sizes), np.maximum(sizes, 0.0), 0.0).max(axis=1, initial=0.0))
+
+    @cached_property
+    def nominal_states(self) -> list[arb_mat]:
+        """The nominal ``(x, 1, u)`` of the decision where every piece begins to act, and at the end."""
+        return self.price.nominal_states(self.pieces)
 
     @property
     def _acting(self) -> Array | None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from itertools import groupby, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Stopped, Worst
-from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.tube import Tube
@@ -33,7 +33,7 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, Enclosed
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
-from sparserob_core.control.problem.names import joined, measured_in
+from sparserob_core.control.problem.names import joined, measured_in, unit_of_row
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array
 
@@ -86,7 +86,14 @@ def bounded(case: Case, window: Window) -> str:
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     if found.bound < 0:
         return f"kept, with a margin of at least {-found.bound:.1e}{_unit(case, window)} ({size})"
-    return f"kept to {found.bound:.1e}{_unit(case, window)}, {found.share:.1e} of its own unit ({size})"
+    return f"kept to {found.bound:.1e}{_unit(case, window)}{_excused(case, window)} ({size})"
+
+
+def _excused(case: Case, window: Window) -> str:
+    """In words, the largest violation that counts as none."""
+    if window.seen.facets is None:
+        return f" of its gauge, where {TOLERANCE:g} is excused"
+    return f", where {TOLERANCE * float(case.units(window).rows.max(initial=0.0)):.1e}{_unit(case, window)} is excused"
 
 
 def is_followed(case: Case, window: Window) -> bool:
@@ -95,11 +102,13 @@ def is_followed(case: Case, window: Window) -> bool:
 
 
 def follows(case: Case) -> bool:
-    """Whether rows of the system, which is known and has many states, are followed by their adjoints."""
+    """Whether rows of the system, which is known, are followed by their adjoints: where it has many states, or
+    measurable disturbances, which would be integrated along matrices on every piece."""
     system, still = case.problem.system, case.still
-    if case.answering or not case.alike or case.execution is not None or len(case.grid) > MOST_PIECES:
+    if case.answering or not case.alike or len(case.grid) > MOST_PIECES:
         return False
-    return still is not None and not system.parameter_count and system.states >= FOLLOWED
+    known_system = still is not None and not system.parameter_count
+    return known_system and (case.measurable or system.states >= FOLLOWED)
 
 
 def _along_rows(case: Case, window: Window) -> Proven:
@@ -166,13 +175,13 @@ def along(case: Case, window: Window, direction: Array, worst: Worst, limit: flo
     times = worst.cuts([window.start, window.stop, *window.cuts(breaks)])
     times = times[(times >= window.start) & (times <= window.stop)]
     start, stop = (times[:-1], times[1:]) if times.size > 1 else (times, times)
-    count, top, plain = 0, -np.inf, window.reference is None and not window.is_mixed
+    count, top = 0, -np.inf
     for _ in range(HALVINGS):
         case.clock.check()
         count += start.size
         if count > MOST_CELLS:
             break
-        tops = worst.over(start, stop, 0.0 if plain else _added(case, window, direction, start, stop))
+        tops = worst.over(start, stop, _added(case, window, direction, start, stop))
         open_ = ~(tops <= limit)
         top = max(top, float(tops[~open_].max(initial=-np.inf)))
         if not open_.any():
@@ -199,9 +208,32 @@ def beside(case: Case, window: Window, direction: Array, time: float, inside: fl
 
 
 def _added(case: Case, window: Window, direction: Array, start: Array, stop: Array) -> Array:
-    """What stands beside the state at both ends of cells, ``(2, k)``, at most."""
-    cells = case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
-    return np.array([[beside(case, window, direction, t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
+    """What stands beside the state at both ends of cells, and what errors of execution add there, ``(2, k)``, at most;
+    with how far these may be above their chord."""
+    found, delivered = np.zeros((2, start.size)), _delivered(case)
+    if window.reference is not None or window.is_mixed:
+        cells = case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
+        found = np.array([[beside(case, window, direction, t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
+    if delivered is not None:
+        c, _ = window.split(direction)
+        bent = delivered.bent_over(c, start, stop)
+        more = np.stack([delivered.added_at(c, times)[1] for times in (start, stop)]) + bent
+        found = found + more + HALF_ULP * 4.0 * (np.abs(found) + more)
+    return found
+
+
+def _delivered(case: Case) -> Execution | None:
+    """How exactly the control is delivered, of a system whose rows are followed."""
+    found = case.execution
+    assert found is None or isinstance(found, Execution)  # of one that changes with time none are
+    return found
+
+
+def erring_at(case: Case, c: Array, times: Array) -> tuple[Array, Array]:
+    """What the worst errors of execution add to ``c'x`` at ``times (k,)``, of a system whose rows are followed: between
+    ``(k,)`` and ``(k,)``."""
+    delivered = _delivered(case)
+    return (np.zeros(times.size), np.zeros(times.size)) if delivered is None else delivered.added_at(c, times)
 
 
 def _refute(
@@ -218,6 +250,8 @@ def _refute(
     if window.reference is not None or window.is_mixed:
         more = [beside(case, window, direction, t, t)[0] for t in middles.tolist()]
         least = least + np.array(more) - HALF_ULP * 8.0 * np.abs(more)
+    errors, _ = erring_at(case, window.split(direction)[0], middles)
+    least = least + errors - HALF_ULP * 8.0 * np.abs(errors)
     place = int(least.argmax())
     if least[place] > limit:
         raise Broken(f"{limit!r} is exceeded, by {least[place] - limit:.3g} at t = {middles[place]:.6g}")
@@ -236,7 +270,7 @@ def _unit(case: Case, window: Window) -> str:
     """The units of the rows of a window; of a curved set, whose excess is in multiples of its gauge, none."""
     sides = window.shape.halfspaces()
     rows = () if sides is None else sides[0]
-    return joined(measured_in(row, case.problem.names, window.states).strip() for row in rows)
+    return joined(unit_of_row(row, case.problem.names, window.states).strip() for row in rows)
 
 
 def normals_of(window: Window, data: object) -> Array:
@@ -303,7 +337,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
     those with the same parameters and directions together, their times cut wherever anything turns or jumps."""
     nu, units = case.problem.system.parameter_count, case.units(window)
     basis, gains, flat = _facets(window, units)
-    curved = None if flat is not None else Curved(window.seen, normals, units.sums)
+    curved = None if flat is not None else Curved(window.seen, normals, units.floors)
     pairs = case.clock.each(zip(lower, upper, strict=True))
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in pairs]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
@@ -388,12 +422,15 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
 def equalities(case: Case) -> str:
     """Show that the fixed states are met at every parameter, disturbance and initial state; a sentence with the
     figures."""
-    worst = 0.0
-    for (state, value), (off, added) in zip(case.equalities, missed(case), strict=True):
-        most = EQUALITY * max(added, abs(value))
+    worst, states = 0.0, np.eye(case.problem.system.states)[[state for state, _ in case.equalities]]
+    sizes = case.nominal_sizes(states, np.zeros((len(states), 0))).tolist()
+    for (state, value), (off, added), size, row in zip(case.equalities, missed(case), sizes, states, strict=True):
+        most = min(EQUALITY * max(added, abs(value)), TOLERANCE * max(size, abs(value)))
         if not off <= most:
-            name = case.problem.names.state(state)
-            raise Broken(f"{name} is missed by up to {float(off.upper()):.3g}, rounding is at most {most:.1e}")
+            name, unit = case.problem.names.state(state), measured_in(row, case.problem.names)
+            raise Broken(
+                f"{name} is missed by up to {float(off.upper()):.3g}{unit}, at most {most:.1e}{unit} is excused"
+            )
         worst = max(worst, float(off.upper()))
     return f"kept to {worst:.1e}{of_fixed(case)}"
 
@@ -405,28 +442,25 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = RowUnits(case.problem, scene, everything, horizon, horizon, varying=case.changing).sums
     answers, found = answers_of(case), []
-    last = answers.loop.nodes[-1].tolist() if case.looped else _unreached(case, scene)
+    last = answers.loop.nodes[-1].tolist() if case.looped else _unreached(case)
     for state, value in case.equalities:
         if case.several:
             raise Unchecked("the checker knows fixed final states beside disturbances of one class")
-        off, responses = last[state][0] - balls([value])[0], last[state][1:]
+        rests = not case.looped and _rests(case, state)
+        off, responses = (last[state][0] * 0 if rests else last[state][0]) - balls([value])[0], last[state][1:]
         high, low = off + answers.support(responses), answers.support([-x for x in responses]) - off
         found.append((high.max(low), float(sums[state]) + (answers.added(state) if case.looped else 0.0)))
     return found
 
 
-def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
+def _unreached(case: Case) -> list[list[arb]]:
     """The final state ``(d, 1)`` where no uncertainty reaches what is fixed of it, whatever the control."""
     if isinstance(case.changing, SpreadFlow):
         raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
     for state, _ in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
-    middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
-    basis = np.eye(case.problem.system.states)
-    if isinstance(case.changing, VaryingFlow):
-        return list(VaryingTube(case.changing, scene, basis).nodes[-1].tolist())
-    return list(Tube(flows(case.problem.system, middle), scene, basis).nodes[-1].parts[0].tolist())
+    return case.nominal_states[-1].tolist()
 
 
 def of_fixed(case: Case) -> str:
@@ -438,16 +472,7 @@ def of_fixed(case: Case) -> str:
 def _reached(case: Case, state: int) -> bool:
     """Whether an uncertain entry, a disturbance or the choice of an initial state may reach a state: follow the entries
     of ``A`` that are not 0 at every parameter."""
-    system = case.problem.system
-    wide = _hull(case)
-    every = (
-        [case.changing.links]
-        if isinstance(case.changing, VaryingFlow)
-        else [expanded(mode, Monomials(len(wide), 1), wide, [1.0] * len(wide)) for mode in system.modes]
-    )
-    d, reaching = system.states, {state}
-    for _ in range(d):
-        reaching |= {j for i in reaching for j in range(d) if any(not one["A"][0][i, j].is_zero() for one in every)}
+    every, reaching = _linked(case, state)
     uncertain = any(
         not part[i, j].is_zero()
         for parts in every
@@ -462,6 +487,38 @@ def _reached(case: Case, state: int) -> bool:
     begun = case.problem.initial_set
     moved = begun is not None and any(known(begun).radius[j] > math.ulp(0.0) for j in reaching)
     return uncertain or pushed or moved
+
+
+def _rests(case: Case, state: int) -> bool:
+    """Whether a state begins at 0 and nothing ever moves it: neither another state that is linked to it, nor a control
+    of the decision, nor a drift."""
+    every, reaching = _linked(case, state)
+    m, early = case.problem.system.controls, case.problem.initial_control
+    commands = [*case.pieces, *([] if early is None else [stacked([[u] for u in balls(np.asarray(early))])])]
+    idle = [all(command[channel, 0].is_zero() for command in commands) for channel in range(m)]
+    driven = any(
+        not parts["B"][0][i, channel].is_zero()
+        for parts in every
+        for i in reaching
+        for channel in range(parts["B"][0].ncols())
+        if channel >= m or not idle[channel]
+    )
+    return not driven and not any(np.asarray(case.problem.initial_state)[[*reaching]])
+
+
+def _linked(case: Case, state: int) -> tuple[list[Any], set[int]]:
+    """The entries of every system that takes its turn, and the states that may reach a state by those of ``A`` that
+    are not 0 at every parameter."""
+    system, wide = case.problem.system, _hull(case)
+    every = (
+        [case.changing.links]
+        if isinstance(case.changing, VaryingFlow)
+        else [expanded(mode, Monomials(len(wide), 1), wide, [1.0] * len(wide)) for mode in system.modes]
+    )
+    d, reaching = system.states, {state}
+    for _ in range(d):
+        reaching |= {j for i in reaching for j in range(d) if any(not one["A"][0][i, j].is_zero() for one in every)}
+    return every, reaching
 
 
 def _hull(case: Case) -> Sequence[arb]:

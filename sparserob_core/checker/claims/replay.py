@@ -13,7 +13,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.answers import Named, answers_of, commanded
 from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
 from sparserob_core.checker.claims.cells import Reached
-from sparserob_core.checker.claims.constraints import beside, followed, follows, missed
+from sparserob_core.checker.claims.constraints import beside, erring_at, followed, follows, missed
 from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
@@ -180,7 +180,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     pieces = _pieces(case, time, jumps=window.is_mixed)
     if follows(case):
         over, slack = _along_rows(case, window, time, begun, pieces)
-        return over, slack + ROUNDED * case.problem.system.states * float(case.units(window).rows.max(initial=0.0))
+        return over, slack + ROUNDED * case.problem.system.states * float(case.units(window).resolved.max(initial=0.0))
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
     tube = _tube(case, parameter, begun, basis, gains)
     beside = case.beside(window, basis, gains, parameter.tolist())
@@ -190,7 +190,9 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         polynomials += cells if beside is None else beside.added(cells, time, time, z, k)
     limits = [float(b.mid()) for _, b in flat] * (len(polynomials) // max(1, len(flat)))
     over = [float(poly.coefficients[0, 0]) - b for poly, b in zip(polynomials, limits, strict=True)]
-    slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(case.units(window).rows.max(initial=0.0))
+    slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(
+        case.units(window).resolved.max(initial=0.0)
+    )
     return over, slack
 
 
@@ -210,6 +212,8 @@ def _along_rows(
                 worst = replace(worst, centre=begun, begun=None)
             (top,), (wide,) = worst.most(np.array([time]))
             low, high = beside(case, window, c, time, (breaks[k] + breaks[k + 1]) / 2)
+            (least,), (most,) = erring_at(case, window.split(c)[0], np.array([time]))
+            low, high = low + least, high + most
             over.append(float(top - wide / 3.0 + (low + high) / 2.0) - float(b.mid()))
             slack = max(slack, float(wide + high - low))
     return over, slack

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, final
@@ -35,6 +36,7 @@ MOST_HELD = 16_000_000  # numbers that tell what inputs do on every piece, at on
 # With a tenth of it, runs would be refused that were honest in the units of their whole range; with ten times as much,
 # a control of 1 in a range of 1e7 would forgive seven digits.
 BEYOND = 2.0**20
+TINY = 1e-300  # the unit of a row that has no size at all: nothing of it is excused
 MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 
 
@@ -43,13 +45,15 @@ MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 class RowUnits:
     """The units of the constraint ``x(t) - r(t)`` in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in one
     of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``;
-    ``acting (m,)``: how far the control of a decision goes; ``varying``: the flow of a system that changes with time.
+    ``acting (m,)``: how far the control of a decision goes; ``varying``: the flow of a system that changes with time;
+    ``nominal``: the largest values of rows on the state and on the control along the nominal trajectory.
 
     That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any
     admissible control, the worst disturbance, any parameter), ``|b|``, and the width of the slab where the opposite row
     exists. That of a curved set in a direction ``c`` is ``h(c) - c'm``, ``m`` its centre. It is at least what double
-    precision resolves of the numbers that are added up. A violation of `TOLERANCE` of it counts as none. Units are no
-    claims: floating point will do.
+    precision resolves of the numbers that are added up, but never more than what a user can read: the largest of
+    ``|b|``, of that width, and of what the row does along the nominal trajectory (decision 0088). A violation of
+    `TOLERANCE` of it counts as none. Units are no claims: floating point will do.
     """
 
     problem: OptimalControlProblem
@@ -60,10 +64,32 @@ class RowUnits:
     reference: Array | None = None
     acting: Array | None = None
     varying: VaryingFlow | SpreadFlow | None = None
+    nominal: Callable[[Array, Array], Array] | None = None
 
     @cached_property
     def rows(self) -> Array:
         """The unit ``(k,)`` of every facet of a flat set."""
+        resolved, flat = self.resolved, known(self.shape).facets
+        assert flat is not None
+        across = np.array(widths(flat))
+        sizes = np.array([abs(float(b.mid())) for _, b in flat])
+        sizes = np.maximum(sizes, np.where(np.isfinite(across), across, 0.0))
+        if (resolved > sizes).any() and self.nominal is not None:
+            sizes = np.maximum(sizes, self.nominal(*self._rows_of(states=False)))
+        return np.asarray(np.minimum(resolved, np.maximum(sizes, TINY)))
+
+    @cached_property
+    def floors(self) -> Array:
+        """The least units ``(d,)`` of the states, by which that of a direction of a curved set is bounded from below:
+        what double precision resolves, but never more than what the state does along the nominal trajectory."""
+        d = self.problem.system.states
+        seen = np.zeros(d) if self.nominal is None else self.nominal(np.eye(d), np.zeros((d, 0)))
+        return np.minimum(RESOLVED * self.sums, seen)
+
+    @cached_property
+    def resolved(self) -> Array:
+        """The unit ``(k,)`` of every facet of a flat set as far as double precision resolves it, readable or not: by
+        that figures are compared, nothing is excused."""
         flat = known(self.shape).facets
         assert flat is not None
         heights = np.array([abs(float(b.mid())) for _, b in flat])
@@ -89,7 +115,7 @@ class RowUnits:
         if shape.facets is None:
             width = float(limit.mid()) - float(direction @ shape.centre)
             return TOLERANCE * max(width, RESOLVED * float(np.abs(direction) @ self.sums))
-        return TOLERANCE * float(shape.shares(direction) @ self.rows)
+        return TOLERANCE * float(shape.shares(direction) @ self.resolved)
 
     @property
     def _middle(self) -> tuple[float, ...]:

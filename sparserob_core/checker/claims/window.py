@@ -13,8 +13,8 @@ from sparserob_core.checker.arithmetic.balls import above
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.measurable import Execution
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.sets.known import known

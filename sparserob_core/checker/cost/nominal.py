@@ -82,6 +82,28 @@ def walked(
     return Walk(value, slope, blurred, terms)
 
 
+def nominal_states(
+    problem: OptimalControlProblem, control: Dictionary, pieces: Sequence[arb_mat], changing: Changing | None
+) -> list[arb_mat]:
+    """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and with ``u = 0`` at the end.
+
+    Every uncertainty is at its nominal point.
+    """
+    from flint import arb, arb_mat
+
+    modes, d, m = Nominal.of(problem), problem.system.states, problem.system.controls
+    still = stacked([[arb(0)] for _ in range(m)])
+    x, seen = modes[0].start, []
+    for start, stop, k, leg in _acting(problem, control):
+        if changing is None:
+            flow = modes[leg].over(stop - start, acting=k >= 0)[0]
+        else:
+            flow = changing.step(float(start), float(stop), k >= 0)
+        seen.append(arb_mat(x.tolist() + (still if k < 0 else pieces[k]).tolist()))
+        x = arb_mat((flow * seen[-1]).tolist()[: d + 1])
+    return [*seen, arb_mat(x.tolist() + still.tolist())]
+
+
 def _terms(z: arb_mat, M: arb_mat) -> float:
     """``|z|' |M| |z|``."""
     size = np.array([abs(float(entry.mid())) for entry in z.entries()])
@@ -169,6 +191,11 @@ class Changing:
     problem: OptimalControlProblem
     law: VaryingFlow
     _known: dict[tuple[float, float], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+
+    def step(self, start: float, stop: float, acting: bool) -> arb_mat:
+        """What the time from ``start`` to ``stop`` does to ``z``."""
+        parts = [part.tolist() for part in self.law.over(start, stop)]
+        return self._of(stacked([[*a, *b, *e] for a, b, e in zip(*parts, strict=True)]), True, acting)
 
     def over(self, start: float, stop: float, M: arb_mat, acting: bool) -> tuple[arb_mat, arb_mat]:
         """What the time from ``start`` to ``stop`` does to ``z``, and what it costs, segment by segment of the law;

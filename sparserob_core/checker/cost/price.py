@@ -15,7 +15,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
-from sparserob_core.checker.cost.nominal import Changing, Walk, ball_of, walked
+from sparserob_core.checker.cost.nominal import Changing, Walk, ball_of, nominal_states, walked
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
@@ -187,6 +187,10 @@ class Price:
     @property
     def _terms(self) -> tuple[Quadratic | None, ...]:
         return self.problem.cost.terms
+
+    def nominal_states(self, pieces: Sequence[arb_mat]) -> list[arb_mat]:
+        """Return the nominal ``(x, 1, u)`` of a control where every piece begins to act, and at the end."""
+        return nominal_states(self.problem, self.control, pieces, self._changing)
 
     def convex(self) -> None:
         """Show that every matrix is positive semidefinite; raises `Broken`."""

@@ -324,7 +324,7 @@ class Adjoint:
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
         """What an input of 1 from ``start`` to ``stop`` adds to the row at exact times, ``(..., q)``; where the
         difference of two times is rounded, the radius allows for it."""
-        (since, one), (until, other) = _apart(times, start), _apart(times, stop)
+        (since, one), (until, other) = subtract_times(times, start), subtract_times(times, stop)
         (late, first), (early, second) = self.integrals(since), self.integrals(until)
         mid = late.mid - early.mid
         rad = np.abs(late.rad - early.rad) + (OUTWARD - 1.0) * (late.rad + early.rad) + first + second
@@ -378,7 +378,7 @@ class Stopped:
         (first, _), motion = parts[0], parts[0][0].motion
         exact = arb_mat([[arb(float(v)) for v in row]])
         turned = exact * (motion.A * (arb(end) - arb(begin))).exp() - exact
-        length, rounded = (part.item() for part in _apart(np.array([end]), begin))
+        length, rounded = (part.item() for part in subtract_times(np.array([end]), begin))
         return Stopped(parts, [(first, length, rounded), (Adjoint.of_balls(motion, turned.tolist()[0]), begin, 0.0)])
 
     @property
@@ -403,7 +403,7 @@ def _sum(parts: Sequence[Enclosed]) -> Enclosed:
     return Enclosed(mid, rad * OUTWARD)
 
 
-def _apart(times: Array, others: Array | float) -> tuple[Array, Array]:
+def subtract_times(times: Array, others: Array | float) -> tuple[Array, Array]:
     """Differences of times, and by how much they are rounded (Knuth 1997, section 4.2.2, theorem B)."""
     nearest = times - np.asarray(others, dtype=float)
     part = nearest - times

@@ -4,10 +4,6 @@ On a piece of the grid a disturbance ``w = m + z`` pushes the state by ``e = int
 is left of the piece; the control of later pieces answers ``e``, and nothing else of the disturbance. So the worst of
 ``a'e`` is the integral of the support function of ``E'e^{A'r} a``. It is enclosed: on cells the corner of the set that
 is best there stands for all, and where another one could be better, by how much is bounded.
-
-Errors of execution, by which what is delivered of a control differs from the command, are such disturbances through
-``B``, as large as a share of the command. By parts the worst of them is a sum over the jumps of ``share_j |u_j|`` of
-``F_j(t - t_k)``, ``F_j(a) = int_0^a |c'e^{A s} B_j| ds``.
 """
 
 from __future__ import annotations
@@ -24,7 +20,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
-from sparserob_core.checker.reach.flow import OwnUnits, column, flows, held, middles, stacked
+from sparserob_core.checker.reach.flow import OwnUnits, column, held, middles, stacked
 from sparserob_core.checker.sets.along import Curve
 from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
 from sparserob_core.checker.sets.known import known
@@ -233,7 +229,8 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
         wrong = (below + dips) * (1.0 + 1e-13)
         wrong[rows, best] = 0.0
         wrong = wrong.max(axis=1)
-        settled = (wrong * width <= allowed[here]) | (turn == ROUNDS)
+        # where all are within what they are off by, no cut tells them apart
+        settled = (wrong * width <= allowed[here]) | (wrong <= e[here].max(axis=1)) | (turn == ROUNDS)
         done, at = rows[settled], here[settled]
         chosen = Q[done, :, best[done]] * weights
         area = _valued(chosen, stop[done]) * stop[done] - _valued(chosen, start[done]) * start[done]
@@ -483,117 +480,6 @@ class LoopBeside(ClosedLoop):
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         both = super().bent(piece, start, stop, rows), self._other.bent(piece, start, stop, rows)
         return np.asarray((both[0] + both[1]) * OUTWARD)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Ages:
-    """``|c'e^{A s} B_j|`` for one ``c`` on equal parts of the horizon: polynomials ``P (S, p + 1, m)``, off by at most
-    ``off (S, m)``, integrals up to the end of every part between ``low`` and ``high (S + 1, m)``, and how fast it
-    changes at most, ``steepest (S, m)``."""
-
-    P: Array
-    off: Array
-    low: Array
-    high: Array
-    steepest: Array
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Execution:
-    """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
-    none where only rows are asked for."""
-
-    problem: OptimalControlProblem
-    shares: Array
-    breakpoints: Array
-    pieces: Sequence[arb_mat]
-    _known: dict[bytes, Ages] = field(default_factory=dict, repr=False)
-
-    @cached_property
-    def kernel(self) -> Kernel:
-        """``e^{A s} [B, A B]`` over the horizon: the second half is how fast the first one changes."""
-        from flint import arb
-
-        (flow,) = flows(self.problem.system, [])
-        A, B, m = flow.parts["A"][0], flow.parts["B"][0], self.shares.size
-        B = stacked([[x * (i not in self.problem.commanded) for x in row[:m]] for i, row in enumerate(B.tolist())])
-        both = stacked([[*b, *more] for b, more in zip(B.tolist(), (A * B).tolist(), strict=True)])
-        horizon = float(self.breakpoints[-1])
-        return Kernel.of(A, both, arb(horizon), OwnUnits.of(A, horizon, np.abs(middles(B)).sum(axis=1)))
-
-    def ages(self, c: Array) -> Ages:
-        """Those of a direction ``c (d,)``, which is exact."""
-        key = (c + 0.0).tobytes()
-        if key not in self._known:
-            kernel, m = self.kernel, self.shares.size
-            plain, off = kernel.along(Enclosed(c[None], np.zeros((1, c.size))))
-            P, off = plain[0], off[0] + rounding(4 * ORDER + 32) * np.abs(plain[0]).sum(axis=1)  # as they are summed
-            value, more, less = swept(*signed(P[..., :m], off[:, :m]), np.ones(len(P) * m))
-            low, high = (part.reshape(-1, m) * kernel.half for part in (value - less, value + more))
-            lost = rounding(len(P) + 8) * np.cumsum(np.abs(high), axis=0)
-            totals = [np.concatenate([np.zeros((1, m)), np.cumsum(part, axis=0)]) for part in (low, high)]
-            lost = np.concatenate([np.zeros((1, m)), lost]) * OUTWARD
-            steepest = np.abs(P[..., m:]).sum(axis=1) + off[:, m:]
-            self._known[key] = Ages(P[..., :m], off[:, :m], totals[0] - lost, totals[1] + lost, steepest * OUTWARD)
-        return self._known[key]
-
-    def integrals(self, c: Array, ages: Array) -> tuple[Array, Array]:
-        """``F_j`` at ``ages (n,)`` that are rounded differences of times, between ``(n, m)`` and ``(n, m)``."""
-        known, kernel, m = self.ages(c), self.kernel, self.shares.size
-        place = np.clip(ages / float(self.breakpoints[-1]) * kernel.count, 0.0, kernel.count)
-        part = np.minimum(place.astype(int), kernel.count - 1)
-        ends = np.clip(2.0 * (place - part) - 1.0, -1.0, 1.0)
-        P, off = known.P[part], known.off[part]
-        value, more, less = swept(*signed(P, off), np.repeat(ends, m))
-        value, more, less = (one.reshape(-1, m) for one in (value, more, less))
-        # of where an age is among the parts, and of the polynomial's own height there
-        late = APART * kernel.count * np.abs(known.P).sum(axis=1).max(axis=0) + rounding(16) * np.abs(value)
-        low = known.low[part] + (value - less - late) * kernel.half
-        high = known.high[part] + (value + more + late) * kernel.half
-        size = rounding(4) * (np.abs(low) + np.abs(high))
-        begun = (ages > 0.0)[:, None]
-        return np.where(begun, np.maximum(low - size, 0.0), 0.0), np.where(begun, high + size, 0.0)
-
-    def least(self, c: Array, time: float) -> Array:
-        """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
-        low, high = self.integrals(c, np.maximum(time - self.breakpoints, 0.0))
-        found = self.shares * (low[:-1] - high[1:]) * (1.0 - 1e-15)
-        return np.maximum(found, 0.0)
-
-    @cached_property
-    def jumps(self) -> tuple[np.ndarray, Array, Array]:
-        """The pieces ``(q,)`` with which the size of an error changes, by how much ``(q, m)``, and how far that may be
-        off."""
-        control = Enclosed.all(self.pieces, (len(self.pieces), self.shares.size))
-        size = self.shares * np.abs(control.mid)
-        off = self.shares * control.rad + rounding(2) * size
-        change = np.diff(size, axis=0, prepend=0.0)
-        off = off + np.concatenate([np.zeros_like(off[:1]), off[:-1]]) + rounding(1) * np.abs(change)
-        which = np.flatnonzero(np.diff(control.mid, axis=0, prepend=0.0).any(axis=1) | change.any(axis=1))
-        return which, change[which], (off * OUTWARD)[which]
-
-    def added(self, c: Array, time: float) -> tuple[float, float]:
-        """What the worst errors add to ``c'x(t)``, between two numbers."""
-        which, change, off = self.jumps
-        low, high = self.integrals(c, np.maximum(time - self.breakpoints[which], 0.0))
-        up, down = np.maximum(change, 0.0), np.minimum(change, 0.0)
-        lost = (off * high).sum() + rounding(2 * change.size + 8) * (np.abs(change) * high).sum()
-        lost *= OUTWARD
-        return float((up * low + down * high).sum() - lost), float((up * high + down * low).sum() + lost)
-
-    def bent(self, c: Array, start: float, stop: float) -> float:
-        """How far `added` may be from its chord on ``[start, stop]``, which lies within one piece."""
-        which, change, off = self.jumps
-        ages = np.array([start, stop])[:, None] - self.breakpoints[which]
-        known, kernel = self.ages(c), self.kernel
-        places = np.clip(ages / float(self.breakpoints[-1]) * kernel.count, 0.0, kernel.count - 1).astype(int)
-        first, last = np.maximum(places[0] - 1, 0), np.minimum(places[1] + 1, kernel.count - 1)
-        steep = np.array([known.steepest[a : b + 1].max(axis=0) for a, b in zip(first, last, strict=True)])
-        begun = (ages[1] > 0.0)[:, None]
-        total = ((np.abs(change) + off) * steep.reshape(change.shape) * begun).sum()
-        return float((stop - start) ** 2 / 8.0 * total * (1.0 + rounding(change.size + 16)))
 
 
 def signed(P: Array, off: Array) -> tuple[Array, Array]:

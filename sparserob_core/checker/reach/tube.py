@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 STEPS = 16  # of the horizon, after which the norms of the transition's coefficients are looked at anew
 STEPS_WITHIN = 16  # of a piece of the grid, to the next of which the norms of what is left out are followed
 STATES_KEPT = 20_000  # enclosures of the state, per box of parameters
-MANY = 1000  # pieces of the grid, from which none has a ball of a duration that also holds others: balls add up
 
 
 @final
@@ -157,21 +156,17 @@ class Tube:
 
     @cached_property
     def _spans(self) -> list[int]:
-        """Of every piece of the grid the number of its duration; equal ones share one ball. Every duration is known
-        before one is used, since balls grow."""
+        """Of every piece of the grid the number of its duration; only equal ones share a number.
+
+        A ball that holds several durations is amplified with the state.
+        """
         from flint import arb
 
-        found, numbers = list[int](), dict[int | tuple[float, float], int]()
+        found, numbers = list[int](), dict[tuple[float, float], int]()
         for start, stop in pairwise(self.scene.grid):
-            length = arb(stop) - arb(start)
-            key: int | tuple[float, float] = round((stop - start) / self.scene.tick)
-            if len(self.scene.grid) > MANY:
-                key = difference(stop, start)
-            number = numbers.setdefault(key, len(numbers))
+            number = numbers.setdefault(difference(stop, start), len(numbers))
             if number == len(self._lengths):
-                self._lengths.append(length)
-            elif len(self.scene.grid) <= MANY:
-                self._lengths[number] = self._lengths[number].union(length)
+                self._lengths.append(arb(stop) - arb(start))
             found.append(number)
         return found
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import below
-from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
+from sparserob_core.checker.outcome import TOLERANCE, Unchecked
 from sparserob_core.checker.sets.shape import Shape, along, dot, total
 from sparserob_core.sip.convex_set import Array
 
@@ -42,12 +42,12 @@ class Bounded:
 @final
 @dataclass(frozen=True, eq=False)
 class Curved:
-    """A curved set with the coordinates of its directions: ``c = z'normals``, ``normals (b, d)``; ``sums (d,)``: the
-    largest numbers that are added up to a state."""
+    """A curved set with the coordinates of its directions: ``c = z'normals``, ``normals (b, d)``; ``floors
+    (d,)``: the least unit of every state."""
 
     shape: Shape
     normals: Array
-    sums: Array
+    floors: Array
 
     def bounded(self, z: Array, inside: Sequence[arb]) -> Bounded:
         """The constraint in one direction with a point ``inside`` the set as its limit. Its unit is the width of the
@@ -64,7 +64,7 @@ class Curved:
         return self._row(z, below(height), max(0.0, below(height - along(self.shape.centre, c))))
 
     def _row(self, z: Array, limit: float, unit: float) -> Bounded:
-        return Bounded(z, limit, max(unit, RESOLVED * float(np.abs(self.floats(z)) @ self.sums)) or 1.0)
+        return Bounded(z, limit, max(unit, float(np.abs(self.floats(z)) @ self.floors)) or 1.0)
 
     def floats(self, z: Array) -> Array:
         """``c (d,)`` rounded."""

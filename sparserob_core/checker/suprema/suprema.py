@@ -158,11 +158,8 @@ def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | N
 
 
 def _followed(case: Case, asked: Asked) -> Worst | None:
-    """The row by its adjoint, where the system is known and does not change, and the control is delivered as it is
-    commanded; ``None`` elsewhere."""
+    """The row by its adjoint, where the system is known and does not change; ``None`` elsewhere."""
     system = case.problem.system
-    if case.problem.execution is not None and case.theta.any():
-        return None
     if case.still is None or system.parameter_count or not case.alike:
         return None
     return followed(case, asked.window.split(asked.direction)[0])

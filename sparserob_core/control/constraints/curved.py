@@ -24,6 +24,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.taylor import Combination, combination
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.reach.functional import Leg, WorstCase
+from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Moving, Reference
 from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit
@@ -224,6 +225,15 @@ class CurvedConstraint(StateConstraint):
         said = explanation(self.name, self.functionals, directions, rhs, 0, *at, scale=float(np.abs(directions).max()))
         tangent = f" (a tangent of the {self.set.kind})"
         return replace(said, text=said.text + tangent, statement=said.statement + tangent)
+
+    @property
+    @shaped
+    def sized_rows(self) -> tuple[Float[Array, "q d"], Float[Array, " q"]]:
+        rows = self._flat.H if self.unit > 1.0 else np.zeros((0, self.set.dimension))
+        return rows, np.full(len(rows), 1.0 / self.unit)
+
+    def _along(self, x: Array, rows: Array) -> Array:
+        return np.asarray(np.abs(rows) @ nominal_sizes(self.functionals, x, np.eye(self.set.dimension)))
 
     def nominal(self) -> CurvedConstraint:
         known = self.functionals.nominal()

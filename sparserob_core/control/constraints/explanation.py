@@ -10,7 +10,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from sparserob_core.brief import ENTRIES, brief
-from sparserob_core.control.problem.names import UNNAMED, Names, measured_in
+from sparserob_core.control.problem.names import UNNAMED, Names, measured_in, unit_of_row
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
@@ -34,6 +34,10 @@ class Source(ABC):
     def normals_in(self, units: Units) -> tuple[Array, Array]:
         """The normals of its rows, ``(r, q)``, and what one of each of their coordinates ``(q,)`` is in the user's
         units, where its own are ``units``."""
+
+    def scale(self, x: Array) -> float:
+        """Return the size of the smallest row at the decision ``x (n,)``, 1 where no row is smaller."""
+        return 1.0
 
     @property
     def of_state(self) -> Source | None:
@@ -284,7 +288,7 @@ def explanation(
         combination(sign * stated / scale, functionals.names, f"({time:.6g})", direction.size),
         system.describe(parameter) if parameter.size else corner or "",
     )
-    unit = measured_in(normal, functionals.names, direction.size)
+    unit = unit_of_row(normal / scale, functionals.names, direction.size)
     remarks = [f"the initial state gives {free / scale:.6g}{unit}"] if time <= 0 else []
     remarks += (
         [f"the {cause} alone {'move' if len(names) > 1 else 'moves'} it by {sigma / scale:.4g}{unit}"]

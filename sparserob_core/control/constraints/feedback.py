@@ -13,8 +13,9 @@ from sparserob_core.control.constraints.explanation import Source, TimedExplanat
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop, shared
-from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
+from sparserob_core.control.reach.sizes import stated_sizes
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
@@ -71,12 +72,13 @@ class Uncertain(Protocol):
         """One constraint for people, at an index that may hold deviations too."""
 
 
-def indexed(constraint: Uncertain, index_set: Box, start: Array, source: object) -> ConstraintFamily:
+def indexed(constraint: Uncertain, index_set: Box, start: Array, source: Source) -> ConstraintFamily:
     """A constraint as a family; in its literal form, deviations are part of the index."""
     family = ConstraintFamily(
         name=constraint.name,
         index_set=index_set,
         rows=not_linear,
+        scale=source.scale,
         excess=constraint.excess,
         uncertain=constraint.uncertain,
         start=start,
@@ -128,6 +130,15 @@ class FeedbackConstraint(Source):
         """Those without feedback."""
         return self.flat.normals_in(units)
 
+    def scale(self, x: Array) -> float:
+        rows, sizes = self.flat.sized_rows
+        small = sizes < 1.0
+        if self.flat.gains is not None or not (small.any() or self.exact):
+            return self.flat.scale(x)
+        found = np.maximum(sizes, self.loop.sizes(x, rows))[small | self.exact]
+        least = float(found[found > 0.0].min(initial=np.inf))  # a row of a state that rests at 0 is met exactly
+        return least if self.exact and np.isfinite(least) else min(1.0, least)
+
     @property
     def of_state(self) -> FlatConstraint:
         """The one without feedback."""
@@ -139,6 +150,7 @@ class FeedbackConstraint(Source):
         begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
         source = self if self.exact else self.flat
         family = indexed(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], source)
+        family = replace(family, scale=self.scale)
         return replace(family, scaled=self.scaled) if self.loop.scales else family
 
     def scaled(self, factor: float) -> ConstraintFamily:
@@ -295,8 +307,7 @@ class FeedbackConstraint(Source):
             acting = flat.commanded((ends[0] + ends[1]) / 2)[:, 0]
             added = flat.gains[:proven] @ self.loop.controls(x)[acting]
             beside = [np.concatenate([more + added[..., :1], added[..., 1:]], axis=-1) for more in beside]
-        # an equality is one of computed numbers, to their rounding, as it is without feedback
-        found, late = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]), computed=self.exact)
+        found, late = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]))
         excess, every = found - flat.h[:proven], np.arange(found.shape[0])
         worst = excess.argmax(axis=1)
         return Enclosure(excess[every, worst], np.zeros_like(every), late[every, worst])
@@ -374,6 +385,10 @@ class FeedbackControl(Source):
         """Its sides, and the units of controls."""
         return self.H, units.controls
 
+    def scale(self, x: Array) -> float:
+        sizes = stated_sizes(self.H, self.h)
+        return float(sizes[sizes > 0.0].min(initial=1.0))
+
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         index_set = Box(self.places.starts[:1], np.array([self.places.stop]))
@@ -443,7 +458,7 @@ class FeedbackControl(Source):
     @property
     def measured(self) -> tuple[str, ...]:
         """The unit of every row, empty where it has none that is known."""
-        return tuple(measured_in(normal, self.loop.functionals.names, 0).strip() for normal in self.H)
+        return tuple(unit_of_row(normal, self.loop.functionals.names, 0).strip() for normal in self.H)
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people."""

@@ -81,7 +81,7 @@ class Turning(ABC):
 
     @property
     @abstractmethod
-    def source(self) -> object:
+    def source(self) -> Source:
         """What the family is of."""
 
     @property
@@ -246,7 +246,7 @@ class FeedbackCurved(Turning):
         return self.curved.unit
 
     @property
-    def source(self) -> object:
+    def source(self) -> Source:
         return self.curved
 
     @cached_property
@@ -301,7 +301,7 @@ class FeedbackCurvedControl(Turning, Source):
         return self.convex
 
     @property
-    def source(self) -> object:
+    def source(self) -> Source:
         return self
 
     @property

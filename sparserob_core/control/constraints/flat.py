@@ -25,6 +25,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.terms.windows import Flat
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.reach.functional import LEGS_KEPT, Leg, WorstCase
+from sparserob_core.control.reach.sizes import stated_sizes
 from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Direct, Moving, Reference
@@ -354,6 +355,12 @@ class FlatConstraint(StateConstraint):
             return explanation(self.name, self.functionals, self.H, allowed, row, time, parameter)
         mixed = (self.gains, int(self.commanded(index[:1])[0, row]))
         return explanation(self.name, self.functionals, self.H, allowed, row, time, parameter, mixed=mixed)
+
+    @property
+    @shaped
+    def sized_rows(self) -> tuple[Float[Array, "q d"], Float[Array, " q"]]:
+        normals = self.H if self.gains is None else np.hstack([self.H, self.gains])
+        return self.H, stated_sizes(normals, self.h)
 
     def nominal(self) -> FlatConstraint:
         return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None), shared=None)

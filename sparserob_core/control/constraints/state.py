@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from functools import cached_property
 
 import numpy as np
 
 from sparserob_core.control.constraints.explanation import SAME, Source, TimedExplanation
-from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Reference
 from sparserob_core.shapes import Float, Int, shaped
@@ -147,6 +149,37 @@ class StateConstraint(Source):
         """Itself."""
         return self
 
+    @property
+    @abstractmethod
+    def sized_rows(self) -> tuple[Float[Array, "q d"], Float[Array, " q"]]:
+        """Rows ``(q, d)`` on the state, with the sizes ``(q,)`` that they have whatever the decision; of a curved set
+        those in some directions."""
+
+    @shaped
+    def sizes(self, x: Float[Array, " n"]) -> Float[Array, " q"]:
+        """The sizes ``(q,)`` of `sized_rows` at a decision ``x (n,)``: a claim may excuse a billionth of them."""
+        rows, sizes = self.sized_rows
+        return np.maximum(sizes, self._along(x, rows))
+
+    def scale(self, x: Array) -> float:
+        """The least of the `sizes` at a decision ``x (n,)``, 1 where none is below that."""
+        rows, sizes = self.sized_rows
+        small = sizes < 1.0
+        if not small.any():
+            return 1.0
+        key = x.tobytes()
+        if key not in self._scales:
+            self._scales.clear()
+            self._scales[key] = float(np.maximum(sizes, self._along(x, rows))[small].min(initial=1.0))
+        return self._scales[key]
+
+    def _along(self, x: Array, rows: Array) -> Array:
+        return nominal_sizes(self.functionals, x, rows, self.gains)
+
+    @cached_property
+    def _scales(self) -> dict[bytes, float]:
+        return {}
+
     def normals_in(self, units: Units) -> tuple[Array, Array]:
         """Those of any index, and the units of states, and of controls where they are mixed."""
         coordinates = units.states if self.gains is None else np.concatenate([units.states, units.controls])
@@ -175,7 +208,7 @@ class StateConstraint(Source):
             return ("",)
         H, names = self.sides[0], self.functionals.names
         normals = H if self.gains is None else np.hstack([H, self.gains])
-        return tuple(measured_in(normal, names, H.shape[1]).strip() for normal in normals)
+        return tuple(unit_of_row(normal, names, H.shape[1]).strip() for normal in normals)
 
     @shaped
     def at(self, x: Float[Array, " n"], indices: Float[Array, "k j"]) -> Float[Array, "k r"]:

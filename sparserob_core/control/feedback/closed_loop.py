@@ -223,6 +223,49 @@ class ClosedLoop:
         flow, driven = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
         return np.asarray(flow @ nodes[pieces] + driven @ drives[pieces])
 
+    def _enclosed(self, x: Array, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
+        """The `states` at ``times (k,)`` on these pieces, and their rounding error under any deviation, ``(k, d)``."""
+        nodes, drives = self.path(x)
+        flow, driven = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        sizes, pushed, errors = self._rounded(x)
+        added = np.abs(flow) @ sizes[pieces, :, None] + np.abs(driven) @ pushed[pieces, :, None]
+        off = ROUND_OFF * added + np.abs(flow) @ errors[pieces, :, None]
+        return np.asarray(flow @ nodes[pieces] + driven @ drives[pieces]), off[:, :, 0]
+
+    def _rounded(self, x: Array) -> tuple[Array, Array, Array]:
+        """The sizes of the nodes ``(L + 1, d)`` and of what drives them ``(L, ..)`` under any deviation, and the
+        rounding error of every node.
+
+        Each step rounds `ROUND_OFF` of what it adds up, and the transitions to the node amplify that. Those of a system
+        that changes with time are counted by its motion.
+        """
+        key = x.tobytes()
+        if key not in self._errors:
+            (nodes, drives), radii = self.path(x), np.concatenate([[1.0], self.spread.radii])
+            sizes, pushed = np.abs(nodes) @ radii, np.abs(drives) @ radii
+            errors = np.zeros_like(sizes)
+            if self.motion is None:
+                Phi, Gamma, which = self.steps.Phi[0], self.steps.Gamma[0], self.functionals.response.which
+                every = np.empty((which.size, *Phi.shape[1:]))
+                step = np.einsum("kij,kj->ki", np.abs(Phi)[which], sizes[:-1])
+                step = ROUND_OFF * (step + np.einsum("kij,kj->ki", np.abs(Gamma)[which], pushed))
+                for piece, length in enumerate(which.tolist()):
+                    every[:piece] = Phi[length] @ every[:piece]
+                    every[piece] = np.eye(self.start.size)
+                    errors[piece + 1] = np.einsum("kij,kj->i", np.abs(every[: piece + 1]), step[: piece + 1])
+            self._errors.clear()
+            self._errors[key] = sizes, pushed, errors
+        return self._errors[key]
+
+    @cached_property
+    def _errors(self) -> dict[bytes, tuple[Array, Array, Array]]:
+        return {}
+
+    def sizes(self, x: Array, rows: Array) -> Array:
+        """Return the largest ``|c'x|`` at the breakpoints under any deviation, ``(r,)`` of ``rows (r, d)``."""
+        along = rows @ self.path(x)[0]
+        return np.asarray(np.maximum(self.height(along), self.height(-along)).max(axis=0))
+
     def _flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
         """What the first ``durations (k,)`` of ``pieces (k,)`` of the grid make of a state, and of what drives it."""
         if self.motion is None:
@@ -257,17 +300,16 @@ class ClosedLoop:
         upper: Array,
         H: Array,
         beside: tuple[Array, Array] | None = None,
-        computed: bool = False,
     ) -> tuple[Array, Array]:
         """The bounds, ``H (r, d)`` or ``(k, r, d)``, and how much of each is owed to the length of the cell;
-        ``beside``: what is added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear between;
-        ``computed``: with the transitions as they are computed, whatever the expansion of a system in t leaves out.
+        ``beside``: what is added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear between.
 
         On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
         support function of a chord lies below the chord of the support functions.
         """
         pieces = self.grid.locate((lower + upper) / 2)
-        ends = np.split(self.states(x, np.concatenate([lower, upper]), np.tile(pieces, 2)), 2)
+        states, off = self._enclosed(x, np.concatenate([lower, upper]), np.tile(pieces, 2))
+        ends, off = np.split(states, 2), np.maximum(*np.split(off, 2))
         along = [H @ end for end in ends]
         radii = np.concatenate([[1.0], self.spread.radii])
         late = self._late(x, H, lower, upper - lower, pieces, ends[0])
@@ -276,7 +318,8 @@ class ClosedLoop:
             end[..., : more.shape[-1]] += more
             size[..., : more.shape[-1]] += np.abs(more)
         found, lost = [self.height(one) for one in along], ROUND_OFF * (size @ radii)
-        if self.motion is not None and not computed:
+        lost += (np.abs(H) @ off[:, :, None])[:, :, 0]
+        if self.motion is not None:
             lost += (np.abs(H) @ self._left_out(x, self.motion)[pieces][:, :, None])[:, :, 0]
         if self.measurable is not None:
             under_way = self.origin[pieces]

@@ -23,7 +23,8 @@ from sparserob_core.errors import SparseRobError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut
-from sparserob_core.sip.method import Deadline, OutOfTime, Tools
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.own_units import answered_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram

@@ -16,9 +16,9 @@ from sparserob_core.control.term import TERMS, UNITLESS, Term, measured
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convexity import ROUNDED, is_definite, require_convex
 
 EXACT = 16  # states up to which a matrix is shown to be positive semidefinite in fractions
-ROUNDED = 1e-13  # of the diagonal, per row: a negative eigenvalue of at most that is rounding of the numbers given
 
 
 @final
@@ -196,26 +196,14 @@ def _numbers(path: str, given: object, shape: tuple[int, ...], expected: str) ->
 
 
 def _semidefinite(path: str, Q: Array) -> Array:
-    """A symmetric positive semidefinite matrix, or one that is but for rounding, which is then made so.
-
-    Every test is one of the matrix with a diagonal of about 1, by powers of two: it does not depend on units.
-    """
-    if not np.array_equal(Q, Q.T):
-        raise InputError(path=path, expected="a symmetric matrix", got=f"{Q.tolist()}")
-    diagonal = np.diag(Q)
-    if np.array_equal(Q, np.diag(diagonal)) and (diagonal >= 0.0).all():
+    """A symmetric positive semidefinite matrix, or one that is but for rounding, which is then made so: the checker
+    shows it in fractions."""
+    form = require_convex(path, Q, Q.shape[0])
+    Q, diagonal = form.toarray(), form.diagonal()
+    small, kept = ROUNDED * Q.shape[0], np.flatnonzero(diagonal > 0.0)
+    if form.nnz == np.count_nonzero(diagonal) or (Q.shape[0] <= EXACT and _exactly_semidefinite(Q)):
         return Q
-    size = np.exp2(np.round(np.log2(np.where(diagonal > 0.0, diagonal, 1.0)) / 2))
-    least = float(np.linalg.eigvalsh(Q / size[:, None] / size)[0])
-    small = ROUNDED * Q.shape[0]
-    bare = ~(diagonal > 0.0)
-    if least < -small or Q[bare].any():
-        raise InputError(
-            path=path,
-            expected="a positive semidefinite matrix",
-            got=f"the eigenvalue {float(np.linalg.eigvalsh(Q)[0]):.6g}",
-        )
-    if least > small or (Q.shape[0] <= EXACT and _exactly_semidefinite(Q)):
+    if is_definite(form[kept][:, kept], 1.0 - 2.0 * small):
         return Q
     return Q + np.diag(4.0 * small * diagonal)
 

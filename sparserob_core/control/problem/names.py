@@ -205,6 +205,17 @@ def measured_in(normal: npt.NDArray[np.float64], names: Names, states: int | Non
     return f" {unit}" if unit else ""
 
 
+def unit_of_row(normal: npt.NDArray[np.float64], names: Names, states: int | None = None) -> str:
+    """Return the unit of a row as the user wrote it, with a space before it; empty where it is not known.
+
+    Coefficients may have units themselves, as stiffnesses do. They are numbers where one of them is 1, or where they
+    are a direction of length 1; of others the unit of the row is not known.
+    """
+    sizes = np.abs(normal)
+    numbers = (sizes == 1.0).any() or abs(np.linalg.norm(sizes) - 1.0) <= ROUNDING
+    return measured_in(normal, names, states) if numbers else ""
+
+
 def joined(units: Iterable[str]) -> str:
     """The unit of a number that is one of several rows', with a space before it: ``m``, or ``m or m/s`` where rows have
     different ones; empty where one of them is not known."""

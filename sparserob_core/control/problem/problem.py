@@ -41,6 +41,7 @@ from sparserob_core.control.problem.terms.windows import (
 )
 from sparserob_core.control.sets.integrals import enclosed
 from sparserob_core.control.sets.sets import Equality, Product
+from sparserob_core.control.sets.strangers import require_consistent
 from sparserob_core.control.term import (
     CONTROLS,
     KIND,
@@ -382,9 +383,11 @@ class OptimalControlProblem(Term):
         if not isinstance(self.measurements, Measurements):
             raise InputError(path="measurements", expected="Measurements", got=type(self.measurements).__name__)
         try:
-            return self.measurements.checked(self.system.states, self.horizon)
+            measured = self.measurements.checked(self.system.states, self.horizon)
+            require_consistent("noise", measured.noise)
         except InputError as error:
             raise error.under("measurements") from None
+        return measured
 
     def _costs(self) -> Cost:
         if not isinstance(self.cost, Cost):

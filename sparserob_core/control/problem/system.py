@@ -24,7 +24,9 @@ from sparserob_core.control.problem.expression import (
     parse_definitions,
     parse_matrix,
 )
+from sparserob_core.control.problem.tracing import SAME
 from sparserob_core.control.sets.sets import Box
+from sparserob_core.control.sets.strangers import require_consistent
 from sparserob_core.control.term import SAME_TIME, over
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, dense, shaped
@@ -280,6 +282,8 @@ class LinearSystem:
             )
         if self.parameters is not None and not self.parameters.is_bounded:
             raise InputError("the set of parameters must be bounded", path="system")
+        if self.parameters is not None:
+            require_consistent("system.parameters", self.parameters)
         names = tuple(self.names) or tuple(f"p{i + 1}" for i in range(self.parameter_count))
         if len(names) != self.parameter_count:
             raise InputError(
@@ -429,7 +433,24 @@ class LinearSystem:
                 raise NotEnclosable(
                     f"system: the function {name} returned {type(model).__name__} for an entry, expected a number"
                 )
+        if not isinstance(entry, ExpressionMatrix):
+            self._require_same(name, np.array([one.coefficients[0] for one in p]), coefficients[0], remainder)
         return coefficients, remainder
+
+    def _require_same(self, name: str, centre: Array, value: Array, remainder: Array) -> None:
+        """Raise `InputError` where a function of the parameters is another one for numbers than for Taylor models,
+        whose ``value`` at the ``centre (nu,)`` of a cell is told: rows would be those of one system, and proofs those
+        of another. An expression is one and the same for both."""
+        given = self._called(name, centre)
+        apart = np.abs(given - value) - remainder
+        if not (apart <= SAME * max(float(np.abs(given).max()), float(np.abs(value).max()))).all():
+            row, column = (int(i) for i in np.unravel_index(int(apart.argmax()), apart.shape))
+            raise InputError(
+                path=f"system.{name}",
+                expected="a function that depends on its argument alone, by arithmetic",
+                got=f"{given[row, column]:.9g} and then {value[row, column]:.9g} in row {row + 1}, column {column + 1},"
+                f" at {self.describe(centre)}",
+            )
 
 
 @final

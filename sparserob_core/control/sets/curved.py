@@ -58,10 +58,10 @@ class Ellipsoid(ConvexSet):
             raise InputError(
                 f"shape must be a square matrix of finite numbers, got shape {shape.shape}", path="ellipsoid"
             )
-        if not np.allclose(shape, shape.T, rtol=1e-12, atol=0.0) or not _positive(shape):
-            raise InputError(f"shape must be symmetric positive definite, got {shape.tolist()}", path="ellipsoid")
+        if (wrong := _indefinite(shape)) is not None:
+            raise InputError(f"shape must be symmetric positive definite, got {wrong}", path="ellipsoid")
         object.__setattr__(self, "centre", _finite("ellipsoid.centre", self.centre, shape.shape[0]))
-        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "shape", (shape + shape.T) / 2)
         sealed(self)
 
     @property
@@ -178,7 +178,8 @@ class NormBall(ConvexSet):
     the origin.
 
     Flat for ``p = 1`` (up to ten dimensions) and ``p = inf``. Support function ``c'centre + radius |c|_q``,
-    ``1/p + 1/q = 1``.
+    ``1/p + 1/q = 1``. A ball of radius 0 is a point whatever ``p``, and is kept as that of ``p = inf``: of a point
+    there is no gauge by which directions could be scaled.
     """
 
     p: float
@@ -199,7 +200,7 @@ class NormBall(ConvexSet):
         if dimension is not None and dimension < 1:
             raise InputError(path="norm.dimension", expected="at least 1", got=str(dimension))
         middle = np.zeros(dimension or 0) if centre is None else _finite("norm.centre", centre, dimension)
-        object.__setattr__(self, "p", float(p))
+        object.__setattr__(self, "p", float(p) if float(radius) > 0.0 else np.inf)
         object.__setattr__(self, "radius", float(radius))
         object.__setattr__(self, "centre", middle)
         sealed(self)
@@ -378,10 +379,24 @@ class NormBall(ConvexSet):
         return super().in_units(units)
 
 
-def _positive(shape: Array) -> bool:
-    """Whether a symmetric matrix is positive definite, judged with unit diagonal."""
+def _indefinite(shape: Array) -> str | None:
+    """What keeps a square matrix from being symmetric and positive definite, in words; ``None`` where it is both.
+    Judged with its diagonal scaled to 1, whatever the units are."""
+    apart = np.abs(shape - shape.T) > 1e-12 * np.abs(shape.T)
+    if apart.any():
+        i, j = np.argwhere(apart)[0]
+        return f"{shape[i, j]:.12g} in row {i + 1}, column {j + 1} and {shape[j, i]:.12g} across the diagonal"
     sizes = np.sqrt(np.maximum(np.diag(shape), 0.0))
-    return bool((sizes > 0.0).all() and np.linalg.eigvalsh(shape / np.outer(sizes, sizes))[0] > 0.0)
+    if not (sizes > 0.0).all():
+        return f"{np.diag(shape).min():.6g} on its diagonal"
+    least = float(np.linalg.eigvalsh(shape / np.outer(sizes, sizes))[0])
+    if not least > 0.0:
+        return f"the eigenvalue {least:.6g} where its diagonal is scaled to 1"
+    try:
+        np.linalg.cholesky(shape)
+    except np.linalg.LinAlgError:
+        return f"an eigenvalue that is 0 but for rounding, {least:.6g}, where its diagonal is scaled to 1"
+    return None
 
 
 @shaped

@@ -306,6 +306,10 @@ class _OfPlane:
         assert enclosure is not None
         return enclosure(x[:-2], lower, upper)
 
+    def scale(self, x: Array) -> float:
+        """The scale of the family at that initial state."""
+        return self._at(x).allowed(x[:-2]) / TOLERANCE
+
     def explain(self, index: Array, row: int) -> Explanation:
         """The constraint for people, without what the initial state gives: it is free."""
         said = self.plane.model.program.family(self.base.name).explanation(index[: self.base.index_set.dimension], row)
@@ -326,6 +330,7 @@ class _Joined(_OfPlane):
             name=self.base.name,
             index_set=self.base.index_set,
             rows=self.rows,
+            scale=self.scale,
             worst=self.worst,
             cells=self.base.cells,
             enclosure=self.enclosure if offers else None,
@@ -367,6 +372,7 @@ class _JoinedUncertain(_OfPlane):
             name=base.name,
             index_set=base.index_set,
             rows=base.rows,
+            scale=self.scale,
             uncertain=self.uncertain,
             excess=self.excess,
             start=np.unique(np.vstack([base.start, *begun]), axis=0),

@@ -26,7 +26,7 @@ from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.events import Notify, ignore
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import ConstraintFamily, Enclosure
 from sparserob_core.sip.proof.branch_and_bound import Supremum, supremum
 

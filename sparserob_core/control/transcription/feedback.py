@@ -25,16 +25,16 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.measurable import MISSED
 from sparserob_core.control.transcription.own_units import added_up, fixed, units_of_steps
-from sparserob_core.control.transcription.program import ranges, transcribed
+from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
+from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import Formulation
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
-EQUALS = "equals"  # the name of that of the terminal equalities
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
@@ -127,6 +127,7 @@ class Answering(Acting):
         loop = ClosedLoop(
             functionals, gains, _spread(posed, seen.pieces), size, seen.pieces, seen.observer, anew=_begins_anew(posed)
         )
+        system, horizon = functionals.response.system, problem.horizon
         families = [of_state(constraint, loop).family() for constraint in posed.constraints]
         settled: list[Callable[[Array], Array]] = []
         if seen.fixed[1].size:
@@ -170,7 +171,7 @@ class Answering(Acting):
         elif charge.among == "peak" and problem.cost.is_linear:
             among = (transcribed(posed, peak).program, first)
         return Part(
-            families=families,
+            families=[replace(one, hindrance=lambda low, high: hindrance(system, horizon)) for one in families],
             lower=lower,
             upper=upper,
             weights=weights,
@@ -238,6 +239,9 @@ def refuse(
     curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     bound, measurable = problem.disturbance, classes == {"measurable"}
+    slanted = [
+        one.kind for one in (None if measurable else bound, problem.initial_set) if one is not None and _is_slanted(one)
+    ]
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
@@ -254,6 +258,9 @@ def refuse(
         f"set with flat sides for states and controls under measurable disturbances, which the "
         f"{' and the '.join(curved)} has not": measurable and bool(curved),
         "cost other than worst under measurable disturbances": measurable and cost == "worst",
+        f"set of disturbances and of initial states with an interior, or of axes that are points, which the"
+        f" {' and the '.join(slanted)} has not: a flat set is a box of its own coordinates, whose directions are the"
+        " columns of E": bool(slanted),
         "disturbance that takes any value on each of its pieces": bool(classes)
         and not measurable
         and not disturbance.is_complete,
@@ -275,6 +282,13 @@ def refuse(
     for wanted, hindered in reasons.items():
         if hindered:
             raise InputError(f"feedback needs a {wanted}", path="policy.name")
+
+
+def _is_slanted(convex: ConvexSet) -> bool:
+    """Whether a set has no length along an axis through its middle, though it deviates along it: then no gain on that
+    entry of a deviation is bounded."""
+    spread = Spread(((1, convex),))
+    return bool(((spread.chords <= 0.0) & (spread.radii > 0.0)).any())
 
 
 def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:

@@ -10,6 +10,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.quadratic import quadratic_cost
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convexity import convex_by_construction
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -68,4 +69,5 @@ def quadratics(problem: OptimalControlProblem, dictionary: Dictionary, variables
     largest = float(prices @ reach) + on_pieces.largest(reach)
     more = variables - terms.q.size
     P = csc_array(block_diag([terms.P, csc_array((more, more))])) if more else terms.P
+    P = convex_by_construction(P)
     return {"P": P, "q": np.append(terms.q, np.zeros(more)), "constant": terms.constant, "largest": largest}

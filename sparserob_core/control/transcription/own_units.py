@@ -10,6 +10,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.sizes import widths
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Moving
 from sparserob_core.control.sets.directions import sampled
@@ -122,7 +123,7 @@ def shortfall(constraints: Sequence[StateConstraint]) -> float:
     for one in constraints:
         if one.sides is not None:
             H, h = constraint_sides(one)
-            sizes = np.minimum(np.where(h != 0.0, np.abs(h), np.inf), np.where((w := _slabs(H, h)) > 0.0, w, np.inf))
+            sizes = np.minimum(np.where(h != 0.0, np.abs(h), np.inf), np.where((w := widths(H, h)) > 0.0, w, np.inf))
             least = min(least, float(sizes.min(initial=1.0)))
     return least
 
@@ -138,7 +139,7 @@ def units_of_sides(H: Array, h: Array, reach: Array, added: Array) -> Array:
     """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
     those of them that are not 0; no less than what double precision resolves of the sums ``added (r,)``. A power of
     two, 1.2 to 2.5 times below that."""
-    sizes = np.stack([reach, np.abs(h), _slabs(H, h)])
+    sizes = np.stack([reach, np.abs(h), widths(H, h)])
     sizes = np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, np.inf).min(axis=0)
     least = np.where(np.isfinite(added), RESOLVED * added, 0.0)
     unit = np.where(np.isfinite(sizes), np.maximum(sizes, least), np.where(least > 0.0, least, 2.0))
@@ -241,19 +242,6 @@ def window_times(functionals: WorstCase, start: float, stop: float) -> Array:
     inside = breaks[(breaks > start) & (breaks < stop)]
     chosen = np.unique(np.linspace(0, inside.size - 1, min(inside.size, TIMES - 2)).round().astype(int))
     return np.unique(np.concatenate([[start], inside[chosen] if inside.size else inside, [stop]]))
-
-
-def _slabs(H: Array, h: Array) -> Array:
-    """The width ``h + h'`` between each row and the nearest opposite one, ``(r,)``; infinite without one."""
-    width = np.full(h.size, np.inf)
-    for row in range(h.size):
-        mine, other = H[row], H
-        scale = np.abs(mine).max()
-        sizes = np.abs(other).max(axis=1)
-        share = scale / np.where(sizes > 0.0, sizes, 1.0)
-        opposite = (np.abs(mine + other * share[:, None]) <= 1e-14 * scale).all(axis=1)
-        width[row] = float(np.min(np.abs(h[row] + h[opposite] * share[opposite]), initial=np.inf))
-    return width
 
 
 def _widths(convex: ConvexSet) -> Array:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
 from sparserob_core.control.constraints.control import ControlConstraint, held_at
+from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.literal import LiteralConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.constraints.state import StateConstraint
@@ -16,6 +18,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two, ratios
 from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.transcription.objective import objective, quadratics
@@ -33,12 +36,13 @@ from sparserob_core.control.transcription.steps import Steps, paired
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
-from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, SemiInfiniteProgram
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, EqualityErrors, Formulation, SemiInfiniteProgram
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 SAME = 1e-11  # of the numbers that are added up, a difference that is rounding
+EQUALS = "equals"  # the name of the fixed final states
 IDLE = 1e-15  # of the numbers that are added up, an entry of a row that is rounding
 
 
@@ -82,6 +86,7 @@ class OpenLoop(Acting):
             families=[moved.get(family.name, family) for family in model.program.families],
             A=A if b.size else None,
             b=b if b.size else None,
+            errors=final_errors(begun) if b.size else None,
         )
         return begun.became(OpenLoop(), program)
 
@@ -116,9 +121,11 @@ def transcribed(posed: Posed, acting: Acting) -> Transcription:
         priced["weights"] = part.weights
     if part.largest is not None:
         priced.setdefault("largest", part.largest)
+    errors = None if not b.size else final_errors(posed)
     program = SemiInfiniteProgram(
         n=n,
         families=part.families,
+        errors=errors,
         **priced,
         S=S,
         lower=lower,
@@ -134,6 +141,35 @@ def transcribed(posed: Posed, acting: Acting) -> Transcription:
         among=part.among,
     )
     return posed.became(acting, program, part.feedback)
+
+
+def final_errors(posed: Posed) -> Callable[[Array], EqualityErrors]:
+    """Return the function that bounds the errors of the fixed final states at a decision, in units of their rows.
+
+    The final state of the middle parameter is enclosed as that of every terminal constraint is, with the rounding of
+    the response counted. A claim may excuse a billionth of a fixed value, or of what its state does until then: nothing
+    of a state that is 0 and stays 0.
+    """
+    (H, values), horizon = fixed(posed.held), np.array([posed.problem.horizon])
+    unit = np.ones(values.size) if posed.rows is None else posed.rows.fixed
+    nominal, ends = posed.functionals.nominal(), (posed.problem.horizon, posed.problem.horizon)
+
+    def errors(x: Array) -> EqualityErrors:
+        sizes = np.maximum(np.abs(values), nominal_sizes(nominal, x, H))
+        share = np.where(sizes > 0.0, sizes, 1.0)
+        rows, heights = H / share[:, None], values / share
+        both = np.vstack([rows, -rows]), np.append(heights, -heights)
+        constraint = FlatConstraint(EQUALS, nominal, *both, *ends, ParameterIndex(None))
+        missed = float(constraint.enclosure(x, horizon[None], horizon[None]).bounds[0])
+        missed = missed if (sizes > 0.0).any() else 0.0
+        system, end = posed.functionals.response.system, posed.problem.horizon
+        advice = (
+            f"the fixed final states may be missed by up to {missed:.1e} of their sizes, {TOLERANCE:g} is excused;"
+            f" {hindrance(system, end) or 'wider final sets would help'}"
+        )
+        return EqualityErrors(missed * sizes / unit, TOLERANCE * sizes / unit, advice)
+
+    return errors
 
 
 def held_nominally(problem: OptimalControlProblem) -> OptimalControlProblem:
@@ -338,6 +374,7 @@ def _reduced(constraint: StateConstraint) -> ConstraintFamily:
         name=constraint.name,
         index_set=constraint.index_set,
         rows=constraint.rows,
+        scale=constraint.scale,
         chosen=constraint.chosen,
         excess=constraint.at,
         worst=constraint.worst,

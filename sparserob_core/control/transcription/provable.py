@@ -12,6 +12,7 @@ from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.reach.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.integrals import enclosed
+from sparserob_core.control.sets.strangers import strangers
 from sparserob_core.control.transcription.terms.in_time import within_reach
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.errors import NotEnclosable
@@ -66,8 +67,15 @@ def remarked(problem: OptimalControlProblem, result: Result, feedback: bool = Fa
 
 
 def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
-    """What a claim about a problem rests on that is not proven; empty where there is nothing of the kind, as where the
-    integrals over the set of measurable disturbances are enclosed. Under ``feedback`` the checker proves it."""
+    """What a claim about a problem rests on that is not proven: what sets of others say of themselves, and integrals
+    over the set of measurable disturbances, unless they are enclosed. Empty where there is nothing of the kind."""
+    kinds = sorted({one.kind for one in strangers(problem)})
+    said = f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
+    return "; ".join(filter(None, [said, _of_integrals(problem, feedback)]))
+
+
+def _of_integrals(problem: OptimalControlProblem, feedback: bool) -> str:
+    """That of the integrals over measurable disturbances. Under ``feedback`` the checker proves it."""
     if problem.measurable is None:
         return ""
     if feedback:
@@ -99,6 +107,6 @@ def hindrance(system: System, horizon: float) -> str:
         return ""
     size = f"e^{exponent:.0f} = {np.exp(min(exponent, 700.0)):.1g}"
     return (
-        f"the state can grow by {size} over the horizon: double precision cannot resolve more than "
-        f"{np.finfo(float).eps:.0e} of what it grows to; a shorter horizon or wider sets would help"
+        f"the plant amplifies by {size} over the horizon, and double precision resolves {np.finfo(float).eps:.0e} of"
+        " that; a shorter horizon, wider sets, or a plant that is stabilised before would help"
     )

@@ -33,7 +33,8 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
     and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). A piece of the
     control whose push is below its price by more than that is 0 in the bound, whatever is rounded (`_pushed`). What a
     multiplier of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their
-    own (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`). Signals of measurable
+    own (`_moving`), and by what an expansion in the parameters leaves out (`_beyond`). With fewer functions than pieces
+    multipliers of the pieces are off by rounding too (`_slipped`). Signals of measurable
     disturbances under feedback prove what they lead to, not what they were composed for (`_missed`); where they do not
     prove that nothing is feasible, that is not claimed. ``prices (n,)`` are those of the decision, where the bound is
     one of what its sizes cost at them.
@@ -44,7 +45,7 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
         return result
     share = SHARE + _moving(model)
     lost = share * (_added(model, result, share, prices) + _quadratic(model, result) + result.lower_bound)
-    lost += _neglected(model, result) + _beyond(model, result) + _missed(model, result)[0]
+    lost += _neglected(model, result) + _beyond(model, result) + _missed(model, result)[0] + _slipped(model, result)
     lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
@@ -205,12 +206,28 @@ def _quadratic(model: Transcription, result: Result) -> float:
     finite, at = model.program.finite, result.dual.at
     if finite.P is None or at is None:
         return 0.0
-    reach = model.problem.control.reach(np.eye(model.problem.system.controls))
-    pieces = np.repeat(reach, model.control.pieces)
-    far = pieces if finite.S is None else np.abs(np.linalg.pinv(model.control.values.T)).sum(axis=1)
-    far = far if finite.S is None else np.kron(reach, far)
+    far = _coefficients(model)
     bent, at, q = (np.abs(model.nominal(each)) for each in (np.asarray(abs(finite.P) @ np.abs(at)), at, finite.q))
     return float(abs(finite.constant) + 0.5 * at @ bent + (q + bent) @ far)
+
+
+def _coefficients(model: Transcription) -> Array:
+    """How far the coefficients of the control come from 0, ``(m N,)``."""
+    reach = model.problem.control.reach(np.eye(model.problem.system.controls))
+    if model.program.finite.S is None:
+        return np.repeat(reach, model.control.pieces)
+    return np.asarray(np.kron(reach, np.abs(np.linalg.pinv(model.control.values.T)).sum(axis=1)))
+
+
+def _slipped(model: Transcription, result: Result) -> float:
+    """What multipliers of the image may be off the slopes that they stand for, times the largest coefficients: the
+    rounding of each sum that makes one of the other (Higham 2002, section 3.1)."""
+    S, z = model.program.finite.S, result.dual.z
+    if S is None or z is None:
+        return 0.0
+    terms = int(np.diff(S.tocsc().indptr).max(initial=0))
+    sizes = model.nominal(np.asarray(abs(S).T @ np.abs(z)))
+    return float((terms + 8) * EPSILON * np.abs(sizes) @ _coefficients(model))
 
 
 def _neglected(model: Transcription, result: Result) -> float:

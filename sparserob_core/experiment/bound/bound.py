@@ -26,7 +26,7 @@ from sparserob_core.experiment.run.given import GivenConfig, as_config, as_run
 from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 
 __all__ = ["Bound", "WorstCase", "bound", "summary_of_bound"]
 

@@ -268,6 +268,8 @@ def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     anew."""
     if summary.get("epsilon") != 0.0 or case.certificate.get("status") == "infeasible":
         return None
+    if case.certificate.get("decision") is None:
+        return [] if summary.get("value") is None else [f"value is {summary['value']!r}, and there is no decision"]
     from sparserob_core.checker.claims.claims import compared
 
     value, cost = summary.get("value"), summary.get("cost")

@@ -17,7 +17,7 @@ from sparserob_core.experiment.config.overrides import Override, apply_override,
 from sparserob_core.experiment.config.reader import Source, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.plugins.components import Registry
-from sparserob_core.experiment.plugins.messages import Complaint, complaints, malformed, models_in
+from sparserob_core.experiment.plugins.messages import NOT_TEXT, Complaint, complaints, malformed, models_in
 from sparserob_core.experiment.plugins.registry import load_registry
 
 KEPT = {*MaximiserEntry.model_fields} - {"name"}  # keys of a maximiser that are the framework's own
@@ -194,7 +194,10 @@ def _refusal(source: Source, changes: tuple[Override, ...], wrong: list[Complain
 
 def _line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> str:
     change = _override(source, changes, complaint)
-    return f"{source.where(complaint.path) if change is None else f'override {change.text}'}: {complaint}"
+    if change is None:
+        return f"{source.where(complaint.path)}: {complaint}"
+    hint = f"; as text it is written {change.quoted}" if complaint.message.startswith(NOT_TEXT) else ""
+    return f"override {change.text}: {complaint}{hint}"
 
 
 def _override(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> Override | None:

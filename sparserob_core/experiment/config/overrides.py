@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +23,38 @@ class Override:
     value: object
     text: str
 
+    @property
+    def quoted(self) -> str:
+        """The same override as it is to be written where its value is meant as text."""
+        return quoted(self.text)
+
+
+def quoted(text: str) -> str:
+    """``key="value"``, quoted once more for a shell, so that the value is text."""
+    key, _, value = text.partition("=")
+    return shlex.quote(f"{key}={json.dumps(value.strip(), ensure_ascii=False)}")
+
+
+def parse_value(text: str, parse: Callable[[str], object]) -> object:
+    """The value of ``key=value``; what YAML would leave out as a comment, or cannot read, is an error that says how to
+    quote it."""
+    given = text.partition("=")[2]
+    try:
+        value = parse(given)
+    except ConfigError as error:
+        raise ConfigError(f"{error}; as text it is written {quoted(text)}") from error
+    for mark in re.finditer(r"(?:^|(?<=\s))#", given):
+        try:
+            comment = parse(given[: mark.start()]) == value
+        except ConfigError:
+            comment = False  # it stands within quotes
+        if comment:
+            raise ConfigError(
+                f"override {shown(text)}: {shown(given[mark.start() :])} would be a comment, which is left out; "
+                f"as text the value is written {quoted(text)}"
+            )
+    return value
+
 
 def parse_overrides(
     given: Mapping[str, object] | Iterable[str] | None, parse: Callable[[str], object]
@@ -31,10 +66,10 @@ def parse_overrides(
         return [Override(_path(key), value, f"{key}={value}") for key, value in given.items()]
     found = []
     for text in (as_utf8(argument, "strict") for argument in given):
-        key, equals, value = text.partition("=")
+        key, equals, _ = text.partition("=")
         if not equals:
             raise ConfigError(f"override {shown(text)}: expected key=value, for example method.name=nominal")
-        found.append(Override(_path(key), parse(value), text))
+        found.append(Override(_path(key), parse_value(text, parse), text))
     return found
 
 

@@ -191,7 +191,7 @@ class PathOptions(SetOptions, populate_by_name=True):
                 path=f"{where}.name", expected="one set in an entry with a name", got=f"{' and '.join(self._given())}"
             )
         found: list[PathConstraint | MixedConstraint] = [
-            PathConstraint(member, self.start, stop, self.name, self.relative_to) for member in members
+            PathConstraint(member, self.start, self.stop, self.name, self.relative_to) for member in members
         ]
         if self.mixed is None:
             return found
@@ -201,7 +201,7 @@ class PathOptions(SetOptions, populate_by_name=True):
                 " itself: write that as an entry of its own",
                 path=f"{where}.relative_to",
             )
-        return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, stop, self.name)]
+        return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, self.stop, self.name)]
 
 
 class TermOptions(Options, populate_by_name=True):

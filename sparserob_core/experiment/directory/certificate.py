@@ -14,7 +14,7 @@ from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.steps import Steps
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment, PlainExperiment
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
@@ -30,8 +30,9 @@ WELL = 1e-14  # of its distance from the middle: a point that is so far from the
 
 
 def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None:
-    """The certificate of a result, as plain data; ``None`` for a program that is no control problem, or when nothing
-    was reached.
+    """The certificate of a result, as plain data; ``None`` for a program that is no control problem, and of a run that
+    failed. Of one that was stopped before there was a decision, or before it was transcribed (`bare_certificate`), it
+    holds the lower bound alone.
 
     ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a
     normal direction (of the state, or of the control and its steps), of equalities, and of the control's pieces where
@@ -53,10 +54,10 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     constraints of ``control_step`` at the horizon, under feedback each at a deviation ``following`` of the next
     period's initial state too.
     """
-    if not isinstance(experiment, ControlExperiment) or result.status == "failed":
+    if isinstance(experiment, PlainExperiment) or result.status == "failed":
         return None
-    if result.decision is None and result.status != "infeasible":
-        return None  # it was stopped before there was anything to claim
+    if not isinstance(experiment, ControlExperiment):
+        return bare_certificate(experiment, result)
     program = experiment.program
     theta = (
         None
@@ -84,6 +85,21 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         **({} if causal is None else {"causal": causal_data(causal)}),
         "proof": _proofs(experiment, result.proofs),
         "witness": _witness(experiment, result) if result.status == "refuted" else None,
+    }
+
+
+def bare_certificate(experiment: Experiment, result: Result) -> dict[str, Any]:
+    """The certificate of a result of which nothing is proven but its lower bound of 0: no term of a cost is
+    negative."""
+    return {
+        "format": FORMAT,
+        "config": experiment.loaded.config.digest(),
+        "status": result.status,
+        "cost": result.cost,
+        "lower_bound": result.lower_bound,
+        "decision": None,
+        "multipliers": None,
+        "proof": {},
     }
 
 

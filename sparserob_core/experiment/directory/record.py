@@ -15,12 +15,15 @@ import numpy as np
 from sparserob_core.control.constraints.control import of_control
 from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.names import measured_in
+from sparserob_core.control.transcription.own_units import fixed
+from sparserob_core.control.transcription.program import EQUALS
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.directory.rounds import BOUND
 from sparserob_core.experiment.directory.sparsity import sparsity, verdict
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Proof
-from sparserob_core.sip.program import EQUALITY, TOLERANCE, SemiInfiniteProgram, WorstConstraint
+from sparserob_core.sip.program import TOLERANCE, EqualityErrors, SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.result import Result
 
 PROVEN = ("certified", "verified")
@@ -49,7 +52,7 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
         **({"units": units} if units else {}),
         **({"parameters": list(parameters)} if parameters else {}),
         "tolerances": {proof.family: _tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
-        **({} if result.missed is None else {"equalities": {"allowed": EQUALITY, "missed": result.missed}}),
+        **({} if result.errors is None else {"equalities": _equalities(result.errors)}),
         "sparsity": {
             **(acting or {"active_fraction": None, "switches": None}),
             **({} if model is None else {"channels": model.problem.system.controls}),
@@ -79,6 +82,7 @@ def units_of(model: Transcription, result: Result) -> dict[str, Any]:
     rows = {one.name: list(one.measured) for one in model.constraints}
     every = set(names.control_units)
     alike = every.pop() if len(every) == 1 and model.problem.control.halfspaces() is not None else ""
+    rows |= {EQUALS: [measured_in(axis, names).strip() for axis in fixed(model.problem)[0]]}
     rows |= {name: [alike] for name in (of_control(model.problem), "control_step") if name not in rows}
     worst = result.worst
     mine = [] if worst is None else rows.get(worst.constraint, [])
@@ -96,12 +100,20 @@ def units_of(model: Transcription, result: Result) -> dict[str, Any]:
 
 def _tolerance(proof: Proof) -> dict[str, Any]:
     """What was proven of one constraint: that it is exceeded by at most ``proven`` of each row's own unit (negative: a
-    margin). ``rows``: what counts as no violation, at most `TOLERANCE` of its own unit, of every row in the user's."""
+    margin), ``kept`` of every row in the user's. ``rows``: the violation of every row that counts as none, in the
+    user's units: at most `TOLERANCE` of its size."""
+    share = proof.bound if proof.share is None else proof.share
     return {
         "own": TOLERANCE,
-        "proven": proof.bound if proof.share is None else proof.share,
-        "rows": None if proof.units is None else TOLERANCE * proof.units,
+        "proven": share,
+        "kept": None if proof.units is None else share * proof.units,
+        "rows": None if proof.units is None else proof.allowed * proof.units,
     }
+
+
+def _equalities(errors: EqualityErrors) -> dict[str, Any]:
+    """By how much every fixed final state is ``missed`` at most, and how much of that is ``excused``, in its unit."""
+    return {"missed": errors.missed, "excused": errors.allowed}
 
 
 def _witness(worst: WorstConstraint | None, states: int | None) -> dict[str, Any]:
@@ -196,5 +208,5 @@ def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
 def _version(package: str) -> str | None:
     try:
         return metadata.version(package)
-    except metadata.PackageNotFoundError:
+    except Exception:  # noqa: BLE001  not installed, or a broken folder of that name, of which each Python raises its own
         return None

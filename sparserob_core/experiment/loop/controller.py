@@ -17,7 +17,8 @@ from sparserob_core.experiment.run.given import GivenConfig, as_config
 from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
-from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, as_seconds, require_suited
+from sparserob_core.sip.limits.deadline import Deadline, as_seconds
+from sparserob_core.sip.method import GAP_TOLERANCE, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 
 CONTROLLED = "config: expected a control problem, in which there is something to control"

@@ -54,6 +54,6 @@ def causal_upper(
             break
         problem = scaling.at(factor)
         stated = search.bound(tree, grown, np.inf, problem.disturbance, limits.ended, factor / base)
-        if proven(model, problem, stated) is not None:
+        if proven(model, problem, stated, tools.deadline) is not None:
             return factor, limits.ended
     return np.nan, limits.ended

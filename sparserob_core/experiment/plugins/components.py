@@ -38,6 +38,14 @@ class Part:
     of: type | None = None
 
 
+def _clash(first: Plugin, second: Plugin) -> str:
+    """Two records of one name: who registered them, and what disables one of them and leaves the other."""
+    who = [f"by plugin '{one.plugin}'" + (f" ({one.source})" if one.source else "") for one in (first, second)]
+    apart = [*sorted(second.switches - first.switches), *sorted(first.switches - second.switches)]
+    mend = f"disable one of them, for example {DISABLE}={apart[0]}" if apart else "rename one, or leave one out"
+    return f"{first} is registered twice, {who[0]} and {who[1]}; {mend}"
+
+
 @cache
 def parts(model: type[Options]) -> dict[str, Part]:
     """The options that are components themselves, by name, as `sparserob_core.options.part` says."""
@@ -76,11 +84,7 @@ class Registry:
     def _add(self, record: Plugin) -> None:
         known = self._records[record.kind]
         if record.name in known:
-            first, second = known[record.name].plugin, record.plugin
-            raise UnknownPluginError(
-                f"{record} is registered twice, by plugin '{first}' and by plugin '{second}'; "
-                f"disable one of them, for example {DISABLE}={second}"
-            )
+            raise UnknownPluginError(_clash(known[record.name], record))
         known[record.name] = record
 
     def names(self, kind: str, of: type | None = None) -> list[str]:

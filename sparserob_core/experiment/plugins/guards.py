@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar, final
 
 import numpy as np
@@ -13,15 +14,15 @@ import numpy as np
 from sparserob_core.control.policies.policy import Charge, Policy, Quantity
 from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
 from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
-from sparserob_core.errors import PluginError
+from sparserob_core.errors import InputError, PluginError
 from sparserob_core.experiment.plugins import files
 from sparserob_core.experiment.plugins.attribution import asked, attributed, short_repr
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convexity import ControlImage, Regulariser, require_convex
 from sparserob_core.sip.maximiser import Maximiser, Objective
 from sparserob_core.sip.method import ExecutorFactory, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import ControlImage, Regulariser
-from sparserob_core.sip.result import MEANING, Result
+from sparserob_core.sip.result import MEANING, Result, Status
 from sparserob_core.sip.rules import InnerStop, OuterStop, Schedule, Selection
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 Component = TypeVar("Component")
 FILES = f"{files.__name__}."
+CLAIMS: tuple[Status, ...] = ("certified", "verified", "infeasible")
 TRUTH = (bool, np.bool_)
 NUMBER = (int, float, np.integer, np.floating)
 
@@ -123,6 +125,9 @@ class _Method(Method):
             raise PluginError(
                 f"{self.origin}: solve returned the decision {short_repr(decision)}, expected {program.n} numbers"
             )
+        if result.status in CLAIMS:  # proofs and multipliers are not made anew here, but by `check`
+            name = self.origin.partition(" (")[0]
+            return replace(result, message=f"{result.message}; what the {name} claims is believed")
         return result
 
 
@@ -153,6 +158,10 @@ class _Solver(Solver):
     @property
     def conic(self) -> bool:  # type: ignore[override]
         return self._solver.conic
+
+    @property
+    def aborts(self) -> bool:  # type: ignore[override]
+        return self._solver.aborts
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         claim = asked(self.origin, "solve", lambda: self._solver.solve(program, accuracy), Claim)
@@ -203,9 +212,12 @@ class _Regulariser(Regulariser):
             raise PluginError(
                 f"{self.origin}: quadratic returned shapes {P.shape} and {q.shape}, expected ({n}, {n}) and ({n},)"
             )
-        if not (np.isfinite(P.data).all() and np.isfinite(q).all()):
+        if not np.isfinite(q).all():
             raise PluginError(f"{self.origin}: quadratic returned numbers that are not finite")
-        return P, q
+        try:
+            return require_convex("P", P, n), q
+        except InputError as error:
+            raise InputError(f"{self.origin}: quadratic: {error}") from error
 
 
 def _rule(kind: type, expected: tuple[type, ...], words: str) -> Callable[[Any, str], object]:

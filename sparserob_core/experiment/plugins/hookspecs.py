@@ -47,7 +47,7 @@ class DictionaryPlugin(
 
 
 @final
-class RegulariserPlugin(Plugin, hook="sparserob_regularisers", component="sparserob_core.sip.regulariser:Regulariser"):
+class RegulariserPlugin(Plugin, hook="sparserob_regularisers", component="sparserob_core.sip.convexity:Regulariser"):
     """A `Regulariser`: a strictly convex quadratic."""
 
 
@@ -57,7 +57,17 @@ class SolverPlugin(Plugin, hook="sparserob_solvers", component="sparserob_core.s
 
 
 @final
-class MaximiserPlugin(Plugin, hook="sparserob_maximisers", component="sparserob_core.sip.maximiser:Maximiser"):
+class MaximiserPlugin(
+    Plugin,
+    hook="sparserob_maximisers",
+    component="sparserob_core.sip.maximiser:Maximiser",
+    reserved=(
+        *("budget", "polish"),  # a config's keys of every maximiser; the arguments of `maximise` and `ask_tell` follow
+        *("f", "box", "seed", "gradient", "notify", "start", "seconds", "callback"),
+        *("state", "minimise", "integer", "logarithmic"),
+        "origin",  # what messages call it
+    ),
+):
     """A `Maximiser` over a box."""
 
 

@@ -34,6 +34,7 @@ MUST_BE = {
     "bool_parsing": "true or false",
     "finite_number": "a finite number",
 }
+NOT_TEXT = f"must be {MUST_BE['string_type']}"
 
 
 @dataclass(frozen=True)

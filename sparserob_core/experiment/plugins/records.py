@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import ClassVar
 
 from sparserob_core.arguments import is_whole
@@ -43,12 +44,14 @@ class Plugin:
                  them: schema and reference leave them open.
 
     ``factory(**options)`` builds the component. Raises `PluginError` when a field is malformed. A kind of component is
-    a subclass: ``hook`` yields its records, ``component`` is the class of what they build, and ``kind`` its name.
+    a subclass: ``hook`` yields its records, ``component`` is the class of what they build, ``kind`` its name, and
+    ``reserved`` holds the names that no option may bear, because the framework's own keys and arguments bear them.
     """
 
     kind: ClassVar[str]
     hook: ClassVar[str]
     component: ClassVar[str]
+    reserved: ClassVar[frozenset[str]]
 
     name: str
     factory: Callable[..., object] | str
@@ -60,8 +63,9 @@ class Plugin:
     open: bool = False
     interface: int = 1
 
-    def __init_subclass__(cls, hook: str, component: str) -> None:
+    def __init_subclass__(cls, hook: str, component: str, reserved: tuple[str, ...] = ()) -> None:
         cls.hook, cls.component = hook, component
+        cls.reserved = frozenset({"name", *reserved})
         cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__.removesuffix("Plugin")).lower()
         RECORDS[cls.kind] = cls
 
@@ -145,11 +149,34 @@ class Plugin:
         return not isinstance(factory, type) or issubclass(factory, of)
 
     def options_type(self) -> type[Options]:
-        """The class of the options: as registered, else the component's own class, else no options at all."""
-        if self.options is not None:
-            return self.options
-        factory = self.resolved()
-        return factory if isinstance(factory, type) and issubclass(factory, Options) else Options
+        """The class of the options: as registered, else the component's own class, else no options at all.
+
+        Raises `PluginError` where an option bears a name that is reserved.
+        """
+        options = self.options
+        if options is None:
+            factory = self.resolved()
+            options = factory if isinstance(factory, type) and issubclass(factory, Options) else Options
+        taken = self.taken(options)
+        if taken:
+            raise PluginError(
+                f"{self.origin}: the option {taken[0]!r} bears a name that the framework uses itself; rename it "
+                f"(reserved: {', '.join(sorted(self.reserved))})"
+            )
+        return options
+
+    @classmethod
+    def taken(cls, options: type[Options]) -> list[str]:
+        """The options, sorted, that bear a reserved name."""
+        fields = options.model_fields
+        return sorted(cls.reserved & {*fields, *(field.alias for field in fields.values() if field.alias)})
+
+    @property
+    def switches(self) -> frozenset[str]:
+        """The words, entry point and distribution, each of which disables it; none for a file and for the core."""
+        if not self.source or Path(self.source).is_absolute():
+            return frozenset()
+        return frozenset({self.plugin, self.distribution.partition(" ")[0]}) - {"?", "sparserob"}
 
     def create(self, options: Options) -> object:
         """The component for validated options, checked to be of this kind."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,7 +29,8 @@ UNTRUSTED = (
     "only the components that come with SparseRob are loaded here; --plugins FILE loads those of a file of yours"
 )
 
-Finder: TypeAlias = Callable[[Sequence[str]], list[metadata.EntryPoint]]
+Finder: TypeAlias = Callable[[Sequence[str], list[Failure]], list[metadata.EntryPoint]]
+"""Entry points that are not disabled; it adds the distributions that cannot be read to the failures."""
 
 
 OWN = "sparserob"  # the name of this distribution
@@ -57,7 +59,7 @@ def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = T
     ``SPARSEROB_DISABLE_PLUGINS`` (entry point or distribution, separated by commas) are not even imported.
     """
     if not entry_points:
-        return _with_files(_load(_disabled(), lambda disabled: []), extra_paths)
+        return _with_files(_load(_disabled(), lambda disabled, failures: []), extra_paths)
     return _with_files(_installed(_disabled()), extra_paths)
 
 
@@ -93,7 +95,7 @@ def _load(disabled: Sequence[str], installed: Finder, hint: str = "") -> Registr
     from sparserob_core.experiment.plugins import builtin
 
     found, failures = [_Loaded("core", "", builtin)], list[Failure]()
-    for entry in installed(disabled):
+    for entry in installed(disabled, failures):
         with _noted(failures, _identity(entry)):
             module = entry.load()
             if module is not builtin:
@@ -126,16 +128,42 @@ def _said(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _entry_points(disabled: Sequence[str]) -> list[metadata.EntryPoint]:
-    return sorted(
-        (one for one in metadata.entry_points(group=GROUP) if not {one.name, _distribution(one)} & set(disabled)),
-        key=lambda entry: entry.name,
-    )
+def _entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[metadata.EntryPoint]:
+    allowed = (one for one in _found(failures) if not {one.name, _distribution(one)} & set(disabled))
+    return sorted(allowed, key=lambda entry: entry.name)
 
 
-def _own_entry_points(disabled: Sequence[str]) -> list[metadata.EntryPoint]:
-    own = (one for one in metadata.entry_points(group=GROUP) if _distribution(one) == OWN)
-    return sorted((one for one in own if not {one.name, OWN} & set(disabled)), key=lambda entry: entry.name)
+def _own_entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[metadata.EntryPoint]:
+    return [one for one in _entry_points(disabled, failures) if _distribution(one) == OWN]
+
+
+def _found(failures: list[Failure]) -> Iterator[metadata.EntryPoint]:
+    """The entry points of every distribution that can be read, of those with one name the first on the path, which is
+    the one that is imported.
+
+    `importlib.metadata.entry_points` ends with whatever one broken folder raises. pip writes ``~`` in front of the
+    name while it replaces a distribution: what is left of that is a copy of another.
+    """
+    known = set[str]()
+    for distribution in metadata.distributions():
+        place = getattr(distribution, "_path", None)
+        with _noted(failures, f"{place or 'a distribution'}"):
+            if place is not None and str(place.name).startswith("~"):
+                raise PluginError("it is what an interrupted installation left behind; delete this folder")
+            name = _normalised(distribution)
+            if name not in known:
+                known.add(name)
+                yield from list(distribution.entry_points.select(group=GROUP))
+
+
+def _normalised(distribution: metadata.Distribution) -> str:
+    try:
+        name = distribution.name
+    except Exception:  # noqa: BLE001  without a file of metadata each Python raises another error
+        name = None
+    if not isinstance(name, str) or not name:
+        raise PluginError("it is no distribution, because it names none; delete it, or install it anew")
+    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _distribution(entry: metadata.EntryPoint) -> str:
@@ -196,7 +224,10 @@ def _yielded(plugin: _Loaded, who: str, callers: Sequence[pluggy.HookCaller]) ->
                 raise PluginError(
                     f"{who}: {caller.name} yielded {short_repr(record)}, expected records of type {expected.__name__}"
                 )
-            yield replace(record, plugin=plugin.name, source=plugin.source)
+            known = replace(record, plugin=plugin.name, source=plugin.source)
+            if not isinstance(known.factory, str):  # of a lazy one the options are checked when it is imported
+                known.options_type()
+            yield known
 
 
 def _refuse_unmarked(who: str, module: ModuleType, marked: set[str]) -> None:

@@ -23,8 +23,11 @@ from sparserob_core.experiment.directory.rounds import round_arrays
 from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Observer, RoundFinished, StudyProgress
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import AUTO, Unanswered, whole_name
+
+STOPPED = "no figures: the run was stopped; sparserob figures draws them"
 
 
 @final
@@ -98,6 +101,7 @@ class Journal(Observer):
             self._unfinished(said, seconds),
             status="undecided",
             message=f"{said} after round {last.round}; nothing is proven of its control",
+            stopped=said,
             decision=last.decision,
             cost=last.cost,
             indices=[replace(cut, multiplier=float(y)) for cut, y in zip(last.imposed, multipliers, strict=True)],
@@ -120,12 +124,16 @@ class Journal(Observer):
         return replace(result, lower_bound=last.lower_bound, epsilon=last.epsilon, counts=counts)
 
     def finish(
-        self, result: Result, figures: bool, certify: bool = True, notify: Notify = ignore
+        self,
+        result: Result,
+        figures: bool,
+        notify: Notify = ignore,
+        deadline: Deadline | None = None,
     ) -> tuple[Array | None, dict[str, Any], Sequence[str]]:
-        """Write the outcome, with a certificate where the multipliers of its lower bound are known (``certify``);
-        returns the control ``(m, K)``, what ``result.json`` holds, and what could not be drawn. ``notify`` receives
-        `StudyProgress` where a figure takes longer."""
-        experiment, write = self.experiment, self.directory
+        """Write the outcome and its certificate; returns the control ``(m, K)``, what ``result.json`` holds, and what
+        could not be drawn. ``notify`` receives `StudyProgress` where a figure takes longer. Past the ``deadline``
+        nothing is drawn."""
+        experiment, write, time_left = self.experiment, self.directory, deadline or Deadline()
         control, summary = self.record(result)
         model = self.experiment.model
         feedback = None if model is None or result.decision is None else model.feedback
@@ -138,25 +146,26 @@ class Journal(Observer):
             write.write_arrays("rounds.npz", kept)
         notify(StudyProgress(text="certificate: written down", phase=True))
         proof = certificate(experiment, result)
-        if proof is not None and certify:
+        if proof is not None:
             write.write_json("certificate.json", proof)
         if result.trace is not None:
             write.write_arrays("evaluations.npz", result.trace.arrays())
-        if result.stopped:  # what is drawn may take longer than what was solved
-            return (
-                control,
-                summary,
-                ("no figures: the run was stopped; sparserob figures draws them",) if figures else (),
-            )
-        notify(StudyProgress(text="figures: the worst cases, and what there is to draw", phase=True))
-        worst = adversaries(experiment, np.asarray(result.decision)) if control is not None else {}
+        drawn: tuple[str, ...] = (STOPPED,) if figures else ()
+        if not result.stopped:  # what is drawn may take longer than what was solved
+            notify(StudyProgress(text="figures: the worst cases, and what there is to draw", phase=True))
+            drawn = time_left.attempt(lambda: self._illustrated(result, control, figures, notify), lambda: drawn)
+        return control, summary, drawn
+
+    def _illustrated(self, result: Result, control: Array | None, figures: bool, notify: Notify) -> tuple[str, ...]:
+        """Write the worst cases, and the figures; returns what could not be drawn."""
+        worst = adversaries(self.experiment, np.asarray(result.decision)) if control is not None else {}
         if worst:
-            write.write_arrays(ADVERSARY, worst)
+            self.directory.write_arrays(ADVERSARY, worst)
         if not figures:
-            return control, summary, ()
+            return ()
         from sparserob_core.experiment.run.drawing import drawn
 
-        return control, summary, drawn(experiment, result, write.path, worst, notify)
+        return drawn(self.experiment, result, self.directory.path, worst, notify)
 
 
 def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str, str]]:

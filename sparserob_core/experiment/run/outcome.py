@@ -28,7 +28,7 @@ from sparserob_core.experiment.config.stated.source import component_keys, dicti
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
 from sparserob_core.experiment.plugins.registry import load_registry
-from sparserob_core.experiment.run.conclusion.bound import bounded
+from sparserob_core.experiment.run.conclusion.bound import bounded, unbounded
 from sparserob_core.experiment.run.conclusion.causal import with_causal
 from sparserob_core.experiment.run.conclusion.fewest import with_activity
 from sparserob_core.experiment.run.events import StudyProgress
@@ -39,6 +39,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.proof.verdict import remarked
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Named
 
@@ -177,15 +178,19 @@ class SolvedProblem(ControlResult):
 
 def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Notify = ignore) -> Result:
     """What a run makes of the result of a method before it is written down: bounds that are proven without rounding,
-    what is known of the time of action, and of causal policies. ``notify`` receives `StudyProgress`, one a phase."""
+    what is known of the time of action, and of causal policies. Each of these is left out where the time of the tools
+    is over before it is known. ``notify`` receives `StudyProgress`, one a phase."""
     if not isinstance(experiment, ControlExperiment):
-        return result
+        return remarked(experiment.program, result)
+    attempt = tools.deadline.attempt
     notify(StudyProgress(text="certificate: what the multipliers prove without rounding", phase=True, result=result))
-    known = bounded(experiment, result) if result.sparsest is None else result
+    if result.sparsest is None:
+        result = attempt(lambda: bounded(experiment, result, tools.deadline), lambda: unbounded(result))
     notify(StudyProgress(text="fewest active: how little any admissible control must act", phase=True))
-    known = with_activity(experiment, known, tools).accounted(tools.solver)
+    known = attempt(lambda: with_activity(experiment, result, tools), lambda: result).accounted(tools.solver)
     notify(StudyProgress(text="causal bound: what no causal policy can do", phase=True))
-    concluding = with_causal(SolvedProblem.run(known, experiment), tools)
+    solved = SolvedProblem.run(known, experiment)
+    concluding = attempt(lambda: with_causal(solved, tools), lambda: solved)
     concluding.__dict__["experiment"] = experiment
     return concluding
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 from sparserob_core.errors import InputError, SparseRobError, named
-from sparserob_core.experiment.assemble import Anew, assemble, build, name_of, tools_of
+from sparserob_core.experiment.assemble import Anew, UntranscribedExperiment, assemble_in_time, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
@@ -22,8 +22,10 @@ from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.run.outcome import HEADING, Outcome, SolvedProblem, concluded
 from sparserob_core.experiment.terminal.printing import printable
-from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools, require_suited
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
+from sparserob_core.sip.method import ExecutorFactory, Method, Tools, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
+from sparserob_core.sip.proof.branch_and_bound import more
 from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
 
@@ -43,7 +45,7 @@ def run(
     ``{"solver.name": "clarabel"}`` or texts ``key=value``. ``observers`` watch beside those that the config names.
     ``limits.seconds`` of the config bounds its time: the method then ends as at an interrupt.
     Raises `ConfigError` or another `InputError` before anything is solved, and `TimeLimitError` when the limit comes
-    before there is anything to solve. An interrupt ends the method with what it
+    before the problem is read. An interrupt ends the method with what it
     knows by then: the outcome is that of the last round, ``undecided`` unless more was proven. An error, or an
     interrupt before there was a decision, leaves a directory with the config, the rounds so far and the status
     ``failed``.
@@ -82,7 +84,9 @@ def _run(
     observers: Iterable[Observer],
 ) -> Outcome:
     deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
-    experiment = assemble(loaded, deadline)
+    experiment = assemble_in_time(loaded, deadline)
+    if isinstance(experiment, UntranscribedExperiment):
+        return _untranscribed(experiment, origin, out)
     why = None if experiment.problem is None else unprovable(experiment.problem)
     if why is not None:
         deadline, why = (deadline if deadline.bounded else Deadline(SECONDS)), announced(why, deadline.bounded)
@@ -99,7 +103,6 @@ def _run(
         broadcast = Broadcast([("journal", journal), *watching])
         ending, started = RunFinished(status="failed", message=UNFINISHED, seconds=0.0), time.perf_counter()
         result: Result | None = None
-        complete = True
         try:
             directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
             journal.record(Result(status="failed", message=UNFINISHED))
@@ -115,13 +118,15 @@ def _run(
                 )
             )
             try:
-                result = solve_in_own_units(method, experiment.program, _notifying(tools, broadcast))
-                result = result.accounted(tools.solver)
+                with deadline.enforced():
+                    result = solve_in_own_units(method, experiment.program, _notifying(tools, broadcast))
+                    result = result.accounted(tools.solver)
             except KeyboardInterrupt as pressed:  # a method that does not return what it knows
-                deadline.interrupt(pressed)
-                result, complete = journal.known(_said(pressed), time.perf_counter() - started), False
-                if result is None:
+                said = deadline.interrupt(pressed)
+                result = journal.known(said, time.perf_counter() - started)
+                if result is None and not isinstance(pressed, OutOfTime):
                     raise
+                result = result or Result(status="undecided", message=f"{said}; {more(deadline)}", stopped=said)
             result = concluded(experiment, result, tools, broadcast)
             ending = RunFinished(
                 status=result.status,
@@ -130,7 +135,7 @@ def _run(
                 result=result.plain if isinstance(result, SolvedProblem) else result,
                 pressed=deadline.pressed,
             )
-            control, summary, remarks = journal.finish(result, figures and complete, certify=complete, notify=broadcast)
+            control, summary, remarks = journal.finish(result, figures, broadcast, deadline)
             return Outcome(result, directory.path, experiment, control, summary, remarks, deadline.pressed)
         except BaseException as error:
             if result is not None and isinstance(error, SparseRobError):  # found, and not to be written down
@@ -144,6 +149,16 @@ def _run(
             raise
         finally:
             broadcast(ending)
+
+
+def _untranscribed(experiment: UntranscribedExperiment, origin: Mapping[str, Any], out: str | Path | None) -> Outcome:
+    """The outcome of a problem that was not transcribed in time, and its directory."""
+    loaded = experiment.loaded
+    result = Result(status="undecided", message=experiment.reason, lower_bound=0.0, stopped=experiment.reason)
+    with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
+        directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
+        control, summary, remarks = Journal(directory, experiment, origin).finish(result, figures=False)
+        return Outcome(result, directory.path, experiment, control, summary, remarks)
 
 
 def _said(error: BaseException) -> str:

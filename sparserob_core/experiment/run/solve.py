@@ -17,12 +17,14 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.experiment.solve import PIECES, Choice, careful, component, dictionary, indicators
+from sparserob_core.sip.convexity import Regulariser
 from sparserob_core.sip.events import Event, ignore
+from sparserob_core.sip.limits.deadline import Deadline, as_seconds
 from sparserob_core.sip.maximiser import Maximiser
-from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Deadline, Method, Tools, as_seconds, require_suited
+from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Method, Tools, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import Regulariser
+from sparserob_core.sip.proof.verdict import remarked as remarked_program
 from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import AUTO, Auto, Solver
@@ -135,12 +137,13 @@ def solve(
     require_separable(program, tools.solver, tools.regulariser)
     result = solve_in_own_units(chosen, program, tools).accounted(tools.solver)
     if isinstance(model, SemiInfiniteProgram):
-        return result
+        return remarked_program(model, result)
     from sparserob_core.control.transcription.provable import remarked
+    from sparserob_core.experiment.run.conclusion.final_states import with_final_states
     from sparserob_core.experiment.run.outcome import Asked, SolvedProblem
 
+    result = with_final_states(model, result, getattr(chosen, "tolerance", None))
     result = remarked(model.problem, result, model.feedback is not None)
-
     asked = Asked(
         problem=model.stated,
         choices={

@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.errors import InputError, Path, dotted
-from sparserob_core.experiment.config.overrides import parse_overrides
+from sparserob_core.experiment.config.overrides import parse_overrides, parse_value
 from sparserob_core.experiment.config.plain import BESIDE
 from sparserob_core.experiment.config.reader import read_value
 from sparserob_core.experiment.config.run_config import SLOTS
@@ -166,7 +166,7 @@ def _value(key: str, part: str, of: int) -> object:
     if not part and of > 1:
         raise InputError(path=key, expected="a value between commas", got="nothing")
     try:
-        return read_value(part)
+        return parse_value(f"{key}={part}", read_value)
     except InputError as error:
         raise InputError(f"{key}: {error}") from None
 

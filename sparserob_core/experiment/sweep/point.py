@@ -18,7 +18,7 @@ from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Observer, RoundFinished
 from sparserob_core.experiment.run.run import run_loaded
-from sparserob_core.sip.method import OutOfTime
+from sparserob_core.sip.limits.deadline import OutOfTime
 from sparserob_core.sip.solver import QuadraticProgram
 
 ACCURACY = 1e-6  # of a program that is solved for nothing but its imports

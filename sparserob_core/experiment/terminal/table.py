@@ -58,8 +58,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("relative gap", _number(summary["gap"], ".2e")),
         ("any causal policy", _causal(summary, units.get("cost"))),
         ("worst violation", _worst(worst, units, summary.get("parameters") or ())),
-        ("proven to", _tolerances(summary.get("tolerances") or {}, units.get("rows") or {})),
-        ("equalities", _equalities(summary.get("equalities"))),
+        ("kept", _kept(summary.get("tolerances") or {}, summary.get("equalities"), units.get("rows") or {})),
         ("active indices", str(counts["active_indices"])),
         ("rounds", str(counts["rounds"])),
         ("solved by", _solved_by(counts.get("solved_by"))),
@@ -127,36 +126,30 @@ def _number(value: Any, form: str) -> str:
     return "unknown" if value is None else format(value, form)
 
 
-def _tolerances(tolerances: Mapping[str, Any], units: Mapping[str, Sequence[str]]) -> str:
-    """What was proven to count as no violation, in the user's units: of rows with the same unit the least and the
-    largest."""
-    if not tolerances:
-        return "unknown"
-    parts = []
-    for name, one in tolerances.items():
-        if one["rows"] is None:
-            parts.append(f"{one['own']:.1e} in {name}")
-            continue
-        rows = list(one["rows"])
-        mine = list(units.get(name) or [""])
-        measured = mine * len(rows) if len(mine) == 1 else mine
-        alike: dict[str, list[float]] = {}
-        for unit, row in zip(measured, rows, strict=True):
-            alike.setdefault(unit, []).append(row)
-        parts.append(f"{', '.join(_span(found, unit) for unit, found in alike.items())} in {name}")
-    return f"{', '.join(parts)} ({next(iter(tolerances.values()))['own']:g} of each row's own unit)"
+def _kept(
+    tolerances: Mapping[str, Any], equalities: Mapping[str, Any] | None, units: Mapping[str, Sequence[str]]
+) -> str:
+    """Return to what every constraint is kept, with what is excused, in the user's units: of rows with the same unit
+    the largest."""
+    entries = {name: (one.get("kept"), one["rows"], one["proven"]) for name, one in tolerances.items()}
+    if equalities:
+        entries["equals"] = equalities["missed"], equalities["excused"], None
+    return ", ".join(_kept_to(name, *one, units.get(name) or [""]) for name, one in entries.items()) or "unknown"
 
 
-def _span(found: Sequence[float], unit: str) -> str:
-    least, most = f"{min(found):.1e}", f"{max(found):.1e}"
-    return (least if least == most else f"{least} to {most}") + (f" {unit}" if unit else "")
-
-
-def _equalities(said: Mapping[str, Any] | None) -> str:
-    """What solving in double precision leaves of the terminal equalities."""
-    if not said:
-        return "unknown"
-    return f"missed by {said['missed']:.1e} of the numbers added up, computed; {said['allowed']:g} counts as none"
+def _kept_to(name: str, kept: Any, excused: Any, share: float | None, units: Sequence[str]) -> str:
+    if kept is None or excused is None:
+        kept, excused, units = [share or 0.0], [0.0], [""]
+    measured = list(units) * len(kept) if len(units) == 1 else list(units)
+    largest: dict[str, tuple[float, float]] = {}
+    for unit, mine, most in zip(measured, kept, excused, strict=True):
+        before = largest.get(unit, (float("-inf"), 0.0))
+        largest[unit] = max(before[0], mine), max(before[1], most)
+    if max(kept, default=0.0) <= 0.0:
+        spared = [_measured(abs(mine), unit, ".1e") for unit, (mine, _) in largest.items()]
+        return f"{name} with {', '.join(spared)} to spare"
+    parts = [f"{_measured(max(mine, 0.0), unit, '.1e')} ({most:.1e} excused)" for unit, (mine, most) in largest.items()]
+    return f"{name} to {', '.join(parts)}"
 
 
 def _worst(worst: Mapping[str, Any], units: Mapping[str, Any], parameters: Sequence[str]) -> str:

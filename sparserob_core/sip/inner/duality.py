@@ -33,6 +33,12 @@ FREE = 1e-7  # an entry further than this from 0 and from both bounds, relative 
 TIGHT = 1e-9  # a row with a slack below this may carry a multiplier
 ACTIVE = 1e-9  # a row with a multiplier above this, relative to the largest, is active
 
+# Weight of what must hold beside what is wanted. With a hundredth of it slopes are left that free entries do not bear;
+# with a million times as much the wanted is lost in rounding.
+HEAVY = 1e5
+# Steps for each multiplier at most. With a tenth of them degenerate vertices are given up; more was not needed.
+PATIENT = 30
+
 Multipliers: TypeAlias = tuple[Array, Array, Array | None, Array | None]
 
 
@@ -450,3 +456,34 @@ def vertex_multipliers(
     plain = np.zeros_like(y)
     plain[active] = np.maximum(found[0], 0.0)
     return plain, found[1]
+
+
+@shaped
+def nearest_multipliers(
+    program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"]
+) -> tuple[Float[Array, " r"], Float[Array, " e"]]:
+    """The multipliers nearest to ``(y, mu)`` with ``y >= 0`` that give every entry without bounds the slope 0.
+
+    A vertex of nearly parallel rows has multipliers that are negative by a little; where these are put to 0 and entries
+    are free, nothing is proven. Those of the other rows make up for it: non-negative least squares with the slopes as
+    rows that weigh `HEAVY` times as much (Lawson and Hanson 1974, chapter 23, section 4). Any answer is safe. ``S``
+    must be the identity, and ``P``, norms and weights of the free entries absent, otherwise the multipliers come back
+    unchanged.
+    """
+    free = np.isinf(program.lower) & np.isinf(program.upper)
+    if not free.any() or program.S is not None or program.P is not None or program.weights[free].any():
+        return y, mu
+    from scipy.optimize import nnls  # only here: its import takes as long as a small run
+
+    slopes = np.hstack([program.G[:, free].T, program.A[:, free].T, -program.A[:, free].T])
+    given = np.concatenate([np.maximum(y, 0.0), np.maximum(mu, 0.0), np.maximum(-mu, 0.0)])
+    asks = np.concatenate([np.isfinite(program.h), np.ones(2 * mu.size, dtype=bool)])
+    columns = np.vstack([HEAVY * slopes, np.eye(given.size)])[:, asks]
+    try:
+        found, _ = nnls(columns, np.concatenate([-HEAVY * program.q[free], given]), maxiter=PATIENT * given.size)
+    except RuntimeError:  # its iteration limit: these multipliers were an offer only
+        return y, mu
+    nearest = np.zeros(given.size)
+    nearest[asks] = found
+    first, second, third = np.split(nearest, [y.size, y.size + mu.size])
+    return first, second - third

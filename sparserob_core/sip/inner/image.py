@@ -41,7 +41,10 @@ class Memory:
 
 
 HOLDS = 5
-CANCELLED = 1e-13
+CANCELLED = 1e-13  # of what is added up: what may be left where more cannot be had
+# Of the same: what is left by rounding alone, and not worth a projection. With ten times as much a bound is above what
+# its multipliers prove by more than what is taken off it; with a tenth of it every exact answer is projected.
+ROUNDED = 4 * 2.0**-52
 _factors = Memory(12)
 
 
@@ -59,7 +62,7 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
     held = (program.weights == 0) & unbounded_below & unbounded_above
     moved = z
     for number in range(HOLDS):
-        if number or not _stationary(S, moved, slope):
+        if number or not _stationary(S, moved, slope, ROUNDED):
             z = np.where(held, np.clip(z, -program.weights, program.weights), z)
             project = _factors.recall((S,), held.tobytes(), partial(_projection, S, ~held))
             moved = z - project(S.T @ z + slope)
@@ -95,9 +98,9 @@ def _alone(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], 
     return rows, by_row.indices[places].astype(np.int64), np.asarray(by_row.data[places])
 
 
-def _stationary(S: csc_array, z: Array, slope: Array) -> bool:
+def _stationary(S: csc_array, z: Array, slope: Array, share: float = CANCELLED) -> bool:
     left, size = np.abs(S.T @ z + slope), np.abs(S).T @ np.abs(z) + np.abs(slope)
-    return bool((left <= CANCELLED * size.max(initial=0.0)).all())
+    return bool((left <= share * size.max(initial=0.0)).all())
 
 
 def _projection(S: csc_array, used: npt.NDArray[np.bool_]) -> Callable[[Array], Array]:

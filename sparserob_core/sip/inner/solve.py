@@ -34,7 +34,7 @@ from sparserob_core.sip.finite import (
 )
 from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
 from sparserob_core.sip.inner.dual_newton import from_nothing, polish
-from sparserob_core.sip.inner.duality import farkas_proof, measure, minimisers, vertex_multipliers
+from sparserob_core.sip.inner.duality import farkas_proof, measure, minimisers, nearest_multipliers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
 from sparserob_core.sip.inner.standard_form import Form, Recovered, has_cones, standard_form
@@ -332,6 +332,8 @@ def _at_a_vertex(case: _Case) -> FiniteSolution | None:
     offers = [(corner.y, corner.mu)]
     if program.S is None:
         offers.append(vertex_multipliers(program, corner.x, corner.y, corner.mu))
+    if not program.bounded:
+        offers.append(nearest_multipliers(program, corner.y, corner.mu))
     for y, mu in offers:
         believed = case.judge(measure(program, corner.x, y, mu, corner.z, message="simplex method"), "a vertex", HIGHS)
         if believed is not None:

@@ -29,6 +29,7 @@ from sparserob_core.sip.evidence import Cut, Dual, Leaf, Proof, Sparsest
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import (
     ConstraintFamily,
+    EqualityErrors,
     Formulation,
     OwnUnits,
     SemiInfiniteProgram,
@@ -91,7 +92,11 @@ class UsersUnits:
             dual=self._dual(own.dual, infeasible=own.status == "infeasible"),
             proofs=tuple(self._proof(proof) for proof in own.proofs),
             sparsest=None if own.sparsest is None else self._sparsest(own.sparsest),
+            errors=None if own.errors is None else self._errors(own.errors),
         )
+
+    def _errors(self, own: EqualityErrors) -> EqualityErrors:
+        return replace(own, missed=own.missed * self.equalities, allowed=own.allowed * self.equalities)
 
     def _sparsest(self, own: Sparsest) -> Sparsest:
         tree = [

@@ -23,7 +23,8 @@ from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forwarded, frozen, ignore
 from sparserob_core.sip.evidence import Dual
-from sparserob_core.sip.method import GAP_TOLERANCE, GRACE, Deadline, Method, OutOfTime, Tools
+from sparserob_core.sip.limits.deadline import LAST, Deadline, OutOfTime
+from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -39,9 +40,12 @@ from sparserob_core.sip.working.ledger import Answer, Found, Ledger, prover_of
 from sparserob_core.sip.working.plain import PlainRows
 from sparserob_core.sip.working.securing import back_off
 
-# Of a limit, what a search leaves to the proof of what it has found, a second at most. With a tenth of it a limit of
+# Of a limit, what a search leaves to the proof of what it has found. With a tenth of it a limit of
 # some seconds leaves nothing proven; ten times as much is no search.
 RESERVED = 0.1
+MOMENT = 1.0
+"""Seconds at most that it leaves, and that an interrupt waits for what was found. With a tenth of it nothing is proven
+at an interrupt; ten times as many, and a key seems not to have been pressed."""
 
 MORE_EVALUATIONS = "more evaluations (maximiser.budget) or indices (method.indices) would help"
 
@@ -213,7 +217,7 @@ def _searched(
     rules = Rules(method.sc2, method.slcr or Metropolis(), tools.polish)
     target = Target(values, g.domain, g.gradient, g.block, g.linear, g.acting)
     notify = forwarded(tools.notify, EvaluationsFinished, completed)
-    soon = tools.deadline.sooner(min(GRACE, RESERVED * (tools.deadline.seconds or 0.0)))
+    soon = tools.deadline.sooner(min(MOMENT, RESERVED * (tools.deadline.seconds or 0.0)))
     ledger.relaxed.deadline = soon
     report = maximise(target, tools.maximiser, tools.budget, tools.rng, rules, notify, point)
     ledger.relaxed.deadline = tools.deadline
@@ -229,7 +233,8 @@ def _at_interrupt(g: TupleValue, ledger: Ledger, point: Array, value: float, eps
     in which nothing is told and another interrupt ends it."""
     ledger.relaxed.deadline = Deadline()  # one last program
     if np.isfinite(value) and np.isfinite(g.at(point)):
-        answer, grace = Answer(g.solution, g.rows(), epsilon, value), Deadline(GRACE)
+        answer = Answer(g.solution, g.rows(), epsilon, value)
+        grace = Deadline(max(LAST, ledger.tools.deadline.at_most(MOMENT)))
         ledger.keep(answer)
         tools, ledger.relaxed.deadline = replace(ledger.tools, deadline=grace, notify=ignore), grace
         with suppress(KeyboardInterrupt), grace.enforced():

@@ -15,7 +15,7 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ProofProgress, ignore
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 
 CELLS = 400_000  # cells examined per family before the proof is given up
@@ -58,10 +58,20 @@ def prove(
     budgets = {
         family.name: cells if isinstance(cells, int) else cells.get(family.name, 0) for family in program.families
     }
-    proven = (family.reduced or family for family in program.families)
-    found = [(one, prove_family(one, x, notify, budgets[one.name], time_left)) for one in proven]
+    proven = [family.reduced or family for family in program.families]
+    found: list[tuple[ConstraintFamily, Proof]] = []
+    try:
+        found.extend((one, _prove(one, x, notify, budgets[one.name], time_left)) for one in proven)
+    except OutOfTime as error:  # of families that are left not even one look would come to its end
+        found += [(one, _begun_only(one, error, time_left)) for one in proven[len(found) :]]
     return tuple(
-        replace(proof, formulation=one.formulation, unit=one.row_unit(proof.row), measured=one.measure(proof.row))
+        replace(
+            proof,
+            formulation=one.formulation,
+            unit=one.row_unit(proof.row),
+            measured=one.measure(proof.row),
+            allowed=one.allowed(x),
+        )
         for one, proof in found
     )
 
@@ -93,24 +103,40 @@ def prove_family(
 ) -> Proof:
     """Bound the violation of one family over its whole index set.
 
-    Cells whose enclosure is at most `TOLERANCE` are closed, the others halved; the centres of the worst are probed for
-    a witness, and where that takes long one is climbed to. At the deadline, or when it is interrupted from the
-    keyboard (of which the deadline takes note), a proof ends undecided, with what is left.
+    Cells whose enclosure is at most `ConstraintFamily.allowed` are closed, the others halved; the centres of the worst
+    are probed for a witness, and where that takes long one is climbed to. At the deadline, or when it is interrupted
+    from the keyboard (of which the deadline takes note), a proof ends undecided, with what is left.
     """
     time_left = deadline or Deadline()
+    try:
+        return _prove(family, x, notify, cells, time_left)
+    except OutOfTime as error:
+        return _begun_only(family, error, time_left)
+
+
+def _prove(family: ConstraintFamily, x: Array, notify: Notify, cells: int, deadline: Deadline) -> Proof:
+    """`prove_family`; raises `OutOfTime` where not even one look comes to its end by the deadline."""
     try:
         if family.enclosure is None:
             return _by_separation(family, x)
         try:
-            return _branch_and_bound(family, x, Course(family, notify, cells, time_left), NoViolation())[0]
+            course = Course(family, notify, cells, deadline)
+            return _branch_and_bound(family, x, course, NoViolation(family.allowed(x)))[0]
         except NotEnclosable as error:
-            if time_left.passed:
+            if deadline.passed:
                 return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: {error}")
             return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
+    except OutOfTime:
+        raise
     except KeyboardInterrupt as error:
-        time_left.interrupt(error)
-        reason = f"{family.name}: its proof had begun only; {more(time_left)}"
-        return Proof(family.name, "undecided", np.inf, reason=reason)
+        return _begun_only(family, error, deadline)
+
+
+def _begun_only(family: ConstraintFamily, error: KeyboardInterrupt, deadline: Deadline) -> Proof:
+    """The proof of a family that was interrupted, of which the deadline takes note."""
+    deadline.interrupt(error)
+    reason = f"{family.name}: its proof had begun only; {more(deadline)}"
+    return Proof(family.name, "undecided", np.inf, reason=reason)
 
 
 def more(deadline: Deadline) -> str:
@@ -185,11 +211,14 @@ class Course:
 
 @dataclass(frozen=True)
 class NoViolation:
-    """The question whether anything is violated: cells are closed where nothing is, and a violation ends the search."""
+    """The question whether anything is violated by more than ``allowed``: cells are closed where nothing is, and a
+    violation of more than `TOLERANCE` ends the search. What lies between the two may be rounding."""
+
+    allowed: float = TOLERANCE
 
     def closes(self, best: float) -> float:
         """The bound up to which a cell is closed, where ``best`` was met."""
-        return TOLERANCE
+        return self.allowed
 
     def ends(self, best: float) -> bool:
         """Whether what was met answers the question."""
@@ -237,7 +266,7 @@ def _branch_and_bound(
 ) -> tuple[Proof, Supremum]:
     """What is known of one family, as an answer to whether anything is violated, and as a number."""
     box = family.index_set
-    lower, upper = family.cells if family.cells is not None else (box.lower[None], box.upper[None])
+    lower, upper = family.partition
     best, known = (-np.inf, lower[0], 0), np.full(lower.shape[0], np.inf)
     leaves: list[tuple[Array, Array, Array]] = []  # one entry per halving
     slacks: list[float] = []
@@ -252,7 +281,7 @@ def _branch_and_bound(
         # Look for a witness: where separation finds the largest violations, and in the worst cells.
         first, peaks = not leaves, _NOWHERE
         if first and bend is not None and family.worst is not None:
-            peaks = family.worst(x)
+            peaks = family.separated(x)
         if peaks.violations.size:
             best = (float(peaks.violations[0]), peaks.indices[0], int(peaks.rows[0]))
         elif first or open_.any():
@@ -340,7 +369,6 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
     so that those go into one batch.
     """
     family, count = course.family, lower.shape[0]
-    assert family.enclosure is not None
     bounds, split, bend = np.full(count, np.inf), (upper - lower).argmax(axis=1), np.full(count, np.inf)
     known, hurried = True, course.deadline.bounded or course.deadline.passed
     start, size = 0, FIRST_BATCH if hurried else BATCH
@@ -350,8 +378,8 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
         if hurried:  # to the end of what shares its work, unless that is far
             stop = min(int(ends[np.searchsorted(ends, stop)]), start + BATCH)
         part = order[start:stop]
-        enclosed = family.enclosure(x, lower[part], upper[part])
-        bounds[part] = np.where(np.isnan(enclosed.bounds), np.inf, enclosed.bounds)
+        enclosed = family.enclosed(x, lower[part], upper[part])
+        bounds[part] = enclosed.bounds
         split[part] = enclosed.split
         known = known and enclosed.bend is not None
         bend[part] = np.inf if enclosed.bend is None else enclosed.bend
@@ -458,7 +486,8 @@ def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | N
 
 
 def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
-    """For families without an enclosure: believe a proven bound of their separation, otherwise leave it open."""
+    """For families without an enclosure: believe a proven bound of their separation, but for what both
+    ends of the index set say, otherwise leave it open."""
     if family.worst is None:
         return Proof(
             family.name,
@@ -466,12 +495,16 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
             np.inf,
             reason=f"family {family.name} offers no enclosure, so nothing can be excluded",
         )
-    found = family.worst(x)
+    found = family.separated(x)
     violation = float(found.violations[0]) if found.violations.size else -np.inf
     index, row = (found.indices[0], int(found.rows[0])) if found.violations.size else (None, 0)
+    ends = np.stack([family.index_set.lower, family.index_set.upper])
+    met = _probe(family, x, ends, ends, np.zeros(2)) if np.isfinite(ends).all() else (-np.inf, ends[0], 0)
+    if met[0] > max(violation, TOLERANCE):  # what it says is believed, but not against its own rows
+        violation, index, row = met
     if violation > TOLERANCE:
         return Proof(family.name, "refuted", np.inf, violation, index, row)
-    if found.bound <= TOLERANCE:
+    if found.bound <= family.allowed(x):
         return Proof(family.name, "proven", found.bound, violation, index, row)
     return Proof(
         family.name,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Cut, InfeasibleSubsystem, Proof
+from sparserob_core.sip.evidence import NO_BOUND, Cut, InfeasibleSubsystem, Proof
 from sparserob_core.sip.program import (
     TOLERANCE,
     ConstraintFamily,
@@ -19,8 +19,11 @@ from sparserob_core.sip.program import (
     told_apart,
 )
 from sparserob_core.sip.relaxed.relaxed import Rows
-from sparserob_core.sip.result import MEANING, Status
+from sparserob_core.sip.result import MEANING, Result, Status
 
+# Of the largest entry of a row: by how much the same row may differ where it is chosen among others. Ten times more,
+# and a bound is off by more than a gap that is certified; ten times less, and sums in another order are refused.
+CHOSEN = 1e-9
 NAMED = 6  # reasons, or members of an infeasible subsystem, that are named; of these those with the largest multipliers
 
 
@@ -38,6 +41,53 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
         return "undecided", "; ".join(undecided)
     status: Status = "certified" if gap <= tolerance else "verified"
     return status, f"{MEANING[status]} (gap {max(gap, 0.0):.1e})"
+
+
+def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
+    """The same result with a word on what its claim rests on that nobody has proven: the enclosures and separations of
+    a program that was stated as it is, whose rows can be evaluated only. Nothing is added where nothing is claimed; and
+    where rows deny what families have said, nothing is claimed."""
+    if denied := _denied(program, result):
+        return replace(
+            result,
+            status="failed",
+            message=f"{denied}: one of the two is wrong, and nothing is claimed",
+            lower_bound=-np.inf,
+            upper_bound=np.inf,
+            dual=NO_BOUND,
+            infeasible=None,
+        )
+    names = [family.name for family in program.families if family.enclosure is not None or family.worst is not None]
+    if not names or result.status not in ("certified", "verified"):
+        return result
+    said = f"what {', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''} encloses or separates is believed"
+    return replace(result, message=f"{result.message}; {said}")
+
+
+def _denied(program: SemiInfiniteProgram, result: Result) -> str:
+    """How the rows of families deny what these have said, in words: a witness that meets its row, or, where multipliers
+    are those of chosen rows, other rows at the same indices. Empty where they deny nothing."""
+    worst, x = result.worst, result.decision
+    if result.status == "refuted" and worst is not None and worst.constraint and x is not None:
+        family = program.formulated(worst.constraint, worst.formulation)
+        met = np.inf if family is None else float(family.violations(x, worst.index[None])[0, worst.row])
+        if not met > TOLERANCE / 2:
+            return (
+                f"{worst.constraint} is said to be violated by {worst.violation:.4g} at the index"
+                f" {worst.index.tolist()}, and its rows are by {met:.4g}"
+            )
+    for family in program.families:
+        cuts = [cut for cut in result.dual.cuts if cut.family == family.name and cut.formulation == family.formulation]
+        if family.chosen is None or not cuts:
+            continue
+        indices, rows = np.stack([cut.index for cut in cuts]), np.array([cut.row for cut in cuts])
+        every = [part[np.arange(len(cuts)), rows] for part in family.rows(indices)]
+        whole, chosen = (np.column_stack(parts) for parts in (every, family.chosen(indices, rows)))
+        apart = np.abs(whole - chosen).max(axis=1)
+        if not (apart <= CHOSEN * np.abs(whole).max(axis=1)).all():
+            at = int(np.argmax(apart))
+            return f"{family.name}: the row chosen at the index {indices[at].tolist()} is another one among its rows"
+    return ""
 
 
 def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[ConstraintFamily, Separation]]) -> list[Proof]:

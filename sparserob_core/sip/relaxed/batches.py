@@ -19,7 +19,8 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Dual
-from sparserob_core.sip.method import Deadline, OutOfTime, Rebuild
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
+from sparserob_core.sip.method import Rebuild
 from sparserob_core.sip.relaxed.relaxed import Imposed, RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 from sparserob_core.sip.solver import Unanswered

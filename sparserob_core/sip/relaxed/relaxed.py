@@ -14,15 +14,16 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convexity import ControlImage, Regulariser, require_convex
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.inner.curved import curved_bound, least_curvature
 from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
 from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import ControlImage, Regulariser
 from sparserob_core.sip.result import SMALL_COST
 from sparserob_core.sip.solver import ROUNDING, Asked, Solver
 
@@ -78,6 +79,8 @@ def rows_at(
         where, which, (G, h) = every, rows, constraints.chosen(indices, rows)
     else:
         G, h = constraints.rows(indices)
+        if rows is not None and rows.max() >= h.shape[1]:
+            raise InputError(f"family {family!r}: worst: expected a row below {h.shape[1]}, got {int(rows.max())}")
         where, which = (
             (every, rows)
             if rows is not None
@@ -194,7 +197,7 @@ class RelaxedProgram:
             S = eye_array(self.program.n, format="csc") if base.S is None else csc_array(base.S[:images])
             lengths = np.ones(images) if self.program.lengths is None else self.program.lengths
             P, q = self.regulariser.quadratic(ControlImage(S, self.program.channels, lengths))
-            self._terms = P.tocsc(), q
+            self._terms = require_convex("regulariser.P", P, self.program.n), q
 
     def solve(
         self, rows: Rows, epsilon: float, margin: float = 0.0, guess: FiniteSolution | None = None
@@ -237,7 +240,17 @@ class RelaxedProgram:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
         at = _touched(plain, y, mu, solution.x)
         bound, y, mu, moved = proving(plain.tangent(at), y, mu, z, at=at)
+        if bound == -np.inf and self._bend is not None:
+            bound, at = curved_bound(plain, self._bend, y, mu, at)
         return bound - self.rounding(plain, y, mu, solution.x), y, mu, moved, at
+
+    @cached_property
+    def _bend(self) -> Array | None:
+        """What of the quadratic cost every entry has for itself ``(n,)``; ``None`` where a tangent does as well."""
+        base = self.program.finite
+        if base.P is None or base.S is not None or base.blocks is not None or base.separable or base.bounded:
+            return None
+        return least_curvature(base.P.toarray())
 
     @shaped
     def rounding(
@@ -357,7 +370,8 @@ class RelaxedProgram:
         self, finite: FiniteProgram, guess: FiniteSolution | None = None, small: float = np.inf
     ) -> FiniteSolution:
         """The checked solution of a finite program by the solver, whose answer is counted; see `solve_finite`."""
-        solution = solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
+        counted = self.counted.until(self.deadline)
+        solution = solve_finite(finite, counted, tolerance=self.tolerance, guess=guess, small=small)
         self.count(solution.by)
         if solution.unanswered:
             self.counted.failures.add(RELAXED, solution.unanswered, solution.by)

@@ -13,12 +13,18 @@ import numpy.typing as npt
 from sparserob_core.sip.convex_set import Array
 
 Rows: TypeAlias = npt.NDArray[Any]
+Truths: TypeAlias = npt.NDArray[np.bool_]
 VectorFunction: TypeAlias = Callable[[Array], Array]
 
 STEPS = 80
 REACH = 2.0
 """Longest step, in radii and per coordinate."""
+FARTHER = 2.0
+"""Of its radius, that of the next step of who has moved as far as it lets: with 1 a crest is crept along for ever."""
 ACCURACY = 1e-14
+HOPELESS = 8.0
+"""Times the variation of a model by which its maximum may lie above its best point. With an eighth of it narrow peaks
+are given up; with ten times as much nothing is."""
 LARGEST_DIMENSION_WITH_CROSS_TERMS = 8
 
 
@@ -32,7 +38,7 @@ class Candidates:
     values: Array
     radius: Array
 
-    def take(self, which: npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> Candidates:
+    def take(self, which: npt.NDArray[np.intp] | Truths) -> Candidates:
         """Some of them, by position or mask."""
         return Candidates(self.points[which], self.rows[which], self.values[which], self.radius[which])
 
@@ -62,14 +68,15 @@ class _Model:
         return np.asarray(self.value + np.einsum("ai,ai->a", self.gradient, steps) + curved / 2, dtype=float)
 
 
-def refine(function: VectorFunction, candidates: Candidates) -> Candidates:
+def refine(function: VectorFunction, candidates: Candidates, least: float = -np.inf) -> Candidates:
     """Climb from every candidate to a local maximum of its row of ``function`` (points ``(k, d)`` of the unit box to
     ``(k, r)``).
 
     A quadratic model from finite differences is maximised over a trust region that stays inside the box, whose faces
     are met exactly. The model is believed where it predicts and where its curvature does not depend on the radius;
-    elsewhere (kinks) the radius shrinks to a quarter around the best point. Values never get worse. A smooth row ends
-    within about 1e-14 of its local maximum, a kinked one within 1e-13, both relative to ``max(1, |value|)``.
+    elsewhere (kinks) the radius shrinks to a quarter around the best point. A candidate is given up whose values show
+    that it does not come near ``least``. Values never get worse. A smooth row ends within about 1e-14 of its local
+    maximum, a kinked one within 1e-13, both relative to ``max(1, |value|)``.
     """
     count, dimension = candidates.points.shape
     if dimension == 0 or count == 0:
@@ -80,7 +87,7 @@ def refine(function: VectorFunction, candidates: Candidates) -> Candidates:
     points, values, radius = candidates.points.copy(), candidates.values.copy(), candidates.radius.copy()
     for _ in range(STEPS):
         now = Candidates(points[active], candidates.rows[active], values[active], radius[active])
-        better, curved, done = _step(function, now, offsets, curvature[active])
+        better, curved, done = _step(function, now, offsets, curvature[active], least)
         points[active], values[active], radius[active], curvature[active] = (
             better.points,
             better.values,
@@ -94,15 +101,15 @@ def refine(function: VectorFunction, candidates: Candidates) -> Candidates:
 
 
 def _step(
-    function: VectorFunction, now: Candidates, offsets: Array, curvature: Array
-) -> tuple[Candidates, Array, npt.NDArray[np.bool_]]:
+    function: VectorFunction, now: Candidates, offsets: Array, curvature: Array, least: float
+) -> tuple[Candidates, Array, Truths]:
     radius = np.minimum(now.radius, 0.5)[:, np.newaxis]
     middle = np.clip(now.points, radius, 1 - radius)
-    stencil = _inside(middle[:, np.newaxis] + radius[:, np.newaxis] * offsets)
+    stencil = inside(middle[:, np.newaxis] + radius[:, np.newaxis] * offsets)
     seen = _values(function, stencil, now.rows)
     model = _fit(middle, seen, offsets)
     steps = _climb(model, np.maximum(-REACH, -middle / radius), np.minimum(REACH, (1 - middle) / radius))
-    trial = _inside(middle + radius * steps)
+    trial = inside(middle + radius * steps)
     reached = _values(function, trial[:, np.newaxis], now.rows)
     scale = np.maximum(1.0, np.abs(now.values))
     curved = np.einsum("aii->ai", model.hessian) / radius**2
@@ -114,9 +121,10 @@ def _step(
         now, np.concatenate([stencil, trial[:, np.newaxis]], axis=1), np.concatenate([seen, reached], axis=1)
     )
     moved = np.abs(points - now.points).max(axis=1) > 0.75 * radius[:, 0]
-    shrink = np.where(moved, 1.0, np.where(smooth, 0.125, 1.0 / 4))
+    shrink = np.where(moved, FARTHER, np.where(smooth, 0.125, 1.0 / 4))
     settled = smooth & (model.at(steps) - values <= ACCURACY * scale) & (values - now.values <= ACCURACY * scale)
     done = settled | (model.spread <= 10 * ACCURACY * scale) | (radius[:, 0] < ACCURACY)
+    done |= values + HOPELESS * model.spread < least
     return Candidates(points, now.rows, values, radius[:, 0] * shrink), curved, done
 
 
@@ -133,7 +141,7 @@ def _stencil(dimension: int) -> Array:
     return np.array(offsets)
 
 
-def _inside(points: Array) -> Array:
+def inside(points: Array) -> Array:
     """Into the unit box; what is within rounding of a face lies on it."""
     points = np.where(points < 1e-15, 0.0, points)
     return np.where(points > 1 - 1e-15, 1.0, points)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,18 +10,27 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import EvaluationsFinished, Notify, forwarded, ignore
-from sparserob_core.sip.maximiser import Maximiser
-from sparserob_core.sip.method import Deadline, Tools
+from sparserob_core.sip.events import EvaluationsFinished, forwarded
+from sparserob_core.sip.limits.deadline import Deadline
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 
 if TYPE_CHECKING:
     from sparserob_core.sip.separation.refinement import Candidates
+    from sparserob_core.sip.separation.survey import Survey
 
-GRID_SIDE = {1: 257, 2: 33, 3: 13, 4: 7}
-RANDOM_POINTS = 2048
+# Maxima of a row that are returned at least: the decision has as many that can be active as it has variables. With a
+# quarter of them programs of few variables take more rounds; with ten times as many, rows that stay slack are solved.
 KEPT_PER_ROW = 8
-REFINED_PER_ROW = 32
+# Peaks of a row that are refined at least, and of all rows, as long as something violated is found among them. With a
+# quarter of them a round passes over half of what it could impose; ten times as many cost more than the rounds saved.
+REFINED_PER_ROW, REFINED = 32, 512
+# Points of the grid for each index that the maximiser may ask for: they are evaluated at once, its own one by one. With
+# a quarter of them the grid is not finer than that of every round; ten times as many cost as much as the maximiser.
+POINTS_PER_ASKED = 4
+# Of the maxima that are returned, how many are compared, for some are found more than once. With a quarter of them,
+# what the maximiser finds again takes the place of others; ten times as many are more pairs than one wants to compare.
+MAXIMA_PER_KEPT = 4
 SAME = 1e-6
 """Maxima of one row that are closer than this share of the box are one maximum."""
 LARGEST_ARRAY = 2_000_000
@@ -29,59 +39,141 @@ LARGEST_ARRAY = 2_000_000
 def separate(
     program: SemiInfiniteProgram, x: Array, tools: Tools, threshold: float = 1e-9, number: int = 0
 ) -> list[tuple[ConstraintFamily, Separation]]:
-    """The most violated indices of every family at ``x (n,)``: in the family's own way, or as the maximiser finds them
-    (in round ``number``). Raises `OutOfTime` when the deadline of the tools has passed."""
+    """The most violated indices of every family at ``x (n,)``: in the family's own way, or as they are searched for (in
+    round ``number``; `search_worst`), the harder the less is found: as long as nothing of any family is violated by
+    more than ``threshold``. Raises `OutOfTime` when the deadline of the tools has passed."""
 
-    def searched(family: ConstraintFamily) -> Separation:
+    def search(family: ConstraintFamily) -> _Search:
         notify = forwarded(
             tools.notify, EvaluationsFinished, lambda event: replace(event, family=family.name, round=number)
         )
-        return search_worst(
-            family, x, tools.maximiser, tools.budget, tools.rng, threshold, tools.polish, notify, tools.deadline
-        )
+        return _Search(family, x, replace(tools, notify=notify), threshold)
 
-    separations = []
+    known: dict[str, Separation | _Search] = {}
     for family in program.families:
         tools.deadline.check()
-        found = searched(family) if family.worst is None else family.worst(x)
-        separations.append((family, replace(found, formulation=family.formulation)))
-    return separations
+        known[family.name] = search(family) if family.worst is None else family.separated(x)
+    searched = [one for one in known.values() if isinstance(one, _Search)]
+    highest = max((float(one.violations.max(initial=-np.inf)) for one in known.values()), default=-np.inf)
+    _search_harder(searched, highest)
+    separations = ((family, known[family.name]) for family in program.families)
+    return [
+        (family, replace(one.result() if isinstance(one, _Search) else one, formulation=family.formulation))
+        for family, one in separations
+    ]
 
 
-def search_worst(
-    family: ConstraintFamily,
-    x: Array,
-    maximiser: Maximiser | None,
-    budget: int,
-    rng: np.random.Generator,
-    threshold: float = 1e-9,
-    polish: float | None = None,
-    notify: Notify = ignore,
-    deadline: Deadline | None = None,
-) -> Separation:
-    """The largest local maxima of the violation of every row of ``family`` at the decision ``x (n,)``, at most 8 per
-    row, worst first.
+def search_worst(family: ConstraintFamily, x: Array, tools: Tools, threshold: float = 1e-9) -> Separation:
+    """The largest local maxima of the violation of every row of ``family`` at the decision ``x (n,)``, as many per row
+    as the decision has variables (at least 8), worst first.
 
-    A grid of the index box (257 points for one coordinate that moves, 33 x 33, 13^3, 7^4; 2048 random points beyond)
-    brackets the local maxima; all of them are refined at once, to about 1e-13 in the violation. Only when nothing above
-    ``threshold`` was found is ``maximiser`` asked, for ``budget`` further indices, and its best one refined as well:
-    the rounds of an exchange that find cuts stay cheap, and the last one is searched hard.
+    A grid of the index box (257 points for one coordinate that moves, 33 x 33, 13^3, 7^4; 2048 random points beyond),
+    finer where it does not resolve the violation, brackets the local maxima; the most promising are refined at once, to
+    about 1e-13 in the violation. Only when nothing above ``threshold`` was found are all others refined that may exceed
+    it; then those of a grid of four times the budget of the tools; and then their maximiser is asked, for as many
+    further indices as the budget says, of which again all local maxima are refined. So the rounds of an exchange that
+    find cuts stay cheap, and the last one is searched hard.
 
     A search proves nothing: ``bound`` is ``inf`` unless the maximiser proved one, or the index set is a single point.
     Raises `InputError` when a row is not a number or the index set is unbounded, and `OutOfTime` past the deadline.
     """
-    from sparserob_core.sip.separation.refinement import refine
+    search = _Search(family, x, tools, threshold)
+    _search_harder([search], search.highest)
+    return search.result()
 
-    field = _Violation(family, x, deadline or Deadline())
-    found = refine(field, _grid_maxima(field, rng))
-    bound = np.inf
-    if field.dimension == 0:
-        bound = float(found.values.max())
-    elif maximiser is not None and budget > 0 and found.values.max() <= threshold:
-        asked, bound = _ask(field, maximiser, budget, rng, polish, notify)
-        found = found.join(refine(field, asked))
-    kept = _distinct(found)
-    return Separation(field.indices(kept.points), kept.rows, kept.values, bound)
+
+def _search_harder(searches: Sequence[_Search], highest: float) -> None:
+    """Search on, by finer grids and then by the maximiser, until one of the searches has found a violation, which is
+    ``highest`` so far."""
+    for step in (_Search.look_closer, _Search.ask):
+        for search in searches:
+            if highest <= search.threshold:
+                step(search)
+                highest = max(highest, search.highest)
+
+
+class _Search:
+    """The search for the largest violations of a family: what is ``found``, by the grid of every round to begin with,
+    and the last ``survey``."""
+
+    def __init__(self, family: ConstraintFamily, x: Array, tools: Tools, threshold: float) -> None:
+        self.field = _Violation(family, x, tools.deadline)
+        self.tools, self.threshold, self.kept, self.bound = tools, threshold, max(KEPT_PER_ROW, x.size), np.inf
+        self.survey = self._survey()
+        self.found = self._refined(self.survey)
+        if self.field.dimension == 0:
+            self.bound = self.highest
+
+    @property
+    def highest(self) -> float:
+        """The largest violation so far."""
+        return float(self.found.values.max())
+
+    @property
+    def violations(self) -> Array:
+        """All violations so far."""
+        return self.found.values
+
+    def result(self) -> Separation:
+        """What was found."""
+        worst = _distinct(self.found, self.kept)
+        return Separation(self.field.indices(worst.points), worst.rows, worst.values, self.bound)
+
+    def look_closer(self) -> None:
+        """A finer grid, as far as the budget allows."""
+        from sparserob_core.sip.separation.survey import survey_grid
+
+        dimension = self.field.dimension
+        side = _finer(dimension, POINTS_PER_ASKED * self.tools.budget) if dimension else 0
+        if side:
+            self.survey = survey_grid(self.field, dimension, side, self.threshold)
+            self.found = self.found.join(self._refined(self.survey))
+
+    def ask(self) -> None:
+        """The local maxima of all indices that the maximiser asks for, beside those of the last survey."""
+        from sparserob_core.sip.search.search import Rules, Target, maximise
+        from sparserob_core.sip.separation.survey import survey_scattered
+
+        field, tools, asked, seen = self.field, self.tools, list[Array](), list[Array]()
+        if not field.dimension or tools.maximiser is None or tools.budget <= 0:
+            return
+
+        def worst(indices: Array) -> Array:
+            values = field.at(indices)
+            asked.append(field.unit(indices))
+            seen.append(values)
+            return np.asarray(values.max(axis=1), dtype=float)
+
+        target = Target(worst, field.box)
+        report = maximise(target, tools.maximiser, tools.budget, tools.rng, Rules(polish=tools.polish), tools.notify)
+        if report.interrupted:
+            raise KeyboardInterrupt(report.stopped)
+        self.bound = report.upper_bound
+        scattered = survey_scattered(np.concatenate(asked), np.concatenate(seen), self.survey)
+        self.found = self.found.join(self._refined(scattered))
+
+    def _survey(self) -> Survey:
+        """The points of every round: a grid, or random points where a grid would have too many."""
+        from sparserob_core.sip.separation.survey import GRID_SIDE, RANDOM_POINTS, survey_grid, survey_scattered
+
+        field = self.field
+        if field.dimension > max(GRID_SIDE):
+            unit = self.tools.rng.random((RANDOM_POINTS, field.dimension))
+            return survey_scattered(unit, field(unit))
+        return survey_grid(field, field.dimension, GRID_SIDE.get(field.dimension, 1), self.threshold)
+
+    def _refined(self, survey: Survey) -> Candidates:
+        """The peaks of a survey, the most promising of every row refined; all that may exceed the threshold where those
+        do not."""
+        from sparserob_core.sip.separation.refinement import refine
+
+        share = max(2, min(max(REFINED_PER_ROW, self.kept), REFINED // survey.values.shape[1]))
+        first = survey.best(share)
+        found = refine(self.field, survey.peaks.take(first))
+        if found.values.max(initial=-np.inf) <= self.threshold:
+            others = ~first & (survey.reach > self.threshold)
+            found = found.join(refine(self.field, survey.peaks.take(others), self.threshold))
+        return found
 
 
 class _Violation:
@@ -133,85 +225,24 @@ class _Violation:
         return values
 
 
-def _grid_maxima(field: _Violation, rng: np.random.Generator) -> Candidates:
-    """For every row the most promising points of the grid that no neighbour exceeds."""
-    dimension = field.dimension
-    if dimension > max(GRID_SIDE):
-        unit = rng.random((RANDOM_POINTS, dimension))
-        values = field(unit)
-        return _promising(unit, values, values, 0.5 * RANDOM_POINTS ** (-1 / dimension))
-    side = GRID_SIDE.get(dimension, 1)
-    unit = (
-        np.stack(np.meshgrid(*[np.linspace(0, 1, side)] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
-        if dimension
-        else np.zeros((1, 0))
-    )
-    values = field(unit)
-    shaped = values.reshape(*[side] * dimension, -1)
-    highest, promise = shaped.copy(), shaped.copy()
-    for axis in range(dimension):
-        promise += _peak_above(shaped, axis)
-        highest = _window_maximum(highest, axis)
-    return _promising(
-        unit, values, np.where(shaped >= highest, promise, -np.inf).reshape(values.shape), 1 / max(1, side - 1)
-    )
+def _finer(dimension: int, most: int) -> int:
+    """Points along every coordinate of the finest grid with at most so many points that halves the spacing of that of
+    every round, or halves it again; 0 where there is none."""
+    from sparserob_core.sip.separation.survey import GRID_SIDE
+
+    side = coarse = GRID_SIDE.get(dimension, most + 1)
+    while (2 * side - 1) ** dimension <= most:
+        side = 2 * side - 1
+    return side if side > coarse else 0
 
 
-def _window_maximum(values: Array, axis: int) -> Array:
-    """The maximum of every entry and its two neighbours along an axis."""
-    moved = np.moveaxis(values.copy(), axis, 0)
-    original = moved.copy()
-    np.maximum(moved[1:], original[:-1], out=moved[1:])
-    np.maximum(moved[:-1], original[1:], out=moved[:-1])
-    return np.moveaxis(moved, 0, axis)
-
-
-def _peak_above(values: Array, axis: int) -> Array:
-    """How far the parabola through three neighbours rises above the middle one, at most as far as its neighbours lie
-    below."""
-    moved = np.moveaxis(values, axis, 0)
-    rise = np.zeros_like(moved)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        bend = 2 * moved[1:-1] - moved[:-2] - moved[2:]
-        peak = (moved[2:] - moved[:-2]) ** 2 / (8 * bend)
-        rise[1:-1] = np.where((bend > 0) & np.isfinite(peak), np.minimum(peak, bend), 0.0)
-    return np.moveaxis(rise, 0, axis)
-
-
-def _promising(unit: Array, values: Array, promise: Array, radius: float) -> Candidates:
-    """The best points by ``promise (k, r)`` for every row."""
-    from sparserob_core.sip.separation.refinement import Candidates
-
-    rows = values.shape[1]
-    share = min(len(unit), max(2, min(REFINED_PER_ROW, 16 * REFINED_PER_ROW // rows)))
-    order = np.argsort(-promise, axis=0, kind="stable")[:share]
-    which, row = order.ravel(), np.tile(np.arange(rows), share)
-    worth = (promise[which, row] > -np.inf) | (np.repeat(np.arange(share), rows) == 0)
-    which, row = which[worth], row[worth]
-    return Candidates(unit[which], row, values[which, row], np.full(which.size, radius))
-
-
-def _ask(
-    field: _Violation, maximiser: Maximiser, budget: int, rng: np.random.Generator, polish: float | None, notify: Notify
-) -> tuple[Candidates, float]:
-    """The best index that a maximiser finds, as a candidate of every row."""
-    from sparserob_core.sip.search.search import Rules, Target, maximise
-    from sparserob_core.sip.separation.refinement import Candidates
-
-    target = Target(lambda indices: field.at(indices).max(axis=1), field.box)
-    report = maximise(target, maximiser, budget, rng, Rules(polish=polish), notify)
-    if report.interrupted:
-        raise KeyboardInterrupt(report.stopped)
-    values = field.at(report.best_point[np.newaxis])[0]
-    unit = np.repeat(field.unit(report.best_point[np.newaxis]), values.size, axis=0)
-    return Candidates(unit, np.arange(values.size), values, np.full(values.size, 0.01)), report.upper_bound
-
-
-def _distinct(found: Candidates) -> Candidates:
-    """Worst first; of every row at most `KEPT_PER_ROW` maxima, each once."""
+def _distinct(found: Candidates, kept: int) -> Candidates:
+    """Worst first; of every row at most so many maxima, each once."""
     found = found.take(np.argsort(-found.values, kind="stable"))
-    near = np.abs(found.points[:, np.newaxis] - found.points).max(axis=2, initial=0.0) <= SAME
-    again = (np.tril(near, -1) & (found.rows[:, np.newaxis] == found.rows)).any(axis=1)
-    found = found.take(~again)
-    earlier = np.tril(found.rows[:, np.newaxis] == found.rows, -1).sum(axis=1)
-    return found.take(earlier < KEPT_PER_ROW)
+    chosen = np.zeros(found.rows.size, dtype=bool)
+    for row in np.unique(found.rows):
+        place = np.flatnonzero(found.rows == row)[: MAXIMA_PER_KEPT * kept]
+        points = found.points[place]
+        near = np.abs(points[:, np.newaxis] - points).max(axis=2, initial=0.0) <= SAME
+        chosen[place[~np.tril(near, -1).any(axis=1)][:kept]] = True
+    return found.take(chosen)

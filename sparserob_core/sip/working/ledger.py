@@ -19,6 +19,7 @@ from sparserob_core.sip.program import (
     EQUALITY,
     TOLERANCE,
     ConstraintFamily,
+    EqualityErrors,
     SemiInfiniteProgram,
     Separation,
     WorstConstraint,
@@ -30,6 +31,9 @@ from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
 
 ROUNDING = 1e-13  # of the terms of a cost, with which it is evaluated
 CRUDE = 1e-8  # of bounds, rows and equalities, relative to their scale, at a decision of which nothing is claimed
+# Of the tolerance: a violation that was met though it is proven not to be there. With 1 rounding alone might deny a
+# proof; with ten times as much a violation of ten tolerances is claimed to be none.
+CONTRADICTS = 2.0
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 
 Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d), rows (k,) and the name of a family
@@ -171,6 +175,9 @@ class Ledger:
         x = answer.solution.x
         if any(missed > most for _, missed, most in self._fixed(x, strictly=True)):
             return False
+        errors = self._errors(x)
+        if errors is not None and not errors.kept:
+            return False
         if self.cheaper(answer):
             self.proven = answer, found, proofs
         return True
@@ -188,15 +195,22 @@ class Ledger:
         for what, missed, most in self._fixed(x, strictly=status in ("certified", "verified")):
             if missed > most:
                 status, message = "failed", f"the decision misses {what} by {missed:.1e} of what they compare; {ADVICE}"
+        errors = self._errors(x) if status in ("certified", "verified") else None
+        if errors is not None and not errors.kept:
+            status, message = "undecided", errors.advice
         proven = status in ("certified", "verified") and len(proofs) == len(self.program.families)
-        wrong = alarm(self.program, self.dual, x) if proven else ""
+        wrong = contradiction(worst) or alarm(self.program, self.dual, x) if proven else ""
         if wrong:
             status, message = "failed", wrong
         message = f"{message}; {ending}" if ending and status != "certified" else message
         if status == "refuted" and ending and ending == deadline.reason and not deadline.pressed:
             message = f"{message}; {more(deadline)}"
         result = self.result(status, message, answer, witness(self.program, worst, proofs))
-        return replace(result, proofs=tuple(proofs), stopped=ending if ending == deadline.reason else "")
+        return replace(result, proofs=tuple(proofs), errors=errors, stopped=ending if ending == deadline.reason else "")
+
+    def _errors(self, x: Array) -> EqualityErrors | None:
+        """Proven errors of the equalities at ``x (n,)``; ``None`` where the program offers none."""
+        return None if self.program.errors is None else self.program.errors(x)
 
     def _fixed(self, x: Array, strictly: bool) -> Iterator[tuple[str, float, float]]:
         """What is no family: a name, by how much ``x (n,)`` misses it, and by how much it may. ``strictly``: as much as
@@ -295,6 +309,17 @@ def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...],
     old, new = ({(cut.family, cut.index.tobytes(), cut.row): cut for cut in cuts} for cuts in (before, now))
     return tuple(cut for key, cut in new.items() if key not in old), tuple(
         cut for key, cut in old.items() if key not in new
+    )
+
+
+def contradiction(worst: WorstConstraint) -> str:
+    """Words where a search has met a violation in a family that was proven, by more than rounding makes of its
+    tolerance; empty where all is well."""
+    if not worst.violation > CONTRADICTS * TOLERANCE:
+        return ""
+    return (
+        f"{worst.constraint} is violated by {worst.violation:.4g} at the index {worst.index.tolist()}, though its own"
+        " enclosure or separation proves that it is met: one of the two is wrong, and neither is claimed"
     )
 
 

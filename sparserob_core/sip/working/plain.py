@@ -15,6 +15,7 @@ from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
@@ -42,7 +43,8 @@ Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an 
 class PlainRows(Working):
     """The imposed ``rows``, since how many rounds each is ``idle (r,)``, the weight ``epsilon`` of the regulariser, and
     a solution with these rows as the next ``guess``. ``exact``: the regulariser is only as heavy as the unregularised
-    problem allows, else as the last weight of the continuation. ``close``: the exchange of another program."""
+    problem allows, else as the last weight of the continuation. ``close``: the exchange of another program. ``sheds``:
+    whether idle rows are dropped."""
 
     rows: Rows = field(default_factory=lambda: Rows.none(0))
     epsilon: float = 0.0
@@ -50,6 +52,7 @@ class PlainRows(Working):
     close: Close | None = None
     idle: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     guess: FiniteSolution | None = None
+    sheds: bool = True
 
     @staticmethod
     def start(program: SemiInfiniteProgram, tools: Tools, exact: bool, close: Close) -> PlainRows:
@@ -65,8 +68,12 @@ class PlainRows(Working):
         """Where the cost falls for ever, as it may without enough rows: those that stop it, where there are any."""
         answer = self._regularised(ledger)
         while answer.solution.status == "failed" and not usable(answer.solution) and not last:
-            from sparserob_core.sip.working.unbounded import bounding_rows, falls_for_ever
+            from sparserob_core.sip.working.unbounded import bounding_rows, falls_for_ever, first_rows
 
+            self.sheds = self.sheds and not self.size  # what was dropped may be what bounds it
+            if self.impose(first_rows(self.program)):
+                answer = self._regularised(ledger)
+                continue
             assert self.close is not None
             ray, fresh = bounding_rows(self.program, ledger.tools, self.close)
             if ray is not None:
@@ -136,7 +143,7 @@ class PlainRows(Working):
         known, added = answer.multipliers, np.zeros(fresh.h.size)
         y = np.concatenate([known, np.zeros(self.rows.h.size - known.size)])  # none of what was imposed since
         idle = np.where(y > 0.0, 0, self.idle + 1)
-        keep = (idle < IDLE_ROUNDS) | (number > DROPPING_ROUNDS)
+        keep = (idle < IDLE_ROUNDS) | (number > DROPPING_ROUNDS) | (not self.sheds)
         self.rows = self.rows.take(keep).joined(fresh)
         self.idle = np.concatenate([idle[keep], added.astype(int)])
         fixed = answer.solution.y[: answer.solution.y.size - known.size]
@@ -221,6 +228,9 @@ class PlainRows(Working):
                 continue
             looked = separate(program, other, ledger.tools, ALLOWED, number)
             beyond = [one for family, separation in looked if (one := above(family, separation))[1].size]
+            room = 0.5 * min(0.0, worst_of(found).violation)
+            if self.allowed and worst_of(looked).violation > room:
+                continue  # a proof has asked for room, which the answer leaves and this one does not
             if not beyond:
                 value = program.cost(other) if answer.epsilon == 0.0 else answer.value
                 kept = replace(answer, solution=replace(answer.solution, x=other), value=value), looked

@@ -168,7 +168,7 @@ class RobustRows(Working):
                 continue
             for share in SHARES:
                 at = share * raw + (1.0 - share) * best
-                separation = family.worst(at)
+                separation = family.separated(at)
                 over = family.violations(raw, separation.indices).max(axis=1) > ALLOWED
                 violated.append((separation.indices[over][:CUTS], separation.rows[over][:CUTS], family.name))
                 if feasible and program.settle is not None:

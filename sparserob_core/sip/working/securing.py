@@ -77,6 +77,8 @@ def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Ans
     """Secure a decision when time is due, though that of round ``number`` violates what was ``found``: as soon as
     little would pay for that; where there is a limit, at certain shares of it, and when no more is left of it than that
     may take; without a limit after some rounds. Whether constraints were imposed."""
+    if not all(family.provable for family in ledger.program.families):
+        return False
     deadline, began = ledger.tools.deadline, [event.seconds for event in ledger.history]
     candidate = working.candidate(answer) if number & (number - 1) == 0 else None  # 1, 2, 4, 8, ...
     if candidate is not None and ledger.cheaper(candidate):
@@ -133,7 +135,8 @@ def or_proven(ledger: Ledger, result: Result) -> Result:
     if result.status not in ("refuted", "undecided") or ledger.proven is None:
         return result
     secured, found, proofs = ledger.proven
-    return ledger.judged(secured, worst_of(found), proofs, ledger.tools.deadline.reason)
+    why = ledger.tools.deadline.reason or f"of a decision that costs less it is not proven: {result.message}"
+    return ledger.judged(secured, worst_of(found), proofs, why)
 
 
 def _secure(

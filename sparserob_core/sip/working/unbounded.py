@@ -15,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
@@ -23,6 +24,9 @@ from sparserob_core.sip.working.ledger import Ledger, Prover, unproven
 
 Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an exchange that closes the gap
 FALLS = 1e-7  # of the largest coefficient: a cost per unit of a direction that is no rounding
+# Coordinates of an index up to which the first rows are those of a grid: with two points along each of ten coordinates
+# there are a thousand.
+FEW = 8
 SHOWN = 6  # numbers of a ray that are written into the message
 
 
@@ -59,14 +63,39 @@ def _homogeneous(family: ConstraintFamily) -> ConstraintFamily:
     return ConstraintFamily(name=family.name, index_set=family.index_set, rows=rows)
 
 
+def _has_bounds(program: SemiInfiniteProgram) -> bool:
+    """Whether every entry of the decision has two bounds."""
+    return program.finite.S is None and program.finite.bounded
+
+
+def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, str]]:
+    """Rows that mostly bound a relaxed program without any: of every family as many indices as the decision has
+    variables, and one more, dense at the faces of the index set, where polynomials and cosines grow most (nodes of
+    Chebyshev). Nothing where the bounds of the decision do so."""
+    chosen: list[tuple[Array, np.ndarray, str]] = []
+    if _has_bounds(program):
+        return chosen
+    for family in program.families:
+        box = family.index_set
+        moves = np.flatnonzero(box.upper > box.lower)
+        side = int(np.ceil((program.n + 1) ** (1.0 / max(1, moves.size)) - 1e-9)) if moves.size <= FEW else 1
+        share = 0.5 - 0.5 * np.cos(np.pi * np.arange(side) / max(1, side - 1)) if side > 1 else np.array([0.5])
+        lines = [share if i in moves else np.zeros(1) for i in range(box.dimension)]
+        unit = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, box.dimension)
+        indices = np.clip(box.lower + unit * (box.upper - box.lower), box.lower, box.upper)
+        count = family.violations(np.zeros(program.n), indices[:1]).shape[1]
+        chosen.append((np.repeat(indices, count, axis=0), np.tile(np.arange(count), len(indices)), family.name))
+    return chosen
+
+
 def bounding_rows(
     program: SemiInfiniteProgram, tools: Tools, close: Close
 ) -> tuple[Array | None, list[tuple[Array, np.ndarray, str]]]:
     """A ray ``(n,)`` along which the cost falls for ever; or ``None`` and the indices that let it fall along none."""
     base = program.finite
-    if np.isfinite(base.lower).all() and np.isfinite(base.upper).all() and base.S is None:
+    if _has_bounds(program):
         return None, []
-    steps = replace(tools, regulariser=None, notify=lambda event: None)
+    steps = replace(tools, regulariser=None, notify=ignore)
     result = close(recession_program(program), steps, unproven)
     coefficient = max(float(np.abs(base.q).max(initial=0.0)), float(base.weights.max(initial=0.0)))
     if result.decision is not None and not result.stopped and result.cost < -FALLS * coefficient:

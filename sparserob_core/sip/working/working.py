@@ -51,7 +51,7 @@ class Missed(NamedTuple):
     @staticmethod
     def most(family: ConstraintFamily, separation: Separation) -> Missed:
         """The largest violation that was found of a family."""
-        largest = max(0.0, float(separation.violations[0]))
+        largest = float(separation.violations.max(initial=0.0))
         return Missed(largest, family.name, separation.indices[:1], separation.rows[:1])
 
 

@@ -1,4 +1,4 @@
-"""Guards checker/reach/effort: the largest effort is shown where it is that, and nowhere below."""
+"""Guards checker/cost/effort: the largest effort is shown where it is that, and nowhere below."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from flint import arb, ctx
 
+from sparserob_core.checker.cost import effort
+from sparserob_core.checker.cost.effort import _slope, at_most
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
-from sparserob_core.checker.reach import effort
-from sparserob_core.checker.reach.effort import _slope, at_most
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.sets import Box, NormBall
 

@@ -164,7 +164,7 @@ def test_rows_at_the_corners_of_a_cell_of_directions_stand_for_all_of_it(name):
     source = SETS[name] if name != "high" else Ellipsoid(np.zeros(3), np.diag([1.0, 0.5, 2.0]) + 0.2)
     d = source.dimension
     with ctx.workprec(96):
-        curved = Curved(known(source), rng.normal(size=(d, d)) + 2.0 * np.eye(d), np.ones(d))
+        curved = Curved(known(source), rng.normal(size=(d, d)) + 2.0 * np.eye(d), RESOLVED * np.ones(d))
         low, high = np.full(d, -0.4), np.full(d, 0.3)
         low[0] = high[0] = 1.0
         for depth in range(3):
@@ -344,13 +344,13 @@ def test_the_support_function_of_balls_of_norms_is_that_of_the_dual_norm():
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_a_row_of_a_curved_set_has_the_unit_of_its_reach_and_never_less_than_what_sums_resolve(size):
+def test_a_row_of_a_curved_set_has_the_unit_of_its_width_and_never_less_than_those_of_the_states(size):
     source = Ellipsoid(np.zeros(2), size**2 * np.eye(2))
     z = np.array([1.0, 0.0])
     with ctx.workprec(96):
-        for sums in (np.zeros(2), np.array([1e9 * size, 0.0])):
-            row = Curved(known(source), np.eye(2), sums).true(z)
-            assert row.unit == pytest.approx(max(size, RESOLVED * sums[0]))
+        for floors in (np.zeros(2), np.array([1e3 * size, 0.0])):
+            row = Curved(known(source), np.eye(2), floors).true(z)
+            assert row.unit == pytest.approx(max(size, floors[0]))
 
 
 def test_what_is_allowed_is_rounded_down_whatever_is_added():

@@ -132,3 +132,29 @@ def test_parameters_may_fill_a_polytope() -> None:
     triangle = Polytope(np.array([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]]), np.array([0.0, 0.0, 1.0]))
     system = LinearSystem(lambda p: [[np.sqrt(1.0 - p[0] - p[1] + 1e-9)]], [[1.0]], parameters=triangle)
     assert system.parameter_count == 2
+
+
+def other_for_numbers(p):
+    return [[(-1.0 if isinstance(p[0], float) else -9.0) + 0.0 * p[0]]]
+
+
+def drawn(p):
+    return [[np.random.default_rng().normal() + 0.0 * p[0]]]
+
+
+@pytest.mark.parametrize("function", [other_for_numbers, drawn])
+def test_a_function_that_is_another_one_for_taylor_models_is_refused(function):
+    """Rows would be those of one system, and proofs those of another."""
+    system = LinearSystem(function, [[1.0]], parameters=Box([-0.5], [0.5]))
+    space = TaylorSpace(1, 2)
+    with pytest.raises(InputError, match=r"system\.A: expected a function that depends on its argument alone, .*p1 = "):
+        system.taylor(space, np.zeros(1), np.full(1, 0.5))
+
+
+def test_a_function_that_cancels_is_the_same_for_taylor_models():
+    def A(p):
+        return [[1.0, np.sin(p[0]) - p[0]], [(1.0 + p[0]) ** 2 - 1.0 - 2.0 * p[0] - p[0] ** 2, np.exp(-p[0])]]
+
+    system = LinearSystem(A, [[1.0], [0.0]], parameters=Box([-0.5], [0.5]))
+    for centre in np.linspace(-0.5, 0.5, 7):
+        system.taylor(TaylorSpace(1, 3), np.array([centre]), np.full(1, 1e-3))

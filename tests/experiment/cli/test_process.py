@@ -124,14 +124,15 @@ def test_an_interrupted_run_keeps_its_last_control_and_claims_nothing_of_it(
     assert f"undecided: {WORDS[signal.Signals(number)]} after round" in table
     result = json.loads((out / "result.json").read_text())
     assert result["status"] == "undecided"
-    # the method tells 1.5 and 0.25 in the program's own unit of cost
-    assert result["cost"] == pytest.approx(6.0 * result["lower_bound"], rel=1e-12)
+    assert result["cost"] > 0.0
+    assert result["lower_bound"] == 0.0  # the method tells another one, which nothing proves
     assert (result["upper_bound"], result["gap"]) == (None, None)
     assert result["counts"]["relaxed_programs"] == 3 * result["counts"]["rounds"] > 0
     with np.load(out / "solution.npz") as solution:
         assert (solution["control"] == 0.1).all()
     files = sorted(path.name for path in out.iterdir())
     assert [name for name in files if not name.startswith("adversary")] == [
+        "certificate.json",
         "config.yaml",
         "result.json",
         "rounds.npz",
@@ -278,9 +279,12 @@ observers: []
 
 @pytest.mark.slow
 def test_a_limit_ends_a_transcription_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparserob_core.sip.method.GRACE", 0.0)
+    monkeypatch.setattr("sparserob_core.sip.limits.deadline.GRACE", 0.0)
     (tmp_path / "large.yaml").write_text(LARGE)
-    for study in (sr.run, sr.margin, sr.initial_states):
+    outcome = sr.run(tmp_path / "large.yaml", out=tmp_path / "run")
+    assert (outcome.status, outcome.result.lower_bound, outcome.control) == ("undecided", 0.0, None)
+    assert sr.check(tmp_path / "run").status == "verified"
+    for study in (sr.margin, sr.initial_states):
         with pytest.raises(
             sr.TimeLimitError, match=r"the limit of 0.02 s is reached while the problem was transcribed"
         ):

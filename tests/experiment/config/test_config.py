@@ -4,6 +4,7 @@ written back so that they run again."""
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.config.overrides import quoted
 from sparserob_core.experiment.config.reader import read_value, write_yaml
 
 BILLION_LAUGHS = b"a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + b"".join(
@@ -196,6 +198,16 @@ def test_a_missing_file_and_a_directory_are_told_apart(tmp_path: Path) -> None:
         ("=3", "expected a key"),
         ("a..b=3", "expected a key"),
         ("seed=[1", "not valid YAML"),
+        (
+            "title=run #5",
+            """'#5' would be a comment, which is left out; as text the value is written 'title="run #5"'""",
+        ),
+        ("title=#5", """as text the value is written 'title="#5"'"""),
+        ("seed=3 # of three", "'# of three' would be a comment"),
+        ("title=*", """as text it is written 'title="*"'"""),
+        ("title=@file", """as text it is written 'title="@file"'"""),
+        ("title=012", """title: must be text (got 12); as text it is written 'title="012"'"""),
+        ("title=1e3", """must be text (got 1000.0); as text it is written 'title="1e3"'"""),
         ("problem.terminal.3.box=1", "problem.terminal is a list with 1 entries"),
         ("problem.terminal.first.box=1", "expected a number of at most 1, got 'first'"),
         ("problem.horizon.x=1", "problem.horizon is 2.0, which has no key 'x'"),
@@ -203,6 +215,17 @@ def test_a_missing_file_and_a_directory_are_told_apart(tmp_path: Path) -> None:
 )
 def test_an_override_at_fault_is_told_like_a_key_at_fault(config: Path, override: str, said: str) -> None:
     assert said in refusal(config, override)
+
+
+@pytest.mark.parametrize("text", ["run #5", "#5", "*", "@file", "012", "1e3", 'a "b" # c', "it's", "a\\b #"])
+def test_a_value_that_is_written_as_the_refusal_says_is_that_text(text: str, config: Path) -> None:
+    (argument,) = shlex.split(quoted(f"title={text}"))
+    assert load_config(config, [argument]).config.title == text
+
+
+def test_a_mark_within_a_word_or_within_quotes_begins_no_comment(config: Path) -> None:
+    assert load_config(config, ["title=run#5"]).config.title == "run#5"
+    assert load_config(config, ["title='run #5'"]).config.title == "run #5"
 
 
 def test_overrides_reach_into_lists_and_make_what_is_missing(config: Path) -> None:

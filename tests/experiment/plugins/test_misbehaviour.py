@@ -57,7 +57,7 @@ MISBEHAVIOURS = [
     ("regulariser", "return None", "quadratic returned None, expected a tuple"),
     ("regulariser", "return ('a', 'b')", "quadratic: what it returned raised"),
     ("regulariser", "return np.eye(3), np.zeros(3)", r"quadratic returned shapes \(3, 3\) and \(3,\), expected \(100"),
-    ("regulariser", "return np.eye(100) * np.nan, np.zeros(100)", "quadratic returned numbers that are not finite"),
+    ("regulariser", "return np.eye(100), np.full(100, np.nan)", "quadratic returned numbers that are not finite"),
     ("regulariser", "raise SystemExit", "quadratic raised SystemExit"),
     ("regulariser", "1 / 0", "quadratic raised ZeroDivisionError: division by zero"),
     ("maximiser", "return None", "search returned None, expected an upper bound"),
@@ -122,6 +122,16 @@ def test_a_component_that_misbehaves_is_named_and_ends_with_status_5(kind, body,
     assert re.search(words, flat), flat
     assert "internal error" not in flat
     assert "Traceback" not in flat
+
+
+@pytest.mark.parametrize("claimed", ["certified", "infeasible", "undecided"])
+def test_what_a_method_of_others_claims_is_said_to_be_believed(claimed, status, tmp_path) -> None:
+    body = f"return sr.Result(status='{claimed}', message='so it is', decision=np.zeros(program.n))"
+    (tmp_path / "odd.py").write_text(plugin("method", body))
+    method = sr.load_registry([tmp_path / "odd.py"]).build("method", "odd")
+    result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0), method=method)
+    believed = "" if claimed == "undecided" else "; what the method Odd claims is believed"
+    assert result.message == f"so it is{believed}"
 
 
 SOLVERS = [

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
-from importlib import metadata
 from pathlib import Path
 
 import pytest
 from pydantic import BaseModel, ValidationError, field_validator
 
 import sparserob_core as sr
+from sparserob_core.experiment.config.load import KEPT
 from sparserob_core.experiment.plugins import registry as discovery
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.messages import complaints
 from sparserob_core.options import meanings
+from sparserob_core.testing import ContractBroken, MaximiserContract
 
 GOOD = """
 import sparserob_core as sr
@@ -91,7 +93,7 @@ def test_an_unknown_name_brings_the_nearest_known_names(plugin: Callable[[str], 
 
 def test_a_name_registered_twice_names_both_plugins(plugin: Callable[[str, str], Path]) -> None:
     with pytest.raises(
-        sr.PluginError, match=r"regulariser 'mine' is registered twice, by plugin 'first' and by plugin 'second'"
+        sr.PluginError, match=r"regulariser 'mine' is registered twice, by plugin 'first' .* and by plugin 'second'"
     ):
         load(plugin(GOOD, "first"), plugin(GOOD, "second"))
 
@@ -145,7 +147,7 @@ class Entry:
 @pytest.fixture
 def entry_points(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def use(*entries: Entry) -> None:
-        monkeypatch.setattr(metadata, "entry_points", lambda group: list(entries))
+        monkeypatch.setattr(discovery, "_found", lambda failures: list(entries))
         discovery._installed.cache_clear()
         discovery._own.cache_clear()
 
@@ -153,6 +155,129 @@ def entry_points(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     monkeypatch.undo()
     discovery._installed.cache_clear()
     discovery._own.cache_clear()
+
+
+SEARCH = """
+import sparserob_core as sr
+
+class Greedy(sr.Maximiser, sr.Options):
+    {option} = 7.0
+    def search(self, objective, rng):
+        return float("inf")
+    def helper(self):
+        return 1.0
+
+@sr.hookimpl
+def sparserob_maximisers():
+    yield sr.MaximiserPlugin(name="greedy", factory={factory}, summary="g")
+"""
+
+
+@pytest.mark.filterwarnings("ignore:Field name")
+@pytest.mark.parametrize(
+    "option",
+    ["budget", "polish", "name", "seed", "callback", "search", "polished", "copy", "model_config", "helper", "origin"],
+)
+def test_an_option_that_bears_a_name_in_use_is_refused_when_its_plugin_is_loaded(
+    option: str, plugin: Callable[[str], Path]
+) -> None:
+    with pytest.raises(sr.PluginError, match=rf"plugin 'mine'.*the option '{option}' bears a name that .* uses"):
+        load(plugin(SEARCH.format(option=f"{option}: float", factory="Greedy")))
+
+
+def test_an_alias_in_use_and_the_options_of_a_lazy_factory_are_refused_too(plugin: Callable[[str], Path]) -> None:
+    aliased = SEARCH.format(option="often: float = __import__('pydantic').Field(alias='budget', default=1.0); x: float",
+                            factory="Greedy")  # fmt: skip
+    with pytest.raises(sr.PluginError, match="the option 'budget' bears a name"):
+        load(plugin(aliased))
+    lazy = SEARCH.format(option="budget: float", factory='"tests.experiment.plugins.test_registry:Lazy"')
+    with pytest.raises(sr.PluginError, match="the option 'budget' bears a name"):
+        load(plugin(lazy)).check("maximiser", "greedy", {})
+
+
+class Lazy(sr.Options):
+    budget: float = 7.0
+
+
+def test_every_key_and_argument_of_a_search_is_reserved() -> None:
+    taken = {*inspect.signature(sr.maximise).parameters, *inspect.signature(sr.ask_tell).parameters, *KEPT}
+    assert taken - {"options"} <= sr.MaximiserPlugin.reserved
+
+
+def test_the_contract_refuses_an_option_that_bears_a_name_in_use() -> None:
+    class Greedy(sr.Maximiser, sr.Options):
+        """Nothing."""
+
+        budget: float = 7.0
+
+        def search(self, objective, rng):  # type: ignore[no-untyped-def]
+            return float("inf")
+
+    class Kept(MaximiserContract):
+        component = Greedy
+
+    with pytest.raises(ContractBroken, match="the framework uses itself: budget"):
+        Kept().test_no_option_bears_a_name_that_the_framework_uses()
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """A folder of the path beside the ordinary ones; it is given distributions as mappings of files to texts."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(str(folder))
+
+    def write(name: str, **files: str) -> Path:
+        (folder / name).mkdir()
+        for file, text in files.items():
+            path = folder / (f"{file}.py" if file.startswith("module_") else f"{name}/{file.replace('_txt', '.txt')}")
+            path.write_text(text)
+        return folder
+
+    def forget() -> None:
+        discovery._installed.cache_clear()
+        discovery._own.cache_clear()
+
+    forget()
+    yield write
+    monkeypatch.undo()
+    forget()
+
+
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        (".dist-info", {}),
+        (".egg-info", {}),
+        ("~parserob-1.0.dist-info", {"METADATA": "Metadata-Version: 2.1\nName: sparserob\nVersion: 1\n",
+                                     "entry_points_txt": "[sparserob]\npiqp = nowhere\n"}),
+        ("bad-1.0.dist-info", {"entry_points_txt": "[sparserob]\nno equals sign\n"}),
+    ],
+)  # fmt: skip
+def test_a_folder_that_is_no_distribution_is_named_and_stops_nobody(
+    name: str, files: dict[str, str], site: Callable[..., Path]
+) -> None:
+    folder = site(name, **files)
+    for registry in (sr.load_registry(), discovery.load_own_registry()):
+        assert "piqp" in registry.names("solver")
+        assert [failure.plugin for failure in registry.failures] == [str(folder / name)]
+
+
+def test_two_distributions_with_one_entry_point_are_both_named_and_the_advice_works(
+    site: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for who in ("first", "second"):
+        site(
+            f"{who}_pack-1.0.dist-info",
+            METADATA=f"Metadata-Version: 2.1\nName: {who}-pack\nVersion: 1.0\n",
+            entry_points_txt=f"[sparserob]\nmine = module_{who}\n",
+            **{f"module_{who}": GOOD},
+        )
+    with pytest.raises(sr.PluginError, match=r"\(first-pack 1\.0, .*\(second-pack 1\.0, ") as caught:
+        sr.load_registry()
+    variable, word = str(caught.value).rpartition(" ")[2].split("=")
+    monkeypatch.setenv(variable, word)
+    assert sr.load_registry().get("regulariser", "mine").distribution in {"first-pack 1.0", "second-pack 1.0"}
 
 
 def broken() -> object:

@@ -52,7 +52,9 @@ def test_a_run_tells_units_row_by_row(outcome: sr.Outcome) -> None:
     assert f"{worst['violation']:.2e} {where['worst']} in {worst['constraint']}" in rows["worst violation"]
     assert where["worst"] in {"m", "m/s"} and " s, from (0." in rows["worst violation"]
     assert rows["worst violation"].endswith(" m/s)")
-    assert " m in path" in rows["proven to"] and " m/s in terminal" in rows["proven to"] and " m, " in rows["proven to"]
+    path, terminal = rows["kept"].split("terminal")
+    assert path.startswith("path ") and " m " in path and " m/s" not in path
+    assert " m" in terminal and " m/s" in terminal
     assert sorted(where["rows"]["terminal"]) == ["m", "m", "m/s", "m/s"]
     assert where["time"] == "s"
     assert where["cost"] == "N s" and all(rows[key].endswith(" N s") for key in ("cost", "lower bound", "upper bound"))
@@ -235,7 +237,7 @@ def test_other_units_than_those_of_the_config_fail_the_check(
 def test_nothing_is_said_of_units_that_nobody_has_named(tmp_path: Path) -> None:
     outcome = sr.run({"problem": PROBLEM, "dictionaries": PIECES}, out=tmp_path / "run", quiet=True, figures=False)
     assert "units" not in outcome.summary
-    assert " in path" in told(outcome)["proven to"] and " m" not in told(outcome)["proven to"]
+    assert told(outcome)["kept"].startswith("path ") and " m" not in told(outcome)["kept"]
 
 
 def test_the_table_says_who_answered_how_many_programs_each_under_the_name_it_is_known_by() -> None:

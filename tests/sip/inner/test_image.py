@@ -66,3 +66,14 @@ def test_what_is_stationary_already_but_beyond_its_limit_is_moved_too(seed):
     moved = onto_stationary(program, z, program.q)
     assert np.abs(program.S.T @ moved + program.q).max() <= 1e-12
     assert moved[12:].min() >= -CANCELLED * np.abs(moved).max()
+
+
+@pytest.mark.parametrize("off", [1e-14, 1e-13, 5e-13])
+def test_multipliers_that_are_off_by_little_are_moved_too(off: float) -> None:
+    """What is left of them would be missing in a bound, which is held against the multipliers as they are written."""
+    finite = program([-2.0] * 4, [2.0] * 4, [[1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [1.0, -1.0]])
+    S, z = finite.S, np.array([0.5, 0.25, -0.4, 0.1])
+    assert S is not None
+    slope = -(S.T @ z) + off
+    left = np.abs(S.T @ onto_stationary(finite, z, slope) + slope).max()
+    assert left <= 1e-15

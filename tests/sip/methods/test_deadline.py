@@ -13,7 +13,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.sip.evidence import Cut, Dual
-from sparserob_core.sip.method import Deadline, OutOfTime
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.program import Enclosure
 from sparserob_core.sip.proof.branch_and_bound import prove_family
 from sparserob_core.sip.result import relative_gap
@@ -136,13 +136,13 @@ def test_what_is_refuted_when_the_time_is_over_says_what_would_help():
     def endless(seconds):
         looked = []
 
-        def worst(x):  # another index each time, so that the rounds go on
-            looked.append(1.0 / (len(looked) + 2.0))
+        def worst(x):  # a later index each time, so that the rounds go on
+            looked.append(min(1.0, 0.02 * (len(looked) + 1.0)))
             time.sleep(0.01)
             if seconds is None and len(looked) > 3:
                 raise KeyboardInterrupt
             at = np.array([[looked[-1]]])
-            return sr.Separation(at, np.zeros(1, dtype=int), at[:, 0] + 1.0)
+            return sr.Separation(at, np.zeros(1, dtype=int), at[:, 0] - x[0])
 
         family = replace(slow_family(), enclosure=None, worst=worst)
         program = sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=9.0, families=[family])

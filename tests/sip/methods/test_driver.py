@@ -13,8 +13,9 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble, tools_of
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.sip import method
-from sparserob_core.sip.method import Deadline, OutOfTime, Tools
+from sparserob_core.sip.limits import deadline as limits
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods import driver, exchange
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.methods.exchange import Exchange
@@ -80,7 +81,7 @@ def test_what_is_known_is_the_answer_where_the_time_is_over(when: str) -> None:
 
 
 def test_a_library_that_makes_another_error_of_the_alarm_ends_the_run_like_the_alarm(monkeypatch: Any) -> None:
-    monkeypatch.setattr(method, "GRACE", 0.0)
+    monkeypatch.setattr(limits, "GRACE", 0.0)
 
     def step(number: int) -> Result:
         try:

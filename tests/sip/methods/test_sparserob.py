@@ -139,7 +139,7 @@ def test_a_search_at_its_limit_returns_what_it_has_proven_and_was_not_interrupte
 
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() + (3600.0 if left[0] <= 0 else 0.0))
     monkeypatch.setattr(TupleValue, "at", counted)
-    monkeypatch.setattr("sparserob_core.sip.method.time", clock)
+    monkeypatch.setattr("sparserob_core.sip.limits.deadline.time", clock)
     method, maximiser = {"indices": 8}, {"name": "simulated_annealing", "budget": 60}
     limits = FEW | {"continuation": {"factor": 0.99999, "stop": 1e-6}, "limits.seconds": 3600.0}
     outcome = experiment1(

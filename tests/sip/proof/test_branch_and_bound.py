@@ -18,7 +18,8 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.method import Deadline, Tools
+from sparserob_core.sip.limits.deadline import Deadline
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import ConstraintFamily, Enclosure
 from sparserob_core.sip.proof.branch_and_bound import prove_family

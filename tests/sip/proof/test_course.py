@@ -9,7 +9,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.errors import NotEnclosable
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Enclosure, Separation
 from sparserob_core.sip.proof import branch_and_bound
 from sparserob_core.sip.proof.branch_and_bound import Course, _at_rest, _halved, _towards, prove_family, supremum

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Enclosure, Separation
 from sparserob_core.sip.proof.branch_and_bound import (
     ADVICE,

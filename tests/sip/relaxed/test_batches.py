@@ -13,7 +13,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import Anew, assemble, tools_of
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.sip.method import Deadline, OutOfTime
+from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.relaxed import batches
 from sparserob_core.sip.relaxed.batches import CHUNK, LONG, Batches, Oracle

@@ -4,6 +4,7 @@ exactly; and claims nothing that it has not proven."""
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from hypothesis import strategies as st
 
 import sparserob_core as sr
 from sparserob_core.sip.maximiser import Maximiser
-from sparserob_core.sip.separation.separation import KEPT_PER_ROW, search_worst
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.separation.separation import KEPT_PER_ROW, search_worst, separate
+from sparserob_core.sip.solver import Auto
 
 DECISION = np.array([1.0])
 
@@ -27,8 +30,12 @@ def family(violation, lower, upper):
     return sr.ConstraintFamily(name="made up", index_set=sr.Box(lower, upper), rows=rows)
 
 
+def tools(maximiser=None, budget=0):
+    return Tools(solver=Auto(), maximiser=maximiser, budget=budget)
+
+
 def worst(violation, lower, upper, maximiser=None, budget=0):
-    return search_worst(family(violation, lower, upper), DECISION, maximiser, budget, np.random.default_rng(0))
+    return search_worst(family(violation, lower, upper), DECISION, tools(maximiser, budget))
 
 
 HOLDER = 19.208502567886747
@@ -178,6 +185,104 @@ def test_a_polynomial_family_on_the_unit_interval_is_separated_in_a_few_millisec
     seconds = []
     for _ in range(5):
         start = time.perf_counter()
-        search_worst(sine, np.array([0.0, 1.1, -0.3, 0.6, 0.1]), None, 0, np.random.default_rng(0))
+        search_worst(sine, np.array([0.0, 1.1, -0.3, 0.6, 0.1]), tools())
         seconds.append(time.perf_counter() - start)
     assert min(seconds) < 0.02
+
+
+def test_a_decision_gets_as_many_cuts_of_a_row_as_it_has_variables():
+    rows = sr.ConstraintFamily(
+        name="waves",
+        index_set=sr.Box([0.0], [1.0]),
+        rows=lambda t: (np.sin(100 * t)[:, :, np.newaxis] * np.eye(20)[0], np.zeros((len(t), 1))),
+    )
+    found = search_worst(rows, np.eye(20)[0], tools())
+    tops = (np.pi / 2 + 2 * np.pi * np.arange(16)) / 100
+    np.testing.assert_allclose(np.sort(found.indices[found.violations > 0.99, 0]), tops, atol=1e-7)
+
+
+def test_the_highest_of_forty_peaks_of_about_one_height_is_found_though_others_are_higher_on_the_grid():
+    tops = (np.arange(40) + 0.5) / 40
+    heights = np.full(40, 1.0)
+    heights[np.abs(tops * 256 - np.round(tops * 256)).argmax()] += 1e-4
+
+    def peaks(t):
+        nearest = np.minimum((t[:, 0] * 40).astype(int), 39)
+        return heights[nearest] - 1 - (40 * (t[:, 0] - tops[nearest])) ** 2
+
+    found = worst(lambda t: np.where(t[:, 0] < 2, peaks(t), 0.0), [0.0], [1.0])
+    assert abs(found.violations[0] - 1e-4) <= 1e-12
+
+
+def test_peaks_closer_than_the_grid_are_resolved():
+    """A Chebyshev polynomial of degree 80 has four maxima in the last 1.5 % of the interval, where the grid has four
+    points."""
+
+    def chebyshev(t):
+        return np.cos(80 * np.arccos(np.clip(2 * t[:, 0] - 1, -1, 1))) - 1 + 1e-3 * (t[:, 0] > 0.985)
+
+    found = worst(chebyshev, [0.0], [1.0])
+    tops = (1 + np.cos(2 * np.pi * np.arange(4) / 80)) / 2
+    assert sorted(found.indices[found.violations > 0, 0]) == pytest.approx(sorted(tops), abs=1e-6)
+
+
+def test_peaks_of_two_coordinates_closer_than_the_grid_are_resolved():
+    """At a corner, waves run together that a grid of 33 x 33 points resolves everywhere else."""
+
+    def waves(t):
+        return np.cos(34 * t[:, 0] ** 4) + np.cos(34 * t[:, 1] ** 4) - 2 + 1e-3 * (t.min(axis=1) > 0.96)
+
+    found = worst(waves, [0.0, 0.0], [1.0, 1.0])
+    top = (2 * np.pi * 5 / 34) ** (1 / 4)
+    assert abs(found.violations[0] - 1e-3) <= 1e-12
+    np.testing.assert_allclose(found.indices[0], [top, top], atol=1e-6)
+
+
+class Listed(Maximiser):
+    """Evaluates a list of indices, all at once, and then the best one of the list again."""
+
+    def __init__(self, indices):
+        self.indices = np.asarray(indices, dtype=float)
+
+    def search(self, objective, rng):
+        objective.evaluate(self.indices)
+        return np.inf
+
+
+@pytest.mark.parametrize("dimension", [1, 2])
+def test_every_local_maximum_of_what_the_maximiser_evaluated_is_refined(dimension):
+    """Two needles that no grid meets: the one that is lower where it is evaluated is the higher one."""
+    left, right = np.full(dimension, 0.2012345), np.full(dimension, 0.8012345)
+
+    def needles(t):
+        sharp = [height - np.abs(t - at).max(axis=1) / 1e-5 for height, at in ((1.0, left), (2.0, right))]
+        return np.maximum(-1.0, np.maximum(*sharp))
+
+    asked = [left + 1e-6, right + 1.5e-5, np.full(dimension, 0.5)]
+    assert needles(np.array(asked)).argmax() == 0
+    found = worst(needles, np.zeros(dimension), np.ones(dimension), Listed(asked), 3)
+    assert abs(found.violations[0] - 2.0) <= 1e-9
+    assert abs(found.violations - 1.0).min() <= 1e-9
+
+
+def test_what_one_family_violates_spares_the_search_of_the_others():
+    asked = Recording([0.5])
+    violated, kept = family(lambda t: t[:, 0], [0.0], [1.0]), family(lambda t: t[:, 0] - 2, [0.0], [1.0])
+    both = [replace(violated, name="violated"), replace(kept, name="kept")]
+    separate(sr.SemiInfiniteProgram(n=1, families=both), DECISION, tools(asked, 10))
+    assert asked.calls == 0
+    separate(sr.SemiInfiniteProgram(n=1, families=both[1:]), DECISION, tools(asked, 10))
+    assert asked.calls == 1
+
+
+def test_all_peaks_are_refined_in_few_batches():
+    """A round evaluates in batches: as many calls as levels of the grid and steps of the refinement, however many peaks
+    there are."""
+    calls = []
+
+    def waves(t):
+        calls.append(len(t))
+        return np.sin(300 * t[:, 0])
+
+    worst(waves, [0.0], [1.0])
+    assert len(calls) <= 40

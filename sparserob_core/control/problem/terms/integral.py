@@ -10,7 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
-from sparserob_core.control.problem.terms.windows import PathConstraint, Setting, Window, at_corners, coefficients
+from sparserob_core.control.problem.terms.windows import (
+    PathConstraint,
+    Setting,
+    Window,
+    at_corners,
+    coefficients,
+    end_of,
+)
 from sparserob_core.control.term import SAME_TIME, TIME, UNITLESS, measured, over
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box, as_bound
@@ -51,7 +58,7 @@ class IntegralConstraint(Window):
             raise InputError(path=where, expected="rows that integrate something", got=f"zeros in row {empty[0] + 1}")
         lower, upper = _limits(where, self, count)
         horizon, delay = setting.horizon, setting.delay
-        start, stop = float(self.start), horizon if self.stop is None else float(self.stop)
+        start, stop = float(self.start), end_of(self.stop, horizon)
         if not (0.0 <= start < stop - SAME_TIME * horizon and stop <= horizon):
             raise InputError(
                 path=where,

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.control.sets.sets import Equality, Polytope, cylinder, oblique
+from sparserob_core.control.sets.strangers import require_consistent
 from sparserob_core.control.term import SAME_TIME, STATES, TIME, UNITLESS, Term, measured, over, timed
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense
@@ -233,7 +234,7 @@ def placed(term: W, where: str, setting: Setting) -> W:
     """The constraint with its ``stop`` and its reference as numbers; raises `InputError` that begins with ``where``
     for a window that is none."""
     horizon = setting.horizon
-    start, stop = float(term.start), horizon if term.stop is None else float(term.stop)
+    start, stop = float(term.start), end_of(term.stop, horizon)
     if not 0.0 <= start <= stop <= horizon:
         raise InputError(
             path=where,
@@ -253,6 +254,17 @@ def placed(term: W, where: str, setting: Setting) -> W:
             raise InputError(path=f"{where}.relative_to", expected=expected, got=got)
     placed: W = replace(cast("Any", term), **told)
     return placed
+
+
+class UntilHorizon(float):
+    """The horizon as the end of a window that was given none: where the horizon is another one, so is the end."""
+
+    __slots__ = ()
+
+
+def end_of(stop: float | None, horizon: float) -> float:
+    """The end of a window: its ``stop``, and the horizon unless that was given."""
+    return UntilHorizon(horizon) if stop is None or isinstance(stop, UntilHorizon) else float(stop)
 
 
 def columns(rows: Any, count: int) -> Array:
@@ -298,6 +310,7 @@ def checked_set(name: str, value: object, dimension: int, of: str, bounded: bool
         )
     if bounded and not value.is_bounded:
         raise InputError("the set must be bounded", path=name)
+    require_consistent(name, value)
     return value
 
 

@@ -39,6 +39,11 @@ BLUNTEST = 1e-10  # from which on a segment is halved even where that did not he
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
 _KNOWN: WeakKeyDictionary[LinearSystem, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
 FIRST = 8  # segments to begin with
+MOST = 100_000
+"""Segments at most. Ten times as many take an hour and gigabytes; of a tenth systems would be refused that are solved
+in a minute."""
+LOOKED = 256  # segments after which the rest is estimated: a tenth of a second of work; ten times as many are a second
+SAMPLED = 16  # times at which it is; a tenth of them miss where a system is fast, ten times as many take a second
 SWEEPS = 20  # of balancing
 NUMBERS = np.zeros((3, 1), dtype=int)  # the products of polynomials that are numbers
 
@@ -146,46 +151,30 @@ class Expansion:
         units = balanced(A, horizon)
         if spread is not None:  # the same for every coefficient, so that norms are those of a ring
             units = np.tile(balanced(A[: spread.d, : spread.d], horizon), spread.space.size)
-        scale = 1.0 / units[:, None]
-        size = float((np.abs(A) * scale * units).sum(axis=1).max())
+        size = float((np.abs(A) / units[:, None] * units).sum(axis=1).max())
+        look = Look(space, units, size, spread is None)
         todo = [
             (start, stop, np.inf, law)
             for begin, until, law in system.laws
             for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
         ][::-1]
-        ends, found, left, ratios = [0.0], [], [], []
+        ends, found = [0.0], list[Segment]()
         while todo:
             start, stop, before, law = todo.pop()
+            segment = look.at(law, start, stop, before)
             centre = (start + stop) / 2
-            radius = float(np.nextafter(max(stop - centre, centre - start), np.inf))
-            off, here, own, sharp = np.inf, np.inf, np.ones(units.size), False
-            try:
-                parts = law.taylor(space, np.array([centre]), np.array([radius]))
-            except NotEnclosable as error:
-                why = f"has a pole, or is no real number ({error})"
-            else:
-                why = "has a pole, or is too steep to be enclosed"
-                coefficients, rest = np.concatenate(parts[0::2], axis=2), np.concatenate(parts[1::2], axis=1)
-                off, here = _sharpness(coefficients, rest, units, size)
-                here *= stop - start
-                sharp = here <= LONG and (off <= SHARPEST or before / 2 <= off <= BLUNTEST)  # or halving does not help
-                if here > LONG and spread is None:
-                    largest = (np.abs(coefficients).sum(axis=0) + rest)[:, : units.size] * scale * units
-                    if (steady := steadied(largest, stop - start)) is not None:
-                        missed = _lost(coefficients, rest, units * steady, stop - start) * float(steady.max())
-                        own, sharp = steady, missed <= SHARPEST
-            if sharp:
+            if segment.sharp:
                 ends.append(stop)
-                found.append(coefficients)
-                left.append(rest)
-                ratios.append(own)
+                found.append(segment)
+                if len(found) in (LOOKED, MOST):
+                    _require_few(system, look, ends)
             elif stop - start <= SHORTEST * horizon:
-                raise InputError(f"near t = {centre:.9g} the system {why}", path="system")
+                raise InputError(f"near t = {centre:.9g} the system {segment.why}", path="system")
             else:
-                todo += [(centre, stop, off, law), (start, centre, off, law)]
+                todo += [(centre, stop, segment.off, law), (start, centre, segment.off, law)]
         turns = tuple(ends.index(begin) for begin, _ in system.later)
         channels = system.controls, system.disturbances
-        every, lost, owns = (np.array(part) for part in (found, left, ratios))
+        every, lost, owns = (np.array(part) for part in zip(*(one.parts for one in found), strict=True))
         return Expansion(np.array(ends), every, lost, units, owns, channels, turns, spread)
 
     @shaped
@@ -340,22 +329,26 @@ class Expansion:
         A, F = (one.reshape(count, DEGREE + 1, -1, own, one.shape[3]) for one in (A, F))
         size = A.shape[2]
         left, right, target = NUMBERS if self.spread is None else self.spread.space.products
-        factors = [(left[right == b], target[right == b]) for b in range(size)]
+        # the latest term comes first, so that those that meet one another lie side by side
+        every = np.zeros((count, size, own, terms + 2, own))
+        every[:, 0, :, terms + 1] = np.eye(own)
 
-        def times(series: Sequence[Array], n: int, other: Array, there: Sequence[tuple[int, int]]) -> Array:
-            found = np.zeros((count, size, own, other.shape[4]))
-            for k, b in there:
-                if k <= n:
-                    mine, place = factors[b]
-                    found[:, place] += series[n - k][:, mine] @ other[:, k, b, None]
+        def factors(other: Array) -> list[tuple[np.ndarray, np.ndarray, Array]]:
+            there = np.flatnonzero(other.any(axis=(0, 1, 3, 4)))
+            table = other.swapaxes(1, 2).reshape(count, size, 1, (DEGREE + 1) * own, -1)
+            return [(left[right == b], target[right == b], table[:, b]) for b in there]
+
+        def times(n: int, others: list[tuple[np.ndarray, np.ndarray, Array]], columns: int) -> Array:
+            last, found = min(n, DEGREE) + 1, np.zeros((count, size, own, columns))
+            earlier = every[:, :, :, terms + 1 - n : terms + 1 - n + last].reshape(count, size, own, last * own)
+            for mine, place, other in others:
+                found[:, place] += earlier[:, mine] @ other[:, :, : last * own]
             return found
 
-        of_A, of_F = (list(zip(*np.nonzero(one.any(axis=(0, 3, 4))), strict=True)) for one in (A, F))
-        back, found = [np.zeros((count, size, own, own))], []
-        back[0][:, 0] = np.eye(own)
+        of_A, of_F, columns, found = factors(A), factors(F), F.shape[4], []
         for n in range(terms + 1):
-            found.append(times(back, n, F, of_F).reshape(count, size * own, -1))
-            back.append(times(back, n, A, of_A) / (n + 1))
+            found.append(times(n, of_F, columns).reshape(count, size * own, columns))
+            every[:, :, :, terms - n] = times(n, of_A, own) / (n + 1)
         return np.stack(found, axis=1)
 
     def _recentred(self, segments: np.ndarray, times: Array, steps: Array, length: Array) -> tuple[Array, Array]:
@@ -516,6 +509,76 @@ class Expansion:
         """The errors of the flows over all segments, one after another: how much of what is added up to a state at the
         end of the horizon is not resolved."""
         return float(self.flow(self.ends[:-1], self.ends[1:]).error.sum())
+
+
+class Segment(NamedTuple):
+    """A segment of the horizon: whether what a polynomial of the time leaves out of the system there is small enough
+    (``sharp``), else ``why`` a pole may be there; what it leaves out as a share, ``off``; and the ``parts`` of an
+    `Expansion`: coefficients, remainder, ratios."""
+
+    sharp: bool
+    off: float
+    why: str
+    parts: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How a system is looked at on segments: in ``units (d,)``, where its largest matrix has the norm ``size``;
+    ``steadies``: in units of a segment's own, where these help."""
+
+    space: TaylorSpace
+    units: Array
+    size: float
+    steadies: bool
+
+    def at(self, law: LinearSystem, start: float, stop: float, before: float) -> Segment:
+        """The segment from ``start`` to ``stop``; twice as long a one left ``before`` out."""
+        units, centre, own = self.units, (start + stop) / 2, np.ones(self.units.size)
+        radius = float(np.nextafter(max(stop - centre, centre - start), np.inf))
+        try:
+            parts = law.taylor(self.space, np.array([centre]), np.array([radius]))
+        except NotEnclosable as error:
+            return Segment(False, np.inf, f"has a pole, or is no real number ({error})")
+        coefficients, rest = np.concatenate(parts[0::2], axis=2), np.concatenate(parts[1::2], axis=1)
+        off, here = _sharpness(coefficients, rest, units, self.size)
+        here *= stop - start
+        sharp = here <= LONG and (off <= SHARPEST or before / 2 <= off <= BLUNTEST)  # or halving does not help
+        if here > LONG and self.steadies:
+            largest = (np.abs(coefficients).sum(axis=0) + rest)[:, : units.size] / units[:, None] * units
+            if (steady := steadied(largest, stop - start)) is not None:
+                missed = _lost(coefficients, rest, units * steady, stop - start) * float(steady.max())
+                own, sharp = steady, missed <= SHARPEST
+        return Segment(sharp, off, "has a pole, or is too steep to be enclosed", (coefficients, rest, own))
+
+    def length(self, law: LinearSystem, time: float, longest: float, shortest: float) -> float:
+        """About how long a segment around a ``time`` may be, halving after halving of the ``longest``; infinite where
+        even the ``shortest`` is too long: then there is a pole, and not a number of segments."""
+        before = np.inf
+        while longest > shortest:
+            segment = self.at(law, time - longest / 2, time + longest / 2, before)
+            if segment.sharp:
+                return longest
+            before, longest = segment.off, longest / 2
+        return np.inf
+
+
+def _require_few(system: VaryingSystem, look: Look, ends: Sequence[float]) -> None:
+    """Raise `InputError` where the segments between ``ends``, and those that the rest of the horizon takes, are more
+    than can be followed; these are counted by how long some of them are."""
+    done, horizon = ends[-1], system.horizon
+    needed = float(len(ends) - 1)
+    for begin, until, law in system.laws:
+        each = (until - max(begin, done)) / SAMPLED
+        for k in range(SAMPLED if each > 0.0 else 0):
+            time = max(begin, done) + (k + 0.5) * each
+            needed += each / look.length(law, time, each, SHORTEST * horizon)
+    if needed > MOST:
+        raise InputError(
+            f"it changes so fast that it would take some {needed:.1g} segments of the horizon, each a polynomial of the"
+            f" time, and {MOST} can be followed; a shorter horizon takes fewer, or entries without what is so fast",
+            path="system",
+        )
 
 
 @cache

@@ -17,7 +17,7 @@ from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.problem.terms.repeat import widths
-from sparserob_core.control.problem.terms.windows import MixedConstraint
+from sparserob_core.control.problem.terms.windows import MixedConstraint, UntilHorizon
 from sparserob_core.control.problem.tracing import traced
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
 from sparserob_core.control.term import Term
@@ -186,13 +186,16 @@ def _initial_keys(problem: OptimalControlProblem) -> Any:
 
 
 def _term_keys(where: str, term: Term) -> dict[str, Any]:
-    """A key for every field of a term that is told, a set by its kind; a bound that is infinite is none."""
+    """A key for every field of a term that is told, a set by its kind; a bound that is infinite is none, nor is an end
+    that follows the horizon."""
     told = {one.name: value for one in fields(cast("Any", term)) if (value := getattr(term, one.name)) is not None}
     keys: dict[str, Any] = {}
     if isinstance(term, MixedConstraint):
         kept = np.isfinite(np.asarray(term.h))
         keys["mixed"] = {name: _listed(told.pop(name)[kept]) for name in ("H", "G", "h")}
     for name, value in told.items():
+        if isinstance(value, UntilHorizon):
+            continue
         if not isinstance(value, ConvexSet):
             keys[CALLED.get(name, name)] = value if isinstance(value, str) else _listed(value)
         elif name == "set":

@@ -11,12 +11,16 @@ from sparserob_core.control.transcription.rounding import SMALL_GAP, rounded_dow
 from sparserob_core.experiment.assemble import ControlExperiment, counting
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import certificate
+from sparserob_core.experiment.run.conclusion.final_states import with_final_states
+from sparserob_core.sip.evidence import NO_BOUND
 from sparserob_core.sip.inner.solve import ADVICE
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result
 
 SECONDS = 10.0  # for a bound in ball arithmetic
+NO_TIME = "there was no time to see what the multipliers prove without rounding"
 ROUNDING = 1e-12  # of a cost
 CROSSED = (
     "the lower bound {:.12g} that its multipliers prove is above the cost {:.12g} of a decision that was proven, by"
@@ -25,19 +29,34 @@ CROSSED = (
 INWARDS = 1e-13  # of it, so that whoever derives it with another precision does not find less
 
 
-def bounded(experiment: ControlExperiment, result: Result) -> Result:
+def bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -> Result:
     """The same result with a lower bound that its multipliers prove, and with a word on what is not proven of it."""
-    feedback = experiment.transcription.feedback is not None
-    return remarked(experiment.problem, _bounded(experiment, result), feedback)
+    model = experiment.transcription
+    if result.status == "undecided" and not np.isfinite(result.dual.bound):
+        result = replace(result, lower_bound=0.0)  # no term of a cost is negative, and nothing else is proven
+    proven = with_final_states(model, result, experiment.gap_tolerance)
+    return remarked(experiment.problem, _bounded(experiment, proven, deadline), model.feedback is not None)
 
 
-def _bounded(experiment: ControlExperiment, result: Result) -> Result:
+def unbounded(result: Result) -> Result:
+    """The same result where there was no time to see what its multipliers prove: no term of a cost is negative, and
+    nothing else is known from below; that nothing is feasible is not known either."""
+    bare = replace(result, dual=NO_BOUND, lower_bound=0.0)
+    if result.status == "infeasible":
+        return replace(bare, status="undecided", message=NO_TIME, infeasible=None, decision=None)
+    if result.status == "certified":
+        return replace(bare, status="verified", message=f"{result.message}; {NO_TIME}")
+    return bare
+
+
+def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -> Result:
     """The same result with a lower bound that its multipliers prove.
 
     Running bounds of rounding are cheap, but where multipliers are large, as those of nearly parallel rows are, they
     may be all that keeps the gap open. There the bound is derived from the same multipliers in ball arithmetic, which
     leaves out no rounding, in the rows neither. So it is where the worst deviations of a policy are found by support
-    points of sets that are no boxes: what they are off by is in no running bound.
+    points of sets that are no boxes: what they are off by is in no running bound. And beside errors of execution, whose
+    integrals a running bound estimates by shares.
     """
     tolerance = experiment.gap_tolerance
     prices = None if any(counting(experiment.loaded)) else experiment.program.finite.weights
@@ -45,7 +64,7 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
     if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
         return safe
     feedback = experiment.transcription.feedback
-    exact = feedback is None or feedback.loop.spread.is_box
+    exact = experiment.problem.execution is None and (feedback is None or feedback.loop.spread.is_box)
     if exact and safe.gap <= tolerance + SMALL_GAP:
         return safe
     data = certificate(experiment, safe)
@@ -57,7 +76,7 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
 
     given = experiment.problem, experiment.control, experiment.disturbance
     try:
-        case = Case(*given, finite(data), Clock(SECONDS), policy=experiment.transcription.policy)
+        case = Case(*given, finite(data), Clock(deadline.at_most(SECONDS)), policy=experiment.transcription.policy)
         derived = derived_bound(case)
     except (Broken, Unchecked, ZeroDivisionError):
         return safe

@@ -15,6 +15,7 @@ from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import causal_data
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.result import Result
 
@@ -47,7 +48,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
                 return nothing
             tree, grown, none = found
             stated = search.bound(tree, grown, np.inf if none else grown.value, model.problem.disturbance, limits.ended)
-            derived = proven(model, model.problem, stated)
+            derived = proven(model, model.problem, stated, tools.deadline)
             if derived is not None or not stated.outputs:
                 break
     except KeyboardInterrupt as error:
@@ -94,7 +95,9 @@ def searched(
     return CausalSearch(prepare(problem, model.control, pieces, policy=model.answering.policy), None, rests)
 
 
-def proven(model: Transcription, problem: OptimalControlProblem, stated: CausalBound) -> float | None:
+def proven(
+    model: Transcription, problem: OptimalControlProblem, stated: CausalBound, deadline: Deadline | None = None
+) -> float | None:
     """The lower bound of the cost that the multipliers prove, rounded downwards; where none is to exist, by how much
     every policy misses their sum. ``None`` where that is not positive, and where it is not derived."""
     from sparserob_core.checker.claims.case import Case
@@ -103,7 +106,14 @@ def proven(model: Transcription, problem: OptimalControlProblem, stated: CausalB
 
     policy, none = model.answering.policy, stated.lower == np.inf
     try:
-        case = Case(problem, model.control, model.disturbance, {}, Clock(SECONDS), policy=policy)
+        case = Case(
+            problem,
+            model.control,
+            model.disturbance,
+            {},
+            Clock((deadline or Deadline()).at_most(SECONDS)),
+            policy=policy,
+        )
         derived = derived_causal_bound(case, finite(causal_data(stated)), priced=not none)
     except (Broken, Unchecked, ZeroDivisionError):
         return None

@@ -27,7 +27,10 @@ def run(highs: Any) -> None:
     """Solve what a `highspy.Highs` holds. In the main thread a `KeyboardInterrupt`, by a key, a signal or an alarm,
     ends it; where it does not look for that in time, only the end of the process waits for it."""
     if threading.current_thread() is not threading.main_thread():
-        highs.run()
+        # In a new thread all the same: that of the caller may have a scheduler with another number of threads.
+        apart = threading.Thread(target=highs.run, daemon=True)
+        apart.start()
+        apart.join()
         return
     stop, done = threading.Event(), threading.Event()
 

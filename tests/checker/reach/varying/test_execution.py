@@ -13,8 +13,9 @@ from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
 import sparserob_core.checker.reach.varying.flow as varying
+from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.measurable import Execution, Side
+from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.control.problem.system import VaryingSystem

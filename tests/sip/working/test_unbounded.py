@@ -1,0 +1,67 @@
+"""Guards sip/working/unbounded: programs with free variables get the rows that bound them, the dear way only where the
+cheap one does not do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.sip.working import unbounded
+from tests.support.oscillating import PROGRAMS
+
+
+def test_a_few_rows_of_every_family_bound_a_filter_so_that_no_direction_is_looked_for(monkeypatch):
+    def dear(*arguments):
+        raise AssertionError("a recession program was solved")
+
+    monkeypatch.setattr(unbounded, "bounding_rows", dear)
+    result = sr.solve(PROGRAMS["filter, half"]())
+    assert abs(result.cost - 0.0087149597) <= 1e-8
+    assert abs(result.cost - result.lower_bound) <= 1e-8
+
+
+def test_the_first_rows_are_as_many_as_the_decision_has_variables_and_one_more_in_every_family():
+    def rows(t):
+        return np.ones((len(t), 2, 7)), np.ones((len(t), 2))
+
+    families = [
+        sr.ConstraintFamily(name="line", index_set=sr.Box([-1.0], [3.0]), rows=rows),
+        sr.ConstraintFamily(name="plane", index_set=sr.Box([0.0, 5.0, 1.0], [1.0, 5.0, 2.0]), rows=rows),
+        sr.ConstraintFamily(name="point", index_set=sr.Box([2.0], [2.0]), rows=rows),
+    ]
+    line, plane, point = unbounded.first_rows(sr.SemiInfiniteProgram(n=7, families=families))
+    assert [name for _, _, name in (line, plane, point)] == ["line", "plane", "point"]
+    assert len(np.unique(line[0])) == 8
+    assert {-1.0, 3.0} <= set(line[0][:, 0])
+    assert len(np.unique(plane[0], axis=0)) == 9
+    assert (plane[0][:, 1] == 5.0).all()
+    assert point[0].tolist() == [[2.0], [2.0]]
+    assert all(np.bincount(rows).tolist() == [len(rows) // 2] * 2 for _, rows, _ in (line, plane, point))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("strike", "published"), [(30, 21.51), (40, 13.20), (50, 7.30)])
+def test_the_price_of_an_option_on_the_largest_of_three_is_bounded_from_its_moments(strike, published):
+    """Boyle and Lin (1997): the least mean of a quadratic that is above the payoff; the first rows bound it not."""
+    mean, variance, covariance = 44.21, 184.04, 164.88
+    square, product = variance + mean**2, covariance + mean**2
+    moments = np.array([square, product, product, square, product, square, mean, mean, mean, 1.0])
+
+    def monomials(s):
+        x, y, z = s.T
+        return np.stack([x * x, x * y, x * z, y * y, y * z, z * z, x, y, z, np.ones_like(x)], axis=-1)
+
+    def above(asset):
+        return lambda s: (
+            -monomials(s)[:, np.newaxis],
+            (np.zeros(len(s)) if asset is None else strike - s[:, asset])[:, np.newaxis],
+        )
+
+    families = [
+        sr.ConstraintFamily(name=str(asset), index_set=sr.Box([-400.0] * 3, [400.0] * 3), rows=above(asset))
+        for asset in (None, 0, 1, 2)
+    ]
+    result = sr.solve(sr.SemiInfiniteProgram(n=10, q=moments, families=families))
+    assert abs(result.cost - published) <= 0.005
+    assert abs(result.cost - result.lower_bound) <= 1e-6
