@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shutil
 import socket
 import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -244,6 +246,23 @@ def test_the_chunks_of_a_recording_are_as_few_as_the_format_wants_and_nothing_is
     assert [path.name for path in tmp_path.iterdir()] == ["x.rrd"]
     for one, other in zip(scalars(before, "evaluation"), scalars(after, "evaluation"), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.first(1)
+@pytest.mark.parametrize("before", ["import rerun", ""])
+def test_a_recorder_writes_nothing_to_the_terminal(before: str, tmp_path: Path) -> None:
+    """Whether or not the run's own process has imported the viewer's library, which then logs as it does by itself."""
+    config = str(CONFIGS / "double_integrator.yaml")
+    recording = {**QUICK, "observers": [{**SMALL, "save": str(tmp_path / "x.rrd")}]}
+    program = (
+        f"{before}\nimport sparserob_core as sr\nsr.run({config!r}, {recording!r}, 'run', quiet=True, figures=False)"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "RUST_LOG"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert (done.stdout, done.stderr) == ("", "")
+    assert len(read(tmp_path / "x.rrd")["/rounds/bounds"]) == 1  # its chunks were joined
 
 
 def test_the_last_page_and_the_log_tell_the_verdict(exchanged: sr.Outcome) -> None:

@@ -24,7 +24,6 @@ STARTING = 15.0  # seconds that a viewer may take until it listens
 JOINING = 20.0
 """Seconds that the chunks of a finished recording may be joined for. Ten times as many, and a run waits for a large
 file; with a tenth a busy machine leaves it four times as large."""
-PASSES = 50  # over the chunks, at most: they end where nothing is left to be joined
 MEMORY = "25%"  # of the machine's, for a viewer that is started
 
 
@@ -144,9 +143,9 @@ def sinks_of(rr: Any, chosen: Destinations, started: Started) -> tuple[list[Any]
 
 def compact(file: Path, arrangement: Any) -> None:
     """Join what is in a finished recording to chunks as large as the format wants, with its last ``arrangement`` (a
-    blueprint) only: live, each is as small as what has happened in a moment. Where that cannot be done, the recording
-    stays as it is."""
-    from rerun.chunk import OptimizationProfile, RrdReader
+    blueprint) only: live, each is as small as what has happened in a moment. A process of its own joins them, for the
+    library logs to the terminal while it does. Where that cannot be done, the recording stays as it is."""
+    from rerun.chunk import RrdReader
 
     if not file.is_file():
         return
@@ -155,11 +154,10 @@ def compact(file: Path, arrangement: Any) -> None:
     try:
         reader = RrdReader(str(file))
         (store,) = reader.recordings()
-        name, profile = store.application_id, OptimizationProfile(extra_passes=PASSES)
-        found = reader.stream(store=store).collect(optimize=profile)
-        found.write_rrd(chunks, application_id=name, recording_id=store.recording_id)
+        name = store.application_id
+        reader.stream(store=store).write_rrd(chunks, application_id=name, recording_id=store.recording_id)
         arrangement.save(name, screen)
-        command = [str(viewer()), "rrd", "merge", str(chunks), str(screen), "-o", str(joined)]
+        command = [str(viewer()), "rrd", "optimize", "--profile", "live", str(chunks), str(screen), "-o", str(joined)]
         subprocess.run(command, check=True, timeout=JOINING, capture_output=True, stdin=subprocess.DEVNULL)
         joined.replace(file)
     except Exception:  # a large recording is better than none
