@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections import defaultdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -59,16 +60,16 @@ def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
 
 def line_of(chunks: list[Any], trace: sr.SearchTrace) -> np.ndarray:
     """What a line over the evaluations shows at each of them, whose corners are recorded; NaN where there is none. No
-    line goes from one search to the next."""
+    line goes across a NaN, nor from one search to the next, nor beyond what is recorded."""
     at, values = scalars(chunks, "evaluation")
-    shown = np.full(trace.value.size, np.nan)
-    for outer in np.unique(trace.outer):
-        mine = np.flatnonzero(trace.outer == outer)
-        inside = (at > mine[0]) & (at <= mine[-1] + 1) & np.isfinite(values[:, 0])
-        if inside.any():
-            shown[mine] = np.interp(mine + 1, at[inside], values[inside, 0], left=np.nan)
-        if mine[0]:
-            assert np.isnan(values[at == mine[0], 0]).any()
+    known, numbers = np.isfinite(values[:, 0]), np.arange(trace.value.size) + 1
+    corners, ends = at[known], at[~known]
+    broken = np.array([((ends >= a) & (ends < b)).any() for a, b in pairwise(corners)] + [True])
+    leg = np.searchsorted(corners, numbers, side="right") - 1
+    shown = np.interp(numbers, corners, values[known, 0], left=np.nan)
+    shown[(leg < 0) | (broken[leg] & (corners[leg] != numbers))] = np.nan
+    for base in np.flatnonzero(np.diff(trace.outer)) + 1:
+        assert (ends == base).any()
     return shown
 
 

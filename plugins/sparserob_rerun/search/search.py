@@ -100,10 +100,10 @@ class SearchView:
             ("best", best, _corners(best)),
             ("bound", np.full(count, event.lower_bound), np.array([0, count - 1] if count > 1 else [0])),
         ):
-            if np.isfinite(values).any():
-                self._line(f"search/g/{name}", *SERIES[name])
-                rows = self.rr.Scalars.columns(scalars=_shown(values[which]))
-                self.stream.send_columns(f"search/g/{name}", at(which), rows)
+            path = f"search/g/{name}"
+            if path in self.known or np.isfinite(values).any():  # that a line is interrupted has to be sent as well
+                self._line(path, *SERIES[name])
+                self.stream.send_columns(path, at(which), self.rr.Scalars.columns(scalars=_shown(values[which])))
         self._notes(event, stage, numbers, began)
         self._moves(event, stage, numbers, began, moving, projection.moves)
         self.timelines.move(stage.base + event.total, event.round, began + event.seconds)
@@ -242,11 +242,14 @@ def _few(moves: np.ndarray) -> np.ndarray:
 
 def _corners(values: Floats) -> np.ndarray:
     """Which of the values ``(k,)`` of a batch a line needs: the first, the last, and those that are not between their
-    neighbours on a straight line."""
-    bends = np.abs(np.diff(values, 2))
-    scale = np.nanmax(np.abs(values)) if np.isfinite(values).any() else 1.0
-    kept = np.flatnonzero(~(bends <= STRAIGHT * scale)) + 1  # NaN, and what is beside it, stays
-    return np.unique(np.concatenate([[0], kept, [values.size - 1]]))
+    neighbours on a straight line; of several in a row that are not finite the first."""
+    shown = _shown(values)
+    bends, finite = np.abs(np.diff(shown, 2)), np.isfinite(shown)
+    scale = np.max(np.abs(shown[finite]), initial=0.0)
+    kept = np.ones(values.size, dtype=bool)
+    kept[1:-1] = ~(bends <= STRAIGHT * scale)  # what is beside a gap stays
+    kept[1:] &= finite[1:] | finite[:-1]
+    return np.flatnonzero(kept)
 
 
 def _shown(values: Floats) -> Floats:
