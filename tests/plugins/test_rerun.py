@@ -189,6 +189,9 @@ def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.Fi
         )
         assert rows > 1 and first < outcome.result.trace.value.size
     assert texts(found["/state"], "StateChange:state")[-1] == outcome.result.status
+    for path in ("/landscape/words", "/verdict", "/decisions", "/state"):  # from the beginning on
+        records = [chunk.to_record_batch() for chunk in found[path]]
+        assert min(np.asarray(one.column("time")).astype(np.int64).min() for one in records) == 0
 
 
 def test_a_recording_has_a_name_and_says_of_what_it_is_and_how_it_ended(exchanged: sr.Outcome) -> None:

@@ -81,7 +81,9 @@ class Recorder:
 
     def __init__(self, rr: Any, stream: Any, opening: Opening, shown: Shown, inspection: sr.Inspection | None) -> None:
         self.rr, self.stream, self.opening, self.inspection = rr, stream, opening, inspection
-        self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
+        self.timelines = Timelines(rr, stream)
+        self.timelines.move()  # what is logged before is on no timeline
+        self.rounds = Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
         self.physics = (
             Physics(rr, stream, inspection, shown.searches) if inspection is not None and problem is not None else None
@@ -105,7 +107,6 @@ class Recorder:
         self.proofs: dict[str, int] = {}
         self.broken: dict[str, str] = {}
         self.drawn, self.said = False, deque[str](maxlen=LINES)
-        self.timelines.move()
         self.waiting = Waiting(rr, stream, shown)
         self.state = ""
         names, colours = list(words.STATES), [list(colour) for colour in words.STATES.values()]

@@ -75,7 +75,7 @@ def series(
 
     everything = rrb.TimeRangeBoundary.infinite()
     start, end = evaluations or (everything, everything)
-    whole = start.kind != "cursor_relative"  # a range about the cursor is none of another timeline
+    whole = evaluations is None  # a range of evaluations is none of another timeline
     shown = [rrb.VisibleTimeRange("evaluation", start=start, end=end)] if evaluations else None
     return rrb.TimeSeriesView(
         origin=origin,
