@@ -251,6 +251,25 @@ def test_what_the_map_shows_is_said_beside_it_and_only_when_it_changes() -> None
     assert len(written) == 3 and written[2].endswith("pink: proven")
 
 
+@pytest.mark.parametrize(
+    ("value", "last", "marked"), [(0.5 - 1e-7, False, True), (0.4, False, False), (0.4, True, True)]
+)
+def test_the_optimum_is_marked_on_a_map_through_it_or_through_a_tuple_whose_value_is_the_same_to_the_eye(
+    value: float, last: bool, marked: bool
+) -> None:
+    from sparserob_rerun.recording.recorder import Recorder
+
+    landscape, told = SimpleNamespace(value=value, epsilon=0.0), list[str]()
+    recorder: Any = SimpleNamespace(
+        terrain=SimpleNamespace(known=landscape, mark=None),
+        explorer=SimpleNamespace(landscape=landscape if last else None),
+        exact=0.5,
+        draw=lambda panel, task, words: told.append(words),
+    )
+    Recorder.mark(recorder)
+    assert told == ["proven to be the highest: 0.5"] * marked
+
+
 @pytest.mark.parametrize("value", [0.0, 0.4, 1.0])
 def test_the_value_of_the_best_point_is_above_the_whole_surface_and_no_line_crosses_it(value: float) -> None:
     import rerun as rr

@@ -25,7 +25,7 @@ from sparserob_rerun.recording.waiting import BOUNDS, CLASH, CONTROL, LANDSCAPE,
 from sparserob_rerun.search.explorer import Aim, Explorer
 from sparserob_rerun.search.projection import Projector
 from sparserob_rerun.search.search import SearchView
-from sparserob_rerun.search.terrain import Terrain
+from sparserob_rerun.search.terrain import VISIBLE, Terrain
 from sparserob_rerun.search.way import Stage
 
 SEEN = 10  # evaluations between two pictures of the way
@@ -184,9 +184,13 @@ class Recorder:
             self.stream.log("decisions", self.rr.TextDocument("\n".join(self.said)))
 
     def mark(self) -> None:
-        """Mark on the last landscape where the maximum is, if it was proven."""
+        """Mark on the last landscape where the maximum is, if it was proven and the landscape goes through it, or
+        through a tuple whose value is the same to the eye."""
         landscape = self.terrain.known
-        if landscape is not None and self.exact is not None and self.explorer.landscape is landscape:
+        if landscape is None or self.exact is None:
+            return
+        same = abs(landscape.value - self.exact) <= VISIBLE * max(1.0, abs(self.exact))
+        if same or self.explorer.landscape is landscape:
             share = ", with the regulariser's share" if landscape.epsilon > 0.0 else ""
             self.draw(LANDSCAPE, self.terrain.mark, f"proven to be the highest: {self.exact:.6g}{share}")
 
