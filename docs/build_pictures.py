@@ -28,7 +28,11 @@ STARTING, LOADING, DRAWING = 30.0, 9.0, 4.0  # seconds
 TRIES = 5  # of a picture, for each of which the viewer has a quarter of a minute
 
 EXCHANGE = ["watch", "configs/experiment1_repaired.yaml"]
-SEARCH = ["watch", "configs/experiment1_literal.yaml", "maximiser.budget=2500"]
+SEARCH = [  # what `make live` shows
+    *("watch", "configs/experiment1_reduced.yaml", "maximiser.name=simulated_annealing", "maximiser.budget=1500"),
+    *("maximiser.cooling_range=1e-3", "maximiser.polish=0.2", "method.sc2=null", "method.indices=20"),
+    "continuation.stop=1e-6",
+]
 FEEDBACK = ["watch", "configs/experiment1_feedback.yaml"]
 INFEASIBLE = ["watch", "configs/experiment2_repaired.yaml", "problem.path.0.from=1.0"]
 STUDY = ["sweep", "configs/double_integrator.yaml", "problem.horizon=3:6:7", "problem.control.box=0.6:1.6:6"]

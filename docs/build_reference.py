@@ -11,6 +11,8 @@ import click
 
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import commands
+from sparserob_core.experiment.config.extending import EXTENDS
+from sparserob_core.experiment.config.extending import MEANING as MEANS
 from sparserob_core.experiment.config.option_rows import option_rows
 from sparserob_core.experiment.config.run_config import RunConfig
 from sparserob_core.experiment.config.schema import config_schema
@@ -139,6 +141,7 @@ def _config() -> list[str]:
     for name, field in RunConfig.model_fields.items():
         default = "required" if field.is_required() else f"`{json.dumps(defaults[name])}`"
         rows.append((f"`{name}`", default, meanings(RunConfig)[name]))
+    rows.insert(0, (f"`{EXTENDS}`", "none", MEANS))
     return [
         "## Keys of a config",
         "",
@@ -146,7 +149,7 @@ def _config() -> list[str]:
         "",
         (
             "A component is written as a mapping with its `name` and its options, or as its bare name. `maximiser` also"
-            " takes `budget`."
+            " takes `budget`. Instead of `problem`, a config may name another one that it `extends`."
         ),
     ]
 

@@ -12,7 +12,7 @@ class LandscapeOptions(sr.Options):
 
     coordinates: tuple[str, str] | None = None
     """Two coordinates, such as [t, p1] of the index that decides most, or [t, p1[2]] for a time of it and a parameter
-    of the one that decides second; null: the times of these two."""
+    of the one that decides second; null: the two along which g moves most."""
 
     grid: int = Field(default=32, ge=8, le=256)
     """Points along each of the two."""
@@ -25,5 +25,4 @@ class LandscapeOptions(sr.Options):
     weight epsilon."""
 
     patience: float = Field(default=2.0, ge=0.0, le=600.0)
-    """Seconds that a short run waits for its landscape at its end; half of the run's own time is taken off once
-    something is drawn."""
+    """Seconds that a run waits at its end for the landscape of its last tuple."""

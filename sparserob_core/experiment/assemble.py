@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -139,6 +141,16 @@ LATE = (
 )
 
 
+@contextmanager
+def transcribed_by(deadline: Deadline) -> Iterator[None]:
+    """Raise `TimeLimitError` where what is transcribed inside is not done by the ``deadline``."""
+    try:
+        with deadline.enforced():
+            yield
+    except OutOfTime as late:
+        raise TimeLimitError(LATE.format(late)) from late
+
+
 def assemble(loaded: Loaded, deadline: Deadline | None = None) -> Experiment:
     """Build what a checked config describes, and its program; raises `ConfigError` with the place of the key at fault,
     and `TimeLimitError` when that is not done by the ``deadline``."""
@@ -150,11 +162,8 @@ def assemble(loaded: Loaded, deadline: Deadline | None = None) -> Experiment:
 
 def assemble_in_time(loaded: Loaded, deadline: Deadline) -> Experiment:
     """`assemble`, or an `UntranscribedExperiment` of a control problem that is not transcribed by the ``deadline``."""
-    try:
-        with deadline.enforced():
-            problem = problem_of(loaded)
-    except OutOfTime as error:
-        raise TimeLimitError(LATE.format(error)) from error
+    with transcribed_by(deadline):
+        problem = problem_of(loaded)
     if isinstance(problem, SemiInfiniteProgram):
         return PlainExperiment(loaded, problem)
     try:

@@ -14,7 +14,7 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
-from sparserob_core.experiment.config.reader import read_source
+from sparserob_core.experiment.config.reading.reader import read_source
 from tests.known_answers.test_checks import pieces, verified
 from tests.support import tampering
 from tests.support.places import CONFIGS

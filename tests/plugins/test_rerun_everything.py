@@ -49,7 +49,7 @@ def told(file: Path, outcome: sr.Outcome) -> None:
     assert len([line for line in log if line.startswith("no landscape: ")]) <= 1
     trace = outcome.result.trace
     if trace is not None and np.isfinite(trace.value).any():
-        assert {"/search/g/best", "/search/stages/best"} <= set(found)
+        assert {"/search/g/best"} <= set(found)
 
 
 @pytest.fixture(autouse=True)

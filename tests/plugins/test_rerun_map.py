@@ -160,17 +160,114 @@ def test_of_the_moves_of_a_walk_those_are_told_that_changed_g() -> None:
     assert shares == {"1": [1.0, 0.5], "3": [1.0, 0.5]}
 
 
-def test_beside_a_literal_tuple_it_is_said_how_far_below_the_map_it_is() -> None:
+def test_beside_a_literal_tuple_it_is_said_how_far_below_the_map_it_is_and_what_the_map_shows_instead() -> None:
     from sparserob_rerun.search.explorer import Aim
     from sparserob_rerun.search.terrain import _own
 
     landscape: Any = SimpleNamespace(value=0.632, level=1)
     aim = Aim(np.zeros((2, 1)), 0.1, 0.482, "")
-    assert _own(landscape, aim) == [
-        "orange: the best tuple, g = 0.632 on the map",
-        "its own g is 0.482, 0.15 below the map",
-    ]
-    assert _own(landscape, replace(aim, value=0.632)) == ["orange: the best tuple, g = 0.632"]
+    here, own = _own(landscape, aim)
+    assert "g = 0.632 on the map, where the disturbances of these two indices are the worst" in here
+    assert "g is 0.482, 0.15 below the map" in own
+    assert _own(landscape, replace(aim, value=0.632)) == ["orange dot: the best tuple, g = 0.632"]
+
+
+class Kept:
+    """A stream that keeps the last of what was logged for every entity, by the kind of it."""
+
+    def __init__(self) -> None:
+        self.last = dict[str, dict[str, Any]]()
+
+    def log(self, path: str, *parts: Any, **_: Any) -> None:
+        self.last[path] = {type(part).__name__: part for part in parts}
+
+    def image(self, path: str) -> np.ndarray:
+        image = self.last[path]["DepthImage"]
+        fmt = image.format.as_arrow_array().to_pylist()[0]
+        data = np.array(image.buffer.as_arrow_array().to_pylist()[0], dtype=np.uint8).view(np.float32)
+        return data.reshape(fmt["height"], fmt["width"])
+
+
+def test_the_map_is_numbers_with_g_under_the_cursor_and_a_colour_bar_of_its_values() -> None:
+    import rerun as rr
+
+    from sparserob_rerun.drawing.canvas import LIFT
+    from sparserob_rerun.search.explorer import Aim
+    from sparserob_rerun.search.terrain import CELLS, HEIGHT, WIDTH, Terrain
+
+    g = plain(lambda s: np.inf if s.max() > 0.8 else s[0, 0] + s[1, 0], ("time",))
+    found, _ = drawn_of(g, [[0.2], [0.7]])
+    stream, aim = Kept(), Aim(found[-1][0].anchor, 0.1, found[-1][0].value, "through it")
+    terrain = Terrain(rr, stream, "s", "m/s")
+    terrain.surface(found[-1][0], aim)
+    image, middles = stream.image("landscape/map/g"), (np.arange(CELLS) + 0.5) / CELLS
+    assert image.shape == (CELLS, CELLS) == (33, 33)
+    across, up = np.meshgrid(middles, middles[::-1])  # the highest time is at the top
+    known = (across < 0.7) & (up < 0.7)
+    np.testing.assert_allclose(image[known], (across + up)[known], rtol=1e-6)
+    assert np.isnan(image[(across > 0.9) | (up > 0.9)]).all()
+    brown = stream.last["landscape/map/infeasible"]
+    assert set(brown) == {"Transform3D", "Image"}
+    scale = stream.last["landscape/map/g"]["Transform3D"].scale.as_arrow_array().to_pylist()[0]
+    np.testing.assert_allclose(scale, [WIDTH / CELLS, HEIGHT / CELLS, 1.0], rtol=1e-6)
+    bar = stream.image("landscape/map/bar")[:, 0]
+    low, high = terrain.scale
+    assert (np.diff(bar) < 0).all() and low < bar[-1] < bar[0] < high
+    assert bar[0] - bar[-1] == pytest.approx((high - low) * (1.0 - 1.0 / bar.size), rel=1e-5)
+    for path in ("landscape/map/g", "landscape/map/bar"):  # the same colours for the same numbers
+        limits = stream.last[path]["DepthImage"].depth_range.as_arrow_array().to_pylist()[0]
+        assert limits == pytest.approx([low, high])
+    axes = stream.last["landscape/map/axes/labels"]["Points2D"]
+    labels = list(
+        zip(axes.labels.as_arrow_array().to_pylist(), axes.positions.as_arrow_array().to_pylist(), strict=True)
+    )
+    beside = [(float(words), at[1] + LIFT) for words, at in labels if at[0] > WIDTH and words[0].isdigit()]
+    assert "g in m/s" in [words for words, _ in labels] and len(beside) >= 2
+    for value, y in beside:
+        assert y == pytest.approx(HEIGHT * (high - value) / (high - low))
+
+
+def test_what_the_map_shows_is_said_beside_it_and_only_when_it_changes() -> None:
+    import rerun as rr
+
+    from sparserob_rerun.search.explorer import Aim
+    from sparserob_rerun.search.terrain import Terrain
+
+    written: list[str] = []
+
+    class Told(Kept):
+        def log(self, path: str, *parts: Any, **_: Any) -> None:
+            if path == "landscape/words":
+                written.append(parts[0].text.as_arrow_array().to_pylist()[0])
+
+    found, _ = drawn_of(plain(lambda s: s[0, 0] + s[1, 0], ("time",)), [[0.2], [0.7]])
+    terrain = Terrain(rr, Told())
+    assert len(written) == 1 and "least cost of a control" in written[0]
+    aim = Aim(found[-1][0].anchor, 0.1, found[-1][0].value, "through it")
+    terrain.surface(found[-1][0], aim)
+    terrain.surface(found[-1][0], aim)
+    assert len(written) == 2 and "g from 0 (dark) to 2 (bright)" in written[1] and "through it" in written[1]
+    terrain.mark("proven")
+    assert len(written) == 3 and written[2].endswith("pink: proven")
+
+
+@pytest.mark.parametrize(
+    ("value", "last", "marked"), [(0.5 - 1e-7, False, True), (0.4, False, False), (0.4, True, True)]
+)
+def test_the_optimum_is_marked_on_a_map_through_it_or_through_a_tuple_whose_value_is_the_same_to_the_eye(
+    value: float, last: bool, marked: bool
+) -> None:
+    from sparserob_rerun.recording.recorder import Recorder
+
+    landscape, told = SimpleNamespace(value=value, epsilon=0.0), list[str]()
+    recorder: Any = SimpleNamespace(
+        terrain=SimpleNamespace(known=landscape, mark=None),
+        explorer=SimpleNamespace(landscape=landscape if last else None),
+        exact=0.5,
+        draw=lambda panel, task, words: told.append(words),
+    )
+    Recorder.mark(recorder)
+    assert told == ["proven to be the highest: 0.5"] * marked
 
 
 @pytest.mark.parametrize("value", [0.0, 0.4, 1.0])
@@ -196,21 +293,6 @@ def test_the_value_of_the_best_point_is_above_the_whole_surface_and_no_line_cros
     assert foot[2] == pytest.approx(value, abs=0.02) and end[2] == pytest.approx(place[2] - WORDS)
 
 
-def test_a_curve_of_many_values_keeps_the_lowest_and_the_highest_of_every_stretch() -> None:
-    from sparserob_rerun.search.climb import CORNERS, _corners
-
-    values = np.random.default_rng(0).random(10 * CORNERS + 3)
-    values[[5000, 4711]], values[:40], values[777] = (2.0, -1.0), np.nan, np.inf
-    kept = _corners(values)
-    assert kept.size <= 2 * CORNERS + 2 and (np.diff(kept) > 0).all() and {5000, 4711, 0, values.size - 1} <= set(kept)
-    assert 777 not in kept
-    stretch, finite = np.arange(values.size) * CORNERS // values.size, np.isfinite(values)
-    for part in range(4, CORNERS, 50):
-        mine = np.flatnonzero((stretch == part) & finite)
-        assert {mine[values[mine].argmin()], mine[values[mine].argmax()]} <= set(kept)
-    assert _corners(np.full(4 * CORNERS, np.nan)).tolist() == [0, 4 * CORNERS - 1]
-
-
 def test_an_index_beside_the_first_is_not_the_second() -> None:
     from sparserob_core.experiment.run.landscape import two_of
 
@@ -234,64 +316,6 @@ def test_the_pairs_of_many_tuples_are_those_of_one_after_the_other() -> None:
     assert sr.deciding_slots(deciding, tuples, widths, (1, 3)).tolist() == [list(pair) for pair in alone]
     one, none = np.zeros((2, 1, 2)), np.array([[0, -1, -1, -1], [-1, -1, -1, -1]])
     assert sr.deciding_slots(none, one, widths, (0, 0)).tolist() == [[0, 0], [0, 0]]
-
-
-def test_in_a_narrow_panel_of_the_climb_what_is_proven_far_below_is_said_below_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    from unittest.mock import MagicMock
-
-    from sparserob_rerun.search import climb
-    from sparserob_rerun.search.way import Stage
-
-    drawn: list[climb.Drawing] = []
-    monkeypatch.setattr(climb.Drawing, "log", lambda self, *rest, **more: drawn.append(self))
-    stages = [Stage(number, 0.1, 10 * number) for number in range(6)]
-    for stage in stages:
-        stage.values, stage.lower_bound = np.linspace(1.0, 2.0, 10), -50.0
-    climb.Climb(MagicMock(), MagicMock()).draw(stages)
-    below = sorted((at[1], at[0], words) for at, words, _ in drawn[0].labels if at[1] > climb.HEIGHT)
-    assert [words for *_, words in below if "proven" in words] == ["proven ≥ -50"] * climb.MOST
-    assert below[-1][2] == "2 earlier searches are not shown" and below[-1][0] < climb.EXTENT[3]
-    assert np.unique(np.diff([y for y, *_ in below])).tolist() == [0.0, climb.LINE]  # three lines, none on another
-
-
-def test_beside_the_climb_there_are_two_numbers_at_least_that_lie_on_no_other() -> None:
-    from sparserob_rerun.drawing.canvas import Axes
-    from sparserob_rerun.search import climb
-
-    for low in np.linspace(-1.0, 1.0, 101):
-        for span in (0.0013, 0.0226, 0.225, 0.41, 7.7):
-            axes = Axes(0.0, 0.0, 500.0, climb.HEIGHT, (0.0, 1.0), (low, low + span))
-            drawing = climb.Drawing()
-            climb._frame(drawing, axes, SimpleNamespace(epsilon=0.1), low)  # type: ignore[arg-type]
-            heights = sorted(at[1] for at, *_ in drawing.labels if at[0] < 0.0)
-            assert len(heights) >= 2 and min(np.diff(heights)) >= climb.LINE - 1e-9
-
-
-def test_a_panel_of_the_climb_has_all_of_a_climb_and_no_number_on_that_of_its_neighbour(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    from unittest.mock import MagicMock
-
-    from sparserob_rerun.search import climb
-    from sparserob_rerun.search.way import Stage
-
-    drawn: list[climb.Drawing] = []
-    monkeypatch.setattr(climb.Drawing, "log", lambda self, *rest, **more: drawn.append(self))
-    for low in np.linspace(0.3, 0.9, 16):
-        stages = [Stage(number, 0.1, 2000 * number) for number in range(climb.MOST)]
-        for stage in stages:
-            stage.values = np.linspace(low, 1.27, 2000)  # it gains at every other step, and no walk is told of
-            stage.values[1::2] -= 0.05
-        climb.Climb(MagicMock(), MagicMock()).draw(stages)
-        heights = drawn[-1].strips["best"][0][0][:, 1]
-        assert np.mean(heights >= climb.HEIGHT - 1e-9) <= 0.06  # it lies on the axis for a twentieth at most
-        places = np.array([at for at, *_ in drawn[-1].labels])
-        near = (np.abs(places[:, None] - places[None]) < [60.0, climb.LINE - 1e-9]).all(axis=2)
-        assert not near[~np.eye(len(places), dtype=bool)].any()
-        left = [words for at, words, _ in drawn[-1].labels if at[0] < 0.0]
-        assert len(left) >= 2  # one number is no scale
 
 
 def test_words_are_bright_and_lines_of_plots_legible_on_a_dark_and_on_a_light_ground() -> None:
@@ -367,6 +391,84 @@ def test_a_value_of_a_policy_is_computed_in_the_programs_own_units_and_given_up_
     everywhere = slots.copy()
     everywhere[:, 1:] = np.nan  # at all deviations, for which a solver needs some hundred steps
     assert np.isnan(g.at(everywhere))
+
+
+def drawn_of(g: Any, *tuples: list[list[float]]) -> tuple[list[tuple[sr.Landscape, Any]], Any]:
+    """What an explorer draws of tuples that it is asked for one after the other, each to its end."""
+    from sparserob_rerun.options import LandscapeOptions
+    from sparserob_rerun.search.explorer import Aim, Explorer
+
+    found: list[tuple[sr.Landscape, Any]] = []
+    view: Any = SimpleNamespace(relaxed_value=lambda count, epsilon: g)
+    explorer = Explorer(lambda shown, aim: found.append((shown, aim)), view, LandscapeOptions(grid=8))
+    for number, slots in enumerate(tuples):
+        explorer.aim(Aim(np.array(slots), 0.1, float(number), ""))
+        explorer.finish(60.0)
+    return found, explorer
+
+
+def plain(value: Callable[[np.ndarray], float], kinds: tuple[str, ...], moves: tuple[int, ...] | None = None) -> Any:
+    """A function of tuples in the place of ``g``."""
+    width = len(kinds)
+    g: Any = SimpleNamespace(at=value, slot=sr.Box(np.zeros(width), np.ones(width)), kinds=kinds, interchangeable=True)
+    g.names = tuple(f"{kind[0]}{k}" for k, kind in enumerate(kinds))
+    g.coordinates = tuple(range(width)) if moves is None else moves
+    g.deciding = lambda: np.array([0, 1, -1, -1])
+    return g
+
+
+KINDS = ("time", "parameter", "parameter")
+
+
+@pytest.mark.parametrize(
+    ("value", "axes"),
+    [
+        (lambda s: s[0, 0] + 9 * s[0, 1] + 5 * s[1, 2], ((0, 1), (1, 2))),
+        (lambda s: 3 * s[0, 0] + 2 * s[1, 0] + s[0, 1], ((0, 0), (1, 0))),
+        (lambda s: np.inf if s[0, 2] > 0.9 else 4 * s[1, 0], ((1, 0), (0, 2))),
+        (lambda s: -abs(s[0, 1] - 0.5) - abs(s[0, 2] - 0.4) + 0.1 * s[0, 0], ((0, 1), (0, 2))),
+        (lambda s: 1.0, ((0, 0), (1, 0))),
+    ],
+)
+def test_axes_are_the_coordinates_along_which_g_moves_most(value: Any, axes: tuple[tuple[int, int], ...]) -> None:
+    found, _ = drawn_of(plain(value, KINDS), [[0.2, 0.5, 0.5], [0.7, 0.5, 0.5]])
+    landscape = found[-1][0]
+    assert (landscape.first, landscape.second) == axes and landscape.level == 1
+    low, high = landscape.limits
+    assert landscape.flat or high - low > 0.5
+
+
+def test_a_tuple_without_a_map_is_not_the_end_of_the_map_and_one_index_has_one_more_beside_it() -> None:
+    found, explorer = drawn_of(plain(lambda s: 1.0, ("time",), ()), [[0.2]])
+    assert not found and "no coordinate of the indices can move" in explorer.wrong and explorer.left > 0
+
+    def value(slots: np.ndarray) -> float:
+        if (slots[:, 0] > 2.0).any():
+            raise sr.InputError("the first tuple has no value")
+        return float(np.max(slots[:, 0]))
+
+    g = plain(value, ("time",))
+    g.slot = sr.Box(np.zeros(1), np.full(1, 3.0))
+    found, explorer = drawn_of(g, [[2.5]])
+    assert not found and "the first tuple has no value" in explorer.wrong
+    found, explorer = drawn_of(plain(lambda s: float(np.max(s)), ("time",)), [[0.4]], [[0.2]])
+    assert explorer.wrong == "" and {float(shown.value) for shown, _ in found} == {0.4, 0.2}
+    shown = found[-1][0]
+    assert shown.level == 1 and shown.anchor.shape == (2, 1) and shown.limits == (0.0, 1.0)
+
+
+def test_what_is_drawn_last_is_never_coarser_than_what_was_drawn_before_where_it_is_hardly_higher() -> None:
+    from sparserob_rerun.search.explorer import LARGE, Aim
+
+    found, explorer = drawn_of(plain(lambda s: s[0, 0] + s[1, 0], ("time",)), [[0.2], [0.7]])
+    height = 2.0
+    assert [shown.level for shown, _ in found][-1] == 1
+    for gain, more in ((0.5 * LARGE * height, 0), (2.0 * LARGE * height, 1)):
+        count = len(found)
+        explorer.aim(Aim(np.array([[0.3], [0.7 + gain]]), 0.1, gain, ""))
+        explorer.left = 1000  # of the next one there is the coarsest only
+        explorer.finish(0.2)
+        assert len(found) == count + more
 
 
 def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of_a_better_tuple() -> None:

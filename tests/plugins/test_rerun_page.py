@@ -31,10 +31,14 @@ def variable(name: str) -> str:
     return found.group(1)
 
 
-def test_make_live_watches_the_papers_annealing_with_keys_that_exist() -> None:
-    config = load_config(ROOT / variable("LIVE")).config
-    assert (config.method.name, config.maximiser.name) == ("sparserob", "simulated_annealing")
-    assert config.method.options["formulation"] == "literal"
+def test_make_live_watches_an_annealing_with_keys_that_exist_and_the_literal_one_beside_it() -> None:
+    changes = variable("ANNEALING").split()
+    for config, overrides, formulation in (("LIVE", changes, "reduced"), ("LITERAL_LIVE", [], "literal")):
+        found = load_config(ROOT / variable(config), overrides).config
+        assert (found.method.name, found.maximiser.name) == ("sparserob", "simulated_annealing")
+        assert found.method.options["formulation"] == formulation
+        assert found.dictionaries.control is not None
+        assert found.dictionaries.control.options["pieces"] == 100
     assert "live: $(INSTALLED)" in (ROOT / "Makefile").read_text()
 
 
@@ -46,6 +50,7 @@ def test_the_page_moves_to_another_port_where_its_own_is_taken(monkeypatch: pyte
         chosen = sinks.look(None, None, False, True)
         assert chosen.web != taken.getsockname()[1]
         assert f"127.0.0.1:{chosen.web}/" in chosen.page
+        assert chosen.page.endswith("&hide_welcome_screen=1&theme=dark")  # no welcome, and no white frame
     assert sinks.look(None, None, False, True).web == sinks.WEB_PORT
 
 
@@ -53,7 +58,15 @@ def test_the_page_moves_to_another_port_where_its_own_is_taken(monkeypatch: pyte
 def watching(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A search that takes minutes, as `make live` watches it on a machine without a display."""
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    command = [sys.executable, "-m", "sparserob_core", "watch", str(ROOT / variable("LIVE")), "--serve", "--no-figures"]
+    command = [
+        sys.executable,
+        "-m",
+        "sparserob_core",
+        "watch",
+        str(ROOT / variable("LITERAL_LIVE")),
+        "--serve",
+        "--no-figures",
+    ]
     process = subprocess.Popen(
         [*command, "maximiser.budget=100000", "--out", str(tmp_path / "run")],
         stdout=subprocess.PIPE,

@@ -135,8 +135,9 @@ def test_a_constraint_is_marked_where_it_pushes_and_under_the_states_that_it_bou
     for page in pages(six.problem):
         dots = paper.kept[f"{page.path}/dots"][0].positions.as_arrow_array().to_pylist()
         for place, (kind, k) in enumerate(page.plots):
-            top = place * (physics.HEIGHT + physics.GAP)
-            mine = [dot for dot in dots if top <= dot[1] <= top + physics.HEIGHT]
+            each = physics.HEIGHT if page.path != "physics/plots" else physics.height(len(page.plots), False)
+            top = place * (each + physics.GAP)
+            mine = [dot for dot in dots if top <= dot[1] <= top + each + 1e-3]
             told = [cut for cut in active if kind != "state" or f"x{k + 1}(" in words.cut_words(cut, view)]
             assert len(mine) == len({float(cut.index[0]) for cut in told}), (kind, k)
 
@@ -196,6 +197,81 @@ def test_no_word_of_the_bounds_lies_on_another(lower: float) -> None:
         assert min(at[0] - len(one) * WIDE / 1.26 for at, one in zip(places, words, strict=True)) > ONE[0]
 
 
+def test_the_plots_fill_their_panel_and_of_a_search_a_wide_one(six: sr.Outcome) -> None:
+    for searches, aspect in physics.ASPECT.items():
+        for count in (2, 3, 4):
+            left, right, top, bottom = physics.extent(count, physics.height(count, searches))
+            assert (right - left) / (bottom - top) == pytest.approx(aspect)
+    paper, view = Paper(), sr.Inspection.read(six.directory)
+    assert six.problem is not None
+    Physics(rr, paper, view, True).draw(np.asarray(six.result.decision), six.result.indices, None)
+    first = pages(six.problem)[0]
+    limits = physics.extent(len(first.plots), physics.height(len(first.plots), True))
+    for strip in paper.strips(f"{first.path}/frame"):
+        assert (strip >= (limits[0], limits[2])).all() and (strip <= (limits[1], limits[3])).all()
+
+
+def test_what_is_as_it_was_is_not_sent_again() -> None:
+    sent: list[str] = []
+
+    class Counting(Paper):
+        def log(self, path: str, *parts: Any, **_: Any) -> None:
+            sent.append(path)
+
+    paper = Counting()
+    for height, label, expected in (
+        (1.0, "one", ["here/curve", "here/labels", "here/dots"]),
+        (1.0, "one", []),
+        (2.0, "one", ["here/curve"]),
+        (2.0, "two", ["here/labels"]),
+    ):
+        drawing = Drawing()
+        drawing.line("curve", np.array([[0.0, 0.0], [1.0, height]]), (0, 0, 0, 255))
+        drawing.text(0.0, 0.0, label)
+        drawing.dot(np.zeros((1, 2)), (0, 0, 0, 255))
+        sent.clear()
+        drawing.log(rr, paper, "here")
+        assert sent == expected
+
+
+def test_a_line_of_a_search_has_its_corners_and_no_more() -> None:
+    from sparserob_rerun.search.search import _corners
+
+    assert _corners(np.array([3.0])).tolist() == [0]
+    assert _corners(np.full(50, 0.6)).tolist() == [0, 49]
+    assert _corners(0.1 * np.arange(50.0)).tolist() == [0, 49]
+    assert _corners(np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])).tolist() == [0, 2, 3, 5]
+    assert _corners(np.full(50, np.nan)).tolist() == [0]
+    values = np.random.default_rng(0).normal(size=40).cumsum()
+    values[[10, 11, 30]] = np.nan
+    kept = _corners(values)
+    assert {9, 10, 12, 29, 30, 31} <= set(kept.tolist()) and 11 not in kept  # of two in a row that are not finite one
+    known = np.isfinite(values[kept])
+    inside = np.isfinite(values)
+    line = np.interp(np.flatnonzero(inside), kept[known], values[kept][known])
+    np.testing.assert_allclose(line, values[inside], atol=1e-6)
+
+
+def test_what_a_run_is_at_is_said_at_any_moment() -> None:
+    searched = sr.EvaluationsFinished(count=1, total=1, best_value=0.0)
+    finished = sr.RunFinished(status="certified", message="", seconds=1.0)
+    proof, one = sr.ProofProgress(family="path", cells=1, bound=0.1), entry(1, 0.0, 1.0)
+    told, state = list[str](), ""
+    for event in (
+        searched,
+        replace(searched, phase="polish"),
+        one,
+        proof,
+        one,
+        replace(searched, family="path"),
+        finished,
+    ):
+        told.append(state := words.state_of(event, state))
+    assert told == ["search", "polish", "polish", "proof", "rounds", "violations", "certified"]
+    assert set(told) <= set(words.STATES)
+    assert words.state_of(sr.StudyProgress(text="figures"), "proof") == "proof"
+
+
 def test_what_a_drawing_has_no_more_is_taken_away() -> None:
     paper, before = Paper(), Drawing()
     before.line("bound", np.zeros((2, 2)), (0, 0, 0, 255))
@@ -209,7 +285,7 @@ def test_what_a_drawing_has_no_more_is_taken_away() -> None:
     assert gone == {"here/bound", "here/dots"}
 
 
-@pytest.mark.parametrize(("horizon", "left"), [(5.0, -72.0), (7200.0, -108.0), (0.5, -90.0)])
+@pytest.mark.parametrize(("horizon", "left"), [(5.0, -54.0), (7200.0, -90.0), (0.5, -72.0)])
 def test_the_map_has_room_for_the_numbers_of_its_times(horizon: float, left: float) -> None:
     from sparserob_rerun.search.views import landscape
 
@@ -431,17 +507,12 @@ def test_of_three_numbers_for_which_there_is_no_room_the_one_between_is_left_out
     assert low.tolist() == [-2.0, 2.0] and high.tolist() == [-2.0, 0.0, 2.0]
 
 
-def test_decades_are_whole_and_a_search_that_gains_nothing_more_has_numbers_that_can_be_told_apart() -> None:
-    from sparserob_rerun.drawing.canvas import _apart, ticks
-    from sparserob_rerun.search.climb import _limits
+def test_decades_are_whole() -> None:
+    from sparserob_rerun.drawing.canvas import _apart
 
     for low, high in ((-1.0, 0.0), (-2.0, 0.0), (-9.0, 1.0)):
         found = _apart(Axes(0.0, 0.0, 100.0, 136.0, (0.0, 1.0), (low, high)), 34.0, True)
         assert found.size > 1 and (found == np.rint(found)).all()
-    for value in (0.6380821, 2.6840191, 19.3710512, -4.5):
-        none = np.full(3, np.nan)
-        numbers = [f"{one:.7g}" for one in ticks(*_limits(np.full(3, value), none, np.full(3, value), []), 3)]
-        assert len(set(numbers)) == len(numbers) > 0 and max(map(len, numbers)) <= 6
 
 
 def test_a_system_in_a_plane_is_drawn_there_with_the_arcs_on_which_its_control_acts() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections import defaultdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,20 @@ def read(file: Path) -> dict[str, list[Any]]:
     return found
 
 
+def properties(file: Path) -> dict[str, Any]:
+    """What a recording says of itself: the values of its properties by name."""
+    from rerun.chunk import RrdReader
+
+    found = dict[str, Any]()
+    for chunk in RrdReader(str(file)).stream():
+        if chunk.entity_path.startswith("/__properties"):
+            batch = chunk.to_record_batch()
+            for name, column in zip(batch.schema.names, batch.columns, strict=True):
+                entries = [entry for entry in column.to_pylist() if isinstance(entry, list) and entry]
+                found |= {name.rpartition(":")[2]: entry[0] for entry in entries[-1:]}
+    return found
+
+
 def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
     """Times ``(k,)`` and values ``(k, series)`` of an entity, in the order of a timeline."""
     times, values = [], []
@@ -41,6 +56,21 @@ def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
         values += [np.array(row, dtype=float) for row in batch.column("Scalars:scalars").to_pylist()]
     order = np.argsort(times, kind="stable")
     return np.array(times)[order], np.array(values)[order]
+
+
+def line_of(chunks: list[Any], trace: sr.SearchTrace) -> np.ndarray:
+    """What a line over the evaluations shows at each of them, whose corners are recorded; NaN where there is none. No
+    line goes across a NaN, nor from one search to the next, nor beyond what is recorded."""
+    at, values = scalars(chunks, "evaluation")
+    known, numbers = np.isfinite(values[:, 0]), np.arange(trace.value.size) + 1
+    corners, ends = at[known], at[~known]
+    broken = np.array([((ends >= a) & (ends < b)).any() for a, b in pairwise(corners)] + [True])
+    leg = np.searchsorted(corners, numbers, side="right") - 1
+    shown = np.interp(numbers, corners, values[known, 0], left=np.nan)
+    shown[(leg < 0) | (broken[leg] & (corners[leg] != numbers))] = np.nan
+    for base in np.flatnonzero(np.diff(trace.outer)) + 1:
+        assert (ends == base).any()
+    return shown
 
 
 def texts(chunks: list[Any], component: str) -> list[str]:

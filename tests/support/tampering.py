@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.experiment.config.reader import read_source, write_yaml
+from sparserob_core.experiment.config.reading.reader import read_source, write_yaml
 from sparserob_core.sip.result import relative_gap
 
 

@@ -6,8 +6,10 @@ axis.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from hashlib import blake2b
 from typing import Any, final
 from weakref import WeakKeyDictionary
 
@@ -16,6 +18,9 @@ import numpy as np
 from sparserob_rerun.drawing.palette import FAINT, GREY, GROUND, INK, Colour, Floats, worded
 
 HATCHES = 60
+STROKES = 160
+"""Upright strokes of a band. With a tenth of them its edges are steps; with ten times as many a picture of the control
+is a megabyte."""
 LINE = 34.0  # units between two numbers on an axis upwards: a line of words is 26 high, and the lowest is lifted
 LEAST = 5e-4
 """Of the best value, the least height of a panel that shows values. With a tenth of it the numbers beside it are wider
@@ -25,8 +30,9 @@ ASIDE = 13.0
 """How much further left the lowest number upwards is where there are numbers across. With 0 it lies on the first of
 them, with much more it is outside the panel."""
 LETTER = 5.0  # half the width of a letter, in units of a drawing that is a little smaller than its panel
-SHOWN: WeakKeyDictionary[Any, dict[str, set[str]]] = WeakKeyDictionary()
-"""What the last drawing below each path had, of every stream: the viewer keeps an entity until it hears of it again."""
+SHOWN: WeakKeyDictionary[Any, dict[str, dict[str, bytes]]] = WeakKeyDictionary()
+"""What the last drawing below each path had, of every stream: the viewer keeps an entity until it hears of it again, so
+that what is as it was is not sent."""
 LIFT = 9.0  # the viewer writes labels this far below their points
 
 
@@ -119,7 +125,7 @@ class Drawing:
 
     def band(self, layer: str, axes: Axes, x: Floats, lower: Floats, upper: Floats, colour: Colour) -> None:
         """The area between two curves, as upright strokes."""
-        grid = np.linspace(x[0], x[-1], 4 * HATCHES)
+        grid = np.linspace(x[0], x[-1], STROKES)
         low, high = axes.at(grid, np.interp(grid, x, lower)), axes.at(grid, np.interp(grid, x, upper))
         width = axes.width * (x[-1] - x[0]) / (axes.x[1] - axes.x[0]) / grid.size
         for one, other in zip(low, high, strict=True):
@@ -141,54 +147,64 @@ class Drawing:
             self.line(layer, corners[sides] + share * (others[sides] - corners[sides]), colour, 1.0)
 
     def log(self, rr: Any, stream: Any, path: str, static: bool = False, layers: Sequence[str] = ()) -> None:
-        """Log everything below ``path``, later ``layers`` above earlier ones, and take away what the drawing before had
-        there and this one has not."""
-        names = {*self.strips, *(["labels"] if self.labels else []), *(["dots"] if self.dots else [])}
-        if not static:
-            shown = SHOWN.setdefault(stream, {})
-            for name in sorted(shown.get(path, set()) - names):
-                stream.log(f"{path}/{name}", rr.Clear(recursive=False))
-            shown[path] = names
+        """Log what has changed below ``path`` since the drawing before, later ``layers`` above earlier ones, and take
+        away what that had there and this one has not."""
         order = {layer: 10.0 * (place + 1) for place, layer in enumerate(layers)}
-        for layer, strips in self.strips.items():
-            stream.log(
-                f"{path}/{layer}",
-                rr.LineStrips2D(
-                    [points for points, _, _ in strips],
-                    colors=[colour for _, colour, _ in strips],
-                    radii=(
-                        rr.Radius.ui_points([width / 2 for _, _, width in strips])
-                        if layer != "tube"
-                        else [w / 2 for _, _, w in strips]
-                    ),
-                    draw_order=order.get(layer, 5.0),
-                ),
-                static=static,
-            )
+        found: dict[str, tuple[list[Any], Callable[[], Any]]] = {
+            layer: (strips, partial(_strips, rr, layer, strips, order.get(layer, 5.0)))
+            for layer, strips in self.strips.items()
+        }
         if self.labels:
-            stream.log(
-                f"{path}/labels",
-                rr.Points2D(
-                    np.array([place for place, _, _ in self.labels]),
-                    labels=[words for _, words, _ in self.labels],
-                    colors=[worded(colour) for _, _, colour in self.labels],
-                    radii=rr.Radius.ui_points(0.0),
-                    show_labels=True,
-                    draw_order=90.0,
-                ),
-                static=static,
-            )
+            found["labels"] = self.labels, partial(_labels, rr, self.labels)
         if self.dots:
-            points = np.concatenate([places for places, _, _ in self.dots])
-            sizes = np.concatenate([np.full(len(places), size) for places, _, size in self.dots])
-            colours = np.concatenate([np.tile(colour, (len(places), 1)) for places, colour, _ in self.dots]).astype(
-                np.uint8
+            found["dots"] = self.dots, partial(_dots, rr, self.dots)
+        before, now = SHOWN.setdefault(stream, {}).get(path, {}), dict[str, bytes]()
+        for name in sorted(set(before) - set(found)) if not static else ():
+            stream.log(f"{path}/{name}", rr.Clear(recursive=False))
+        for name, (parts, archetype) in found.items():
+            now[name] = _digest(parts)
+            if before.get(name) != now[name]:
+                stream.log(f"{path}/{name}", archetype(), static=static)
+        SHOWN[stream][path] = now
+
+
+def _digest(parts: list[Any]) -> bytes:
+    """By which it is known whether lines, dots or words are as they were."""
+    known = blake2b(digest_size=16)
+    for part in parts:
+        for piece in part:
+            known.update(
+                np.ascontiguousarray(piece).tobytes() if isinstance(piece, np.ndarray) else repr(piece).encode()
             )
-            stream.log(
-                f"{path}/dots",
-                rr.Points2D(points, colors=colours, radii=rr.Radius.ui_points(sizes), draw_order=80.0),
-                static=static,
-            )
+    return known.digest()
+
+
+def _strips(rr: Any, layer: str, strips: list[tuple[Floats, Colour, float]], order: float) -> Any:
+    widths = [width / 2 for _, _, width in strips]
+    return rr.LineStrips2D(
+        [points for points, _, _ in strips],
+        colors=[colour for _, colour, _ in strips],
+        radii=rr.Radius.ui_points(widths) if layer != "tube" else widths,
+        draw_order=order,
+    )
+
+
+def _labels(rr: Any, labels: list[tuple[Floats, str, Colour]]) -> Any:
+    return rr.Points2D(
+        np.array([place for place, _, _ in labels]),
+        labels=[words for _, words, _ in labels],
+        colors=[worded(colour) for _, _, colour in labels],
+        radii=rr.Radius.ui_points(0.0),
+        show_labels=True,
+        draw_order=90.0,
+    )
+
+
+def _dots(rr: Any, dots: list[tuple[Floats, Colour, float]]) -> Any:
+    points = np.concatenate([places for places, _, _ in dots])
+    sizes = np.concatenate([np.full(len(places), size) for places, _, size in dots])
+    colours = np.concatenate([np.tile(colour, (len(places), 1)) for places, colour, _ in dots]).astype(np.uint8)
+    return rr.Points2D(points, colors=colours, radii=rr.Radius.ui_points(sizes), draw_order=80.0)
 
 
 def _apart(axes: Axes, line: float, whole: bool, lifted: float = 0.0) -> Floats:

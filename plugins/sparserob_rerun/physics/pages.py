@@ -42,13 +42,12 @@ def pages(problem: sr.OptimalControlProblem) -> list[Page]:
     return [first_page, *(Page(f"physics/more/{number}", tuple(part)) for number, part in enumerate(parts))]
 
 
-def heading(problem: sr.OptimalControlProblem) -> str:
-    """What the first screen shows, and where the rest is."""
+def heading(problem: sr.OptimalControlProblem, searches: bool = False) -> str:
+    """What the first screen shows, of a search that of the best tuple, and where the rest is."""
     more = pages(problem)[1:]
     rest = ", ".join(page.name(problem.names) for page in more)
-    return "Control and states against the time of the system" + (
-        f"; {rest} in the tab Further signals" if more else ""
-    )
+    what = "The best tuple so far: control and states" if searches else "Control and states"
+    return f"{what} against the time of the system" + (f"; {rest} in the tab Further signals" if more else "")
 
 
 def _controls(which: Sequence[int]) -> list[tuple[Kind, int]]:

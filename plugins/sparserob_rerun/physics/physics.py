@@ -21,16 +21,29 @@ SHADES = (ink.SKY, ink.ORANGE, ink.GREEN, ink.PURPLE, ink.VERMILLION, ink.INK)  
 LAYERS = ("hatch", "tube", "frame", "marks", "worst", "curve", "wall")
 
 
-def extent(count: int) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of ``count`` plots above one another."""
-    return -32.0, LEFT + WIDTH + 76.0, -36.0, count * (HEIGHT + GAP) + 8.0
+ASPECT = {True: 1.75, False: 0.78}
+"""How many times as wide as high the panel of the first page is, in the arrangement of a search and in the others."""
+LOWEST = 40.0  # a plot that is lower has no room for two numbers
+
+
+def height(count: int, searches: bool) -> float:
+    """How high each of ``count`` plots of the first page is, so that they fill their panel."""
+    left, right, top, bottom = extent(0, 0.0)
+    return max(LOWEST, ((right - left) / ASPECT[searches] - (bottom - top)) / count - GAP)
+
+
+def extent(count: int, each: float = HEIGHT) -> tuple[float, float, float, float]:
+    """Left, right, top and bottom of ``count`` plots above one another, each so high."""
+    return -32.0, LEFT + WIDTH + 76.0, -36.0, count * (each + GAP) + 8.0
 
 
 @final
 class Physics:
     """Draws one decision after the other below ``/physics``."""
 
-    def __init__(self, rr: Any, stream: Any, view: sr.Inspection) -> None:
+    def __init__(self, rr: Any, stream: Any, view: sr.Inspection, searches: bool = False) -> None:
+        """``searches``: whether the first page is arranged for a search."""
+        self.searches, self.each = searches, HEIGHT
         self.rr, self.stream, self.view = rr, stream, view
         self.switching = sr.Switching(view.program, view.row)
         assert view.problem is not None
@@ -49,16 +62,17 @@ class Physics:
         push = self.switching.push(active, mu)
         if push is None and proven:
             push = self.switching.push(proven, mu)
-        for page in pages(self.problem):
+        for number, page in enumerate(pages(self.problem)):
             drawing = Drawing()
+            self.each = HEIGHT if number else height(len(page.plots), self.searches)
             for top, (kind, place) in enumerate(page.plots):
                 last = top == len(page.plots) - 1
                 if kind == "control":
-                    self._control(drawing, _axes(top, data, _control_limits(data, place)), data, place, last)
+                    self._control(drawing, self._axes(top, data, _control_limits(data, place)), data, place, last)
                 elif kind == "push":
-                    self._push(drawing, _axes(top, data, (-2.0, 2.0)), data, push, place, last)
+                    self._push(drawing, self._axes(top, data, (-2.0, 2.0)), data, push, place, last)
                 else:
-                    self._state(drawing, _axes(top, data, _state_limits(data, place)), data, worst, place, last)
+                    self._state(drawing, self._axes(top, data, _state_limits(data, place)), data, worst, place, last)
             self._marks(drawing, data, page.plots)
             drawing.log(self.rr, self.stream, page.path, layers=LAYERS)
         draw_phase(self.rr, self.stream, data, worst)
@@ -72,6 +86,7 @@ class Physics:
         if data.gains is not None:
             draw_feedback(rr, self.stream, data)
             send_effort(rr, self.stream, data)
+        self._bars(data)
         at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
         channels = len(data.control)
         names = [data.names.control(channel) for channel in range(channels)]
@@ -99,6 +114,20 @@ class Physics:
             values = np.stack([data.state[state], data.tube_lower[state], data.tube_upper[state]], axis=1)
             rows = rr.Scalars.columns(scalars=values.ravel()).partition([3] * len(values))
             self.stream.send_columns(f"signals/states/x{state + 1}", at, rows)
+
+    def _bars(self, data: sr.FigureData) -> None:
+        """The nominal control and states as bars over the time of the system, which are there on every timeline."""
+        rr, middles = self.rr, (data.breakpoints[:-1] + data.breakpoints[1:]) / 2
+        widths = np.diff(data.breakpoints)
+        for channel, values in enumerate(data.control):
+            colour = ink.legible(SHADES[channel % len(SHADES)])
+            bars = rr.BarChart(values, color=colour, abscissa=middles, widths=widths)
+            self.stream.log(f"signals/bars/controls/u{channel + 1}", bars, static=True)
+        for state in self.problem.names.corners.own(self.problem.system.states):
+            colour = ink.legible(SHADES[state % len(SHADES)])
+            width = np.gradient(data.times)
+            bars = rr.BarChart(data.state[state], color=colour, abscissa=data.times, widths=width)
+            self.stream.log(f"signals/bars/states/x{state + 1}", bars, static=True)
 
     def _control(self, drawing: Drawing, axes: Axes, data: sr.FigureData, channel: int, last: bool) -> None:
         name = data.names.control(channel)
@@ -165,27 +194,20 @@ class Physics:
             drawing.line("worst", axes.at(worst["state_times"], path[state]), ink.ORANGE, 1.2)
         drawing.line("curve", axes.at(data.times, data.state[state]), ink.SKY, 2.0)
 
+    def _axes(self, position: int, data: sr.FigureData, limits: tuple[float, float]) -> Axes:
+        ends = float(data.breakpoints[0]), float(data.breakpoints[-1])
+        return Axes(LEFT, position * (self.each + GAP), WIDTH, self.each, ends, limits)
+
     def _marks(self, drawing: Drawing, data: sr.FigureData, plots: Sequence[tuple[str, int]]) -> None:
         """The times of the active constraints, through the plots of the control and of what pushes it, and as dots on
         the time axis; in the plot of a state those of the constraints that bound it."""
         for position, (kind, place) in enumerate(plots):
-            axes = _axes(position, data, (0.0, 1.0))
+            axes = self._axes(position, data, (0.0, 1.0))
             times = data.active.on(place) if kind == "state" else data.active.times
             for time in times:
                 drawing.dashed("marks", axes.at(np.full(2, time), np.array([0.0, 1.0])), ink.PURPLE)
             if times.size:
                 drawing.dot(axes.at(times, 0.0), ink.PURPLE, 5.0)
-
-
-def _axes(position: int, data: sr.FigureData, limits: tuple[float, float]) -> Axes:
-    return Axes(
-        LEFT,
-        position * (HEIGHT + GAP),
-        WIDTH,
-        HEIGHT,
-        (float(data.breakpoints[0]), float(data.breakpoints[-1])),
-        limits,
-    )
 
 
 def _wall(drawing: Drawing, axes: Axes, wall: sr.Wall) -> None:

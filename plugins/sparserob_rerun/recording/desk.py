@@ -21,7 +21,7 @@ from sparserob_rerun.recording.channel import Receiver
 from sparserob_rerun.recording.guard import ENDING, Guard, broken, within
 from sparserob_rerun.recording.layout import layout
 from sparserob_rerun.recording.recorder import Opening, Recorder, shown_of
-from sparserob_rerun.recording.sinks import Destinations, Started, servers, sinks_of, start
+from sparserob_rerun.recording.sinks import Destinations, Started, compact, servers, sinks_of, start
 from sparserob_rerun.study.recorder import StudyOpening, StudyRecorder
 from sparserob_rerun.study.recorder import layout as study_layout
 
@@ -104,19 +104,20 @@ def _recorded(
     os.environ.setdefault("RUST_LOG", QUIET)
     import rerun as rr
 
-    stream = rr.RecordingStream("sparserob", recording_id=name)
     if isinstance(opening, StudyOpening):
+        stream = rr.RecordingStream(opening.application, recording_id=name)
         begin: Callable[[], Recorder | StudyRecorder] = partial(StudyRecorder, rr, stream, opening)
         blueprint = study_layout(opening)
     else:
         inspection = opening.answers()
         shown = shown_of(inspection, opening.landscape)
+        stream = rr.RecordingStream(shown.application, recording_id=name)
         begin, blueprint = partial(Recorder, rr, stream, opening, shown, inspection), layout(shown)
     sinks, wrong = sinks_of(rr, chosen, started)
     if sinks and not within(ENDING, partial(stream.set_sinks, *sinks, default_blueprint=blueprint)):
         return Account(wrong, "nothing could be sent" if chosen.save is None else broken(chosen.save))
     guard.open(stream, chosen.connect is None and not started)
-    ending, broke_off = Ending(), ""
+    ending, broke_off, recorder = Ending(), "", None
     try:
         recorder = begin()
         ending = _listen(messages, recorder, guard, wrong)
@@ -126,6 +127,8 @@ def _recorded(
         wrong += recorder.broken.values()
     finally:
         broke_off = guard.close()
+        if chosen.save is not None and not broke_off:
+            compact(chosen.save, recorder.arrangement if recorder is not None else blueprint)
         if servers(chosen, started):
             _look_on(ending.keep, messages)
     if guard.wrong and not broke_off:  # of the flush: a viewer that went away

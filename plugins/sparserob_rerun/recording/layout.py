@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, final
+from zlib import crc32
 
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import view
@@ -24,7 +25,9 @@ PHASE = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the phase
 @dataclass(frozen=True)
 class Shown:
     """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
-    the landscape; of a search what the maximiser has ``told`` of itself, and the coordinates that have ``moved``.
+    the landscape; of a search what the maximiser has ``told`` of itself, the coordinates that have ``moved``, and of
+    every search, once all are over (``stages``), the evaluations before it and its weight epsilon; ``budget``: the
+    evaluations of one, 0 where that is not known.
     ``clash``, once a run is infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn;
     ``drawn``: whether there were decisions before that; ``maps``: how many families have a map of their violation;
     ``answers``: whether the control answers what it measures."""
@@ -39,17 +42,31 @@ class Shown:
     drawn: bool = True
     maps: int = 0
     answers: bool = False
+    stages: tuple[tuple[int, float], ...] = ()
+    budget: int = 0
+
+    @property
+    def application(self) -> str:
+        """The name of the viewer's application: it keeps one arrangement for each, so that what is arranged otherwise
+        has another one."""
+        kind = "search" if self.searches else "feedback" if self.answers else "exchange"
+        problem = self.problem
+        parts: list[Any] = [self.families, self.maps, self.landscape]
+        if problem is not None:
+            parts += [problem.system.controls, problem.system.states, heading(problem), problem.names.in_plane]
+            parts += [pages(problem), problem.names.state_units, problem.names.time]
+        return f"sparserob {kind} {crc32(repr(parts).encode()):08x}"
 
 
 def layout(shown: Shown) -> Any:
     """The blueprint: an overview first, then a tab for each part of the story."""
     import rerun.blueprint as rrb
 
-    shares = ([4, 5, 3] if shown.searches else [5, 4, 3]) if shown.problem is not None else [4, 3]
-    overview = rrb.Horizontal(*_columns(rrb, shown), name="Overview", column_shares=shares)
+    columns, shares = _columns(rrb, shown)
+    overview = rrb.Horizontal(*columns, name="Overview", column_shares=shares)
     tabs = [overview, _exchange(rrb, shown)]
     if shown.searches:
-        tabs.insert(1, search.tab(rrb, shown.told, shown.moved))
+        tabs.insert(1, search.tab(rrb, shown.told, shown.moved, search.climb(rrb, shown.stages, shown.budget)))
     if shown.problem is not None and len(pages(shown.problem)) > 1:
         tabs.insert(1, _further(rrb, shown.problem))
     if shown.landscape:
@@ -70,27 +87,41 @@ def layout(shown: Shown) -> Any:
     )
 
 
-def _columns(rrb: Any, shown: Shown) -> list[Any]:
-    numbers = (
-        [search.climb(), *search.notes(rrb, shown.told)] if shown.searches else [_violation(rrb, shown), _bounds(rrb)]
-    )
+def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
+    """The panels of the first screen in columns, and how wide these are."""
+    words = [rrb.TextDocumentView(origin="/verdict", name="What is known")]
+    plane = [_phase(rrb, shown.problem)] if shown.problem is not None and shown.problem.system.states > 1 else []
+    map_words = [rrb.TextDocumentView(origin="/landscape/words", name="What the map shows")] if shown.landscape else []
+    plots = [] if shown.problem is None else [_plots(shown.problem, shown.searches)]
+    if shown.searches:  # the search is what is seen first: its map has more than half of the screen
+        terrain = [_terrain(shown)] if shown.landscape else []
+        below = rrb.Horizontal(search.climb(rrb, shown.stages, shown.budget), _lane(rrb), column_shares=[3, 1])
+        left = rrb.Vertical(*terrain, below, row_shares=[4, 1][-1 - len(terrain) :])
+        right = [rrb.Horizontal(*words, *map_words), *plots, *plane]
+        return [left, rrb.Vertical(*right, row_shares=[6, 6, 4][: len(right)])], [9, 5]
+    numbers = [_violation(rrb, shown), _bounds(rrb)]
     middle = (
-        rrb.Vertical(
-            search.landscape(shown.searches, shown.answers, shown.problem.horizon if shown.problem else 1.0),
-            *numbers,
-            row_shares=[10, *([8, 4, 4][: len(numbers)] if shown.searches else [_room(shown), 5])],
-        )
+        rrb.Vertical(_terrain(shown), *numbers, row_shares=[10, _room(shown), 5])
         if shown.landscape
         else rrb.Vertical(*numbers)
     )
-    words = [rrb.TextDocumentView(origin="/verdict", name="What is known"), _decisions(rrb)]
-    if shown.problem is None:
-        return [middle, rrb.Vertical(*words, row_shares=[2, 3])]
-    if shown.problem.system.states > 1:
-        words.insert(1, _phase(rrb, shown.problem))
-    first = pages(shown.problem)[0]
-    plots = view(f"/{first.path}", heading(shown.problem), physics.extent(len(first.plots)))
-    return [plots, middle, rrb.Vertical(*words, row_shares=[13, 9, 8] if len(words) == 3 else [1, 1])]
+    words = [*words, *plane, *map_words, _decisions(rrb)]
+    heights = [13, *([9] if plane else []), *([6] if map_words else []), 8]
+    return [*plots, middle, rrb.Vertical(*words, row_shares=heights)], ([5, 4, 3] if plots else [4, 3])
+
+
+def _plots(problem: sr.OptimalControlProblem, searches: bool) -> Any:
+    first = pages(problem)[0]
+    count = len(first.plots)
+    return view(f"/{first.path}", heading(problem, searches), physics.extent(count, physics.height(count, searches)))
+
+
+def _lane(rrb: Any) -> Any:
+    return rrb.StateTimelineView(origin="/state", name="What is going on")
+
+
+def _terrain(shown: Shown) -> Any:
+    return search.landscape(shown.searches, shown.answers, shown.problem.horizon if shown.problem else 1.0)
 
 
 def _room(shown: Shown) -> int:
@@ -146,14 +177,20 @@ def _signals(rrb: Any, answers: bool) -> Any:
     legend = rrb.Corner2D.RightTop
     effort = rrb.TimeSeriesView(origin="/signals/effort", name="Size of the controls under disturbances, over t",
                                 plot_legend=legend)  # fmt: skip
-    return rrb.Vertical(
-        rrb.TextDocumentView(origin="/howto", name="These series have a timeline of their own"),
-        rrb.TimeSeriesView(origin="/signals/control", name="Controls over t, in seconds", plot_legend=legend),
-        rrb.TimeSeriesView(origin="/signals/states", name="States over t, in seconds", plot_legend=legend),
+    bars = [
+        rrb.BarChartView(
+            origin="/signals/bars/controls", name="Controls of the last decision over t", plot_legend=legend
+        ),
+        rrb.BarChartView(origin="/signals/bars/states", name="Nominal states over t", plot_legend=legend),
+    ]
+    series = rrb.Vertical(
+        rrb.TextDocumentView(origin="/howto", name="The same as series, with what is uncertain"),
+        rrb.TimeSeriesView(origin="/signals/control", name="Controls on the timeline t", plot_legend=legend),
+        rrb.TimeSeriesView(origin="/signals/states", name="States on the timeline t", plot_legend=legend),
         *([effort] if answers else []),
         row_shares=[1, 5, 5, *([5] if answers else [])],
-        name="Signals (choose the timeline t)",
     )
+    return rrb.Horizontal(rrb.Vertical(*bars), series, column_shares=[3, 2], name="Signals")
 
 
 def _infeasible(rrb: Any, shown: Shown, clash: tuple[float, ...]) -> Any:
@@ -199,4 +236,5 @@ def _exchange(rrb: Any, shown: Shown) -> Any:
         name = "Violation over time and the first parameter: red is forbidden"
         extent = rounds.extent_of_maps(shown.maps)
         right.append(view("/violation", name, extent, "/violation/maps/** /violation/names/**"))
+    right.append(_lane(rrb))
     return rrb.Horizontal(left, rrb.Vertical(*right), name="Exchange")

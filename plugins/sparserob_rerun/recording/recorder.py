@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections import deque
 from collections.abc import Callable
@@ -20,18 +21,21 @@ from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
 from sparserob_rerun.recording.layout import Shown, layout
-from sparserob_rerun.recording.waiting import BOUNDS, CLASH, CLIMB, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
-from sparserob_rerun.search.climb import Climb
+from sparserob_rerun.recording.waiting import BOUNDS, CLASH, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
 from sparserob_rerun.search.explorer import Aim, Explorer
 from sparserob_rerun.search.projection import Projector
 from sparserob_rerun.search.search import SearchView
-from sparserob_rerun.search.terrain import Terrain
+from sparserob_rerun.search.terrain import VISIBLE, Terrain
 from sparserob_rerun.search.way import Stage
 
 SEEN = 10  # evaluations between two pictures of the way
-PICTURE_EVERY, SPARE = 0.5, 20.0
-"""Seconds between them, and how many times the processor time of one. Ten times as many, and the climb stands still for
-seconds; a tenth, and pictures take as much of a processor as the search."""
+PICTURE_EVERY, SPARE = 1.0, 10.0
+"""Seconds between them, and how many times the processor time of one. Ten times as many, and the control stands still
+for seconds; a tenth, and pictures take as much of a processor as the search."""
+ARRANGED = 100
+"""Evaluations of a search after which its panels are arranged: then the maximiser has told all that it tells. With a
+tenth they are arranged again for every word of it, in as many kilobytes as a minute of the search takes; with ten times
+as many a search of another weight has no panel for seconds."""
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
 PROOF = "proof of"
 LATE = 8.0
@@ -77,33 +81,63 @@ class Recorder:
 
     def __init__(self, rr: Any, stream: Any, opening: Opening, shown: Shown, inspection: sr.Inspection | None) -> None:
         self.rr, self.stream, self.opening, self.inspection = rr, stream, opening, inspection
-        self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
+        self.timelines = Timelines(rr, stream)
+        self.timelines.move()  # what is logged before is on no timeline
+        self.rounds = Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
-        self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
-        self.terrain = Terrain(rr, stream, "" if problem is None else problem.names.time, shown.searches)
+        self.physics = (
+            Physics(rr, stream, inspection, shown.searches) if inspection is not None and problem is not None else None
+        )
+        time_unit, cost_unit = ("", "") if problem is None else (problem.names.time, problem.cost_unit)
+        self.terrain = Terrain(rr, stream, time_unit, cost_unit)
         self.explorer = Explorer(self._landscape, inspection, opening.landscape, opening.waits)
         self.search, self.projector = SearchView(rr, stream, self.timelines), Projector()
-        self.climb, self.stages = Climb(rr, stream), list[Stage]()
+        self.stages = list[Stage]()
         self.shown, self.searches, self.began = shown, shown.searches, 0.0
         self.best_value, self.unseen, self.behind, self.way = -np.inf, 0, False, False
+        self.relaxed: tuple[tuple[int, float], sr.RelaxedValue] | None = None
+        self.optimal: Floats = np.zeros((0, 0))  # the tuple whose control is shown
         self.heard = self.next = time.monotonic()
         self.ended = np.inf  # the moment at which the run was over, once it is
         self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
         self.lower, self.upper, self.over = -np.inf, np.inf, -1.0
         self.exact: float | None = None
+        self.concluded = False
         self.answerable = True  # whether it is known through which rows the landscape of a policy goes
         self.proofs: dict[str, int] = {}
         self.broken: dict[str, str] = {}
         self.drawn, self.said = False, deque[str](maxlen=LINES)
-        self.timelines.move()
         self.waiting = Waiting(rr, stream, shown)
+        self.state = ""
+        names, colours = list(words.STATES), [list(colour) for colour in words.STATES.values()]
+        stream.log("state", rr.StateConfiguration(values=names, labels=names, colors=colours), static=True)
         stream.log("howto", rr.TextDocument(words.SIGNALS), static=True)
         self.say(f"run: {opening.title}")
+        self._describe(opening.title)
         self._page("solving", [])
+
+    def _describe(self, title: str) -> None:
+        """Give the recording its name, and say of what it is."""
+        self.stream.send_recording_name(title)
+        known: dict[str, Any] = {"title": [title]}
+        if self.inspection is not None:
+            config = self.inspection.config
+            known |= {"config": [json.dumps(config, default=str)], "seed": [config.get("seed", 0)]}
+        self.stream.send_property("run", self.rr.AnyValues(**known))
+
+    def _conclude(self, event: sr.RunFinished) -> None:
+        """Say how the run has ended."""
+        self.concluded = True
+        result, known = event.result, dict[str, Any](status=[event.status], seconds=[event.seconds])
+        if result is not None:
+            known |= {"lower_bound": [result.lower_bound], "upper_bound": [result.upper_bound]}
+            known |= {"cost": [float(result.cost)]} if result.decision is not None else {}
+        self.stream.send_property("result", self.rr.AnyValues(**known))
 
     def receive(self, event: sr.Event) -> None:
         """Log one event; one of evaluated tuples is a thin one (`thin`)."""
         self.heard = time.monotonic()
+        self._go_on(words.state_of(event, self.state))
         match event:
             case sr.EvaluationsFinished():
                 self._evaluations(event)
@@ -119,6 +153,12 @@ class Recorder:
                     )
             case sr.RunFinished():
                 self._finished(event)
+
+    def _go_on(self, state: str) -> None:
+        """Note on the lane what the run does from now on, where it is another thing than before."""
+        if state != self.state:
+            self.state = state
+            self.stream.log("state", self.rr.StateChange(state=state))
 
     def draw(self, panel: str, task: Callable[..., object], *arguments: Any) -> None:
         """Draw a panel; one that fails is named in the log, once, and is left out from then on."""
@@ -144,9 +184,13 @@ class Recorder:
             self.stream.log("decisions", self.rr.TextDocument("\n".join(self.said)))
 
     def mark(self) -> None:
-        """Mark on the last landscape where the maximum is, if it was proven."""
+        """Mark on the last landscape where the maximum is, if it was proven and the landscape goes through it, or
+        through a tuple whose value is the same to the eye."""
         landscape = self.terrain.known
-        if landscape is not None and self.exact is not None and self.explorer.landscape is landscape:
+        if landscape is None or self.exact is None:
+            return
+        same = abs(landscape.value - self.exact) <= VISIBLE * max(1.0, abs(self.exact))
+        if same or self.explorer.landscape is landscape:
             share = ", with the regulariser's share" if landscape.epsilon > 0.0 else ""
             self.draw(LANDSCAPE, self.terrain.mark, f"proven to be the highest: {self.exact:.6g}{share}")
 
@@ -190,12 +234,11 @@ class Recorder:
         if not self.stages:
             return
         stage, self.way = self.stages[-1], True
-        self.draw(CLIMB, self.climb.draw, self.stages, self.exact)
         self.draw("the way of the search", self.terrain.visit, stage)
-        told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
-        if not (told <= self.shown.told and moved <= self.shown.moved):
-            self.shown = replace(self.shown, told=self.shown.told | told, moved=self.shown.moved | moved)
-            self.draw("the arrangement of the search", self.stream.send_blueprint, layout(self.shown))
+        if self.physics is not None and stage.best.size and not self.shown.answers:
+            self.draw(CONTROL, self._control, stage)
+        if stage.values.size >= ARRANGED or self.concluded:
+            self._arrange(stage)
         weight = f"epsilon = {stage.epsilon:.3g}, " if np.isfinite(stage.epsilon) else ""
         if not self.exact:
             done = self.timelines.evaluation - stage.base
@@ -204,6 +247,29 @@ class Recorder:
             self.lower = max(self.lower, stage.lower_bound)
             self._page("solving", [line])
         self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.thread_time() - began))
+
+    def _control(self, stage: Stage) -> None:
+        """Draw the control that is optimal for the best tuple so far, where it is another one."""
+        slots = stage.best.reshape(-1, stage.block)
+        if self.inspection is None or self.physics is None or np.array_equal(self.optimal, slots):
+            return
+        if self.relaxed is None or self.relaxed[0] != (len(slots), stage.epsilon):
+            key = (len(slots), stage.epsilon)
+            self.relaxed = key, self.inspection.relaxed_value(*key)
+        self.optimal, g = slots, self.relaxed[1]
+        g.at(slots)
+        known = g.optimum()
+        if known is not None:
+            self.physics.draw(*known, None)
+
+    def _arrange(self, stage: Stage) -> None:
+        """Give what the search has told since the last arrangement its panels."""
+        told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
+        begun = tuple((one.base, one.epsilon) for one in self.stages) if self.concluded else ()
+        if not (told <= self.shown.told and moved <= self.shown.moved and begun == self.shown.stages):
+            told, moved = self.shown.told | told, self.shown.moved | moved
+            self.shown = replace(self.shown, told=told, moved=moved, stages=begun, budget=stage.budget)
+            self.draw("the arrangement of the search", self.stream.send_blueprint, self.arrangement)
 
     def _landscape(self, landscape: sr.Landscape, aim: Aim) -> None:
         """Draw a landscape at the moment at which it is there, and the way on it."""
@@ -229,6 +295,11 @@ class Recorder:
         self.draw(LANDSCAPE, self.explorer.step)
 
     @property
+    def arrangement(self) -> Any:
+        """How everything is arranged now."""
+        return layout(self.shown)
+
+    @property
     def pause(self) -> float:
         """Seconds until the way of the search is to be drawn; infinite where there is nothing new."""
         due = self.unseen >= SEEN or (self.unseen > 0 and not self.way)
@@ -245,14 +316,14 @@ class Recorder:
         return self.explorer.urgent
 
     def finish(self) -> None:
-        """A short run waits for its landscape; a long one had it meanwhile, and waits for a coarse one of its last
-        tuple; one that broke off does not wait."""
+        """A run waits for the landscape of its last tuple, to be as fine as there is time for; one that broke off does
+        not wait."""
         explorer = self.explorer
         if self.opening.landscape is not None and self.over >= 0.0:
-            shown, waits = self.terrain.known is not None, self.opening.waits
+            waits = self.opening.waits
             # of a run that is shown again every landscape may take as long; another one wants to end
             left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
-            self.draw(LANDSCAPE, explorer.finish, left - (0.5 * self.over if shown and not waits else 0.0))
+            self.draw(LANDSCAPE, explorer.finish, left)
             if explorer.waiting is not None or explorer.urgent:
                 left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
                 self.draw(LANDSCAPE, explorer.finish, left, 16, COARSE)  # any level is one
@@ -262,7 +333,7 @@ class Recorder:
                 if not explorer.wrong:
                     self.say(f"no landscape: {PATIENT if self.answerable else KEPT}")
                 self.shown = replace(self.shown, landscape=False)
-                self.draw("the arrangement", self.stream.send_blueprint, layout(self.shown))
+                self.draw("the arrangement", self.stream.send_blueprint, self.arrangement)
         if explorer.wrong:
             self.say(explorer.wrong, "WARN")
 
@@ -314,6 +385,7 @@ class Recorder:
         if result is not None:
             self.lower, self.upper = result.lower_bound, result.upper_bound
             self.exact = result.value if event.status == "certified" else None
+        self._conclude(event)
         self._page(event.status, lines)  # before anything that takes time
         if result is not None:
             if event.status != "infeasible":
@@ -341,7 +413,13 @@ class Recorder:
             {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(event.status, "INFO"),
         )
         if self.exact is not None and self.stages:
-            self.draw("the search", self.search.exact, self.exact, result.epsilon if result is not None else 0.0)
+            self.draw(
+                "the search",
+                self.search.exact,
+                self.exact,
+                result.epsilon if result is not None else 0.0,
+                self.stages[-1].base,
+            )
         self._way()
         self._page(event.status, lines)
 
@@ -354,7 +432,7 @@ class Recorder:
             drawn = self.drawn or bool(self.stages)
             seen = self.shown.landscape and self.terrain.known is not None
             self.shown = replace(self.shown, clash=extent(strips) if strips else (), drawn=drawn, landscape=seen)
-            self.stream.send_blueprint(layout(self.shown))
+            self.stream.send_blueprint(self.arrangement)
 
     @property
     def _formulation(self) -> str:

@@ -3,11 +3,13 @@ is missing."""
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,8 +17,13 @@ from typing import Any, TypeAlias, final
 
 import sparserob_core as sr
 
+logger = logging.getLogger("sparserob")
+
 PORT, WEB_PORT = 9876, 9090
 STARTING = 15.0  # seconds that a viewer may take until it listens
+JOINING = 20.0
+"""Seconds that the chunks of a finished recording may be joined for. Ten times as many, and a run waits for a large
+file; with a tenth a busy machine leaves it four times as large."""
 MEMORY = "25%"  # of the machine's, for a viewer that is started
 
 
@@ -42,7 +49,8 @@ class Destinations:
     @property
     def page(self) -> str:
         """The page that a browser is to open."""
-        return f"http://127.0.0.1:{self.web}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{self.serve}%2Fproxy"
+        source = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{self.serve}%2Fproxy"
+        return f"http://127.0.0.1:{self.web}/?url={source}&hide_welcome_screen=1&theme=dark"
 
 
 def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> Destinations:
@@ -131,6 +139,32 @@ def sinks_of(rr: Any, chosen: Destinations, started: Started) -> tuple[list[Any]
             wrong.append("the viewer did not start")
     sinks += [rr.GrpcSink(f"rerun+http://{host}:{port}/proxy") for host, port in addresses]
     return sinks, wrong
+
+
+def compact(file: Path, arrangement: Any) -> None:
+    """Join what is in a finished recording to chunks as large as the format wants, with its last ``arrangement`` (a
+    blueprint) only: live, each is as small as what has happened in a moment. A process of its own joins them, for the
+    library logs to the terminal while it does. Where that cannot be done, the recording stays as it is."""
+    from rerun.chunk import RrdReader
+
+    if not file.is_file():
+        return
+    parts = [file.with_name(f".{file.name}.{part}") for part in ("joined", "chunks", "arrangement")]
+    joined, chunks, screen = parts
+    try:
+        reader = RrdReader(str(file))
+        (store,) = reader.recordings()
+        name = store.application_id
+        reader.stream(store=store).write_rrd(chunks, application_id=name, recording_id=store.recording_id)
+        arrangement.save(name, screen)
+        command = [str(viewer()), "rrd", "optimize", "--profile", "live", str(chunks), str(screen), "-o", str(joined)]
+        subprocess.run(command, check=True, timeout=JOINING, capture_output=True, stdin=subprocess.DEVNULL)
+        joined.replace(file)
+    except Exception:  # a large recording is better than none
+        logger.debug("the chunks of %s could not be joined", file, exc_info=True)
+    for part in parts:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def _unwritable(file: Path) -> str:

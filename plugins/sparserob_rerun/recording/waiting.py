@@ -11,9 +11,9 @@ from sparserob_rerun.physics import physics
 from sparserob_rerun.physics.pages import pages
 from sparserob_rerun.physics.phase import pair_of
 from sparserob_rerun.recording.layout import PHASE, Shown
-from sparserob_rerun.search import climb, views
+from sparserob_rerun.search import views
 
-CONTROL, LANDSCAPE, CLIMB = "control and states", "the landscape", "the climb"
+CONTROL, LANDSCAPE = "control and states", "the landscape"
 VIOLATIONS, BOUNDS, CLASH = "the violations", "the bounds", "what clashes"
 
 
@@ -27,16 +27,17 @@ class Waiting:
         self.places = dict[str, list[str]]()
         first = "the first search ends" if shown.searches else "the first round ends"
         if shown.problem is not None:
-            for page in pages(shown.problem):
-                words = f"the control and the states are drawn when {first}"
-                self._write(CONTROL, page.path, physics.extent(len(page.plots)), words)
+            drawn = "the first tuple is evaluated" if shown.searches else first
+            for number, page in enumerate(pages(shown.problem)):
+                count = len(page.plots)
+                each = physics.HEIGHT if number else physics.height(count, shown.searches)
+                words = f"the control and the states are drawn when {drawn}"
+                self._write(CONTROL, page.path, physics.extent(count, each), words)
             if pair_of(shown.problem) is not None:
-                self._write(CONTROL, "physics/phase", PHASE, f"drawn when {first}")
+                self._write(CONTROL, "physics/phase", PHASE, f"drawn when {drawn}")
         if shown.landscape:
             tuples = "the first tuple is evaluated" if shown.searches else "the first constraints are active"
             self._write(LANDSCAPE, "landscape/map", views.EXTENT, f"the landscape of g is drawn when {tuples}")
-        if shown.searches:
-            self._write(CLIMB, "search/stages", climb.EXTENT, "the climb begins with the first evaluations of g")
         self._write(
             VIOLATIONS,
             "violation/plots",

@@ -6,6 +6,8 @@ import math
 from typing import Any
 
 import sparserob_core as sr
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.palette import Colour
 
 CUTS = 12  # cuts of one round that are listed one by one
 
@@ -18,6 +20,36 @@ LEGEND = """
 Hatched red: forbidden. Yellow: the worst case. Pink: when a constraint is active, and how hard the active ones push the
 control: it acts where the push leaves the dashed band, and nowhere else.
 """
+
+
+STATES: dict[str, Colour] = {
+    "search": ink.SKY,
+    "polish": ink.ORANGE,
+    "rounds": ink.SKY,
+    "violations": ink.VERMILLION,
+    "proof": ink.PURPLE,
+    "certified": ink.GREEN,
+    "verified": ink.GREEN,
+    "undecided": ink.GREY,
+    "infeasible": ink.VERMILLION,
+    "refuted": ink.VERMILLION,
+    "failed": ink.VERMILLION,
+}
+"""What a run may be at, or may have ended with, and the colour of each."""
+
+
+def state_of(event: sr.Event, before: str) -> str:
+    """What a run is at when an event of it comes; what it was at ``before``, where the event says nothing of it."""
+    match event:
+        case sr.EvaluationsFinished():
+            return "violations" if event.family else "polish" if event.phase == "polish" else "search"
+        case sr.RoundFinished():
+            return "rounds" if before in ("", "rounds", "violations", "proof") else before
+        case sr.ProofProgress():
+            return "proof"
+        case sr.RunFinished():
+            return event.status
+    return before
 
 
 def round_lines(event: sr.RoundFinished, inspection: sr.Inspection | None) -> list[str]:
@@ -65,7 +97,9 @@ def page(title: str, status: str, lower: float, upper: float, more: list[str]) -
         bounds = f"{_number(lower)} ≤ J* ≤ {_number(upper)}"
     else:
         bounds = "no bound yet" if status == "solving" else "no bound is known"
-    return "\n\n".join([f"### {title}", f"**{status}**: {bounds}", *more, LEGEND])
+    known = math.isfinite(lower) and math.isfinite(upper) and status != "infeasible"
+    gap = f"; {(upper - lower) / max(abs(upper), 1e-12):.2g} of it apart" if known and upper > lower else ""
+    return "\n\n".join([f"**{status}**: {bounds}{gap}", *more, f"*{title}*", LEGEND])
 
 
 def _decide(count: int) -> str:

@@ -111,8 +111,8 @@ class Explorer:
             before = time.thread_time()
             try:
                 self._step()
-            except sr.SparseRobError as error:
-                self.left, self.wrong = 0, f"no landscape: {error}"
+            except sr.SparseRobError as error:  # of this tuple: the next one may have a map
+                self.aimed, self.wrong = None, f"no landscape: {error}"
             finally:
                 self.used += time.thread_time() - before
 
@@ -126,7 +126,7 @@ class Explorer:
             if self.waiting is not None and self._coarse:
                 self.aimed, self.fresh = None, False
             self.step(hurry=True)
-        if self.fresh:
+        if self.fresh and not (self._coarser and self._gained <= LARGE):  # what is shown last is the finest
             self._draw()
 
     @property
@@ -161,18 +161,31 @@ class Explorer:
 
     def _draw(self) -> None:
         assert self.landscape is not None and self.aimed is not None
+        self.wrong = ""
         self.fresh, self.drawn = False, (self.aimed, self.landscape)
         self.draw(self.landscape, self.aimed)
 
     @property
-    def _held(self) -> bool:
-        """Whether what is shown may stay for a moment, because what is new is coarser and hardly higher."""
+    def _coarser(self) -> bool:
+        """Whether what is new is coarser than what is shown of the same weight."""
         if self.drawn is None or self.landscape is None or self.aimed is None:
             return False
         before, shown = self.drawn
-        if before.epsilon != self.aimed.epsilon or shown is self.landscape or shown.level >= self.landscape.level:
+        return before.epsilon == self.aimed.epsilon and 0 < shown.level < self.landscape.level
+
+    @property
+    def _gained(self) -> float:
+        """By how much what is new is higher than what is shown, in heights of it."""
+        assert self.drawn is not None and self.aimed is not None
+        before, shown = self.drawn
+        return _gain(self.aimed, before, shown)
+
+    @property
+    def _held(self) -> bool:
+        """Whether what is shown may stay for a moment, because what is new is coarser and hardly higher."""
+        if not self._coarser:
             return False
-        gain = _gain(self.aimed, before, shown)
+        gain = self._gained
         return gain <= SAME or (gain <= LARGE and time.monotonic() - self.since < HELD)
 
     def _better(self, waiting: Aim) -> bool:
@@ -190,21 +203,29 @@ class Explorer:
         """Find the indices that decide, then fill the landscape; ``True`` where a level is complete."""
         assert self.inspection is not None and self.options is not None
         g = self.inspection.relaxed_value(len(aim.slots), aim.epsilon)
-        known, middle = min(aim.slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
-        anchor = np.tile(middle, (len(aim.slots), 1))
-        anchor[:, :known] = aim.slots[:, :known]
+        slots = aim.slots
+        if len(slots) == 1 and sr.LandscapeAxes.over(g, 1) is None:  # then the other axis is where one more index is
+            slots = np.repeat(slots, 2, axis=0)
+            g = self.inspection.relaxed_value(2, aim.epsilon)
+        known, middle = min(slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
+        anchor = np.tile(middle, (len(slots), 1))
+        anchor[:, :known] = slots[:, :known]
         anchor = np.clip(anchor, g.slot.lower, g.slot.upper)
-        axes = sr.LandscapeAxes.over(g, len(anchor), self.options.coordinates)
-        if axes is None:
-            self.left, self.wrong = 0, "no landscape: fewer than two coordinates of the indices can move"
+        if sr.LandscapeAxes.over(g, len(anchor)) is None:
+            self.wrong = "no landscape: no coordinate of the indices can move"
             return
-        known_pair = len(aim.pair) == 2 and max(aim.pair) < len(anchor)
+        known_pair = len(aim.pair) == 2 and len(set(aim.pair)) == min(2, len(anchor)) and max(aim.pair) < len(anchor)
         if not known_pair:
             g.at(anchor)
             yield False
         pair = (aim.pair[0], aim.pair[1]) if known_pair else sr.deciding_pair(g, anchor)
-        if pair[0] == pair[1] and axes.orders:
-            self.left, self.wrong = 0, "no landscape: a tuple of one index has no second one"
+        reach = dict[tuple[int, int], tuple[float, float]]()
+        if self.options.coordinates is None:
+            for _ in sr.LandscapeAxes.measure(g, anchor, pair, reach):
+                yield False
+        axes = sr.LandscapeAxes.over(g, len(anchor), self.options.coordinates, reach)
+        if axes is None or (pair[0] == pair[1] and axes.orders):
+            self.wrong = "no landscape: a tuple of one index has no second one"
             return
         self.landscape = sr.Landscape(g, anchor, *axes.places(pair, anchor), self.options.grid, aim.epsilon, axes)
         yield from self.landscape.evaluate()

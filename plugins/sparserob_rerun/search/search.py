@@ -54,6 +54,9 @@ SERIES: dict[str, tuple[str, Colour, float]] = {
 CLOUDS: dict[str, tuple[str, Colour]] = {"tried": ("tried", ink.SKY), "refused": ("tried, refused", ink.VERMILLION)}
 MEANS = ("accepted", "local")  # 0 or 1 at every evaluation, of which a mean says more
 WINDOW = 50
+STRAIGHT = 1e-9
+"""Of the largest value: what bends less is a straight line, for rounding bends more than a tenth of it; of ten times as
+much nothing is seen either."""
 
 
 @final
@@ -62,7 +65,7 @@ class SearchView:
 
     def __init__(self, rr: Any, stream: Any, timelines: Timelines) -> None:
         self.rr, self.stream, self.timelines = rr, stream, timelines
-        self.known = set[str]()
+        self.known, self.lines = set[str](), set[str]()
         self.notes, self.moved = set[str](), set[str]()  # what the maximiser has told, and what has moved
         self.recent = dict[str, Floats]()  # of each share what it is the mean of, the last of it
         self.of: Stage | None = None
@@ -80,6 +83,8 @@ class SearchView:
         batch = event.batch.trace
         count = batch.values.size
         if stage is not self.of:
+            if self.of is not None:
+                self._break(stage.base)
             self.of, self.recent = stage, {}
         numbers = stage.base + event.total - count + 1 + np.arange(count)
 
@@ -89,23 +94,30 @@ class SearchView:
         refused = stage.refused[stage.values.size - count :]
         self._cloud("search/g/tried", at, np.where(refused, np.nan, batch.values), CLOUDS["tried"])
         self._cloud("search/g/refused", at, np.where(refused, batch.values, np.nan), CLOUDS["refused"])
-        for name, values in (
-            ("walk", stage.walk[stage.values.size - count :]),
-            ("best", batch.best),
-            ("bound", np.full(count, event.lower_bound)),
+        walk, best = stage.walk[stage.values.size - count :], batch.best
+        for name, values, which in (
+            ("walk", walk, _corners(walk)),
+            ("best", best, _corners(best)),
+            ("bound", np.full(count, event.lower_bound), np.array([0, count - 1] if count > 1 else [0])),
         ):
-            if np.isfinite(values).any():
-                self._line(f"search/g/{name}", *SERIES[name])
-                rows = self.rr.Scalars.columns(scalars=_shown(values))
-                self.stream.send_columns(f"search/g/{name}", at(np.arange(count)), rows)
+            path = f"search/g/{name}"
+            if path in self.known or np.isfinite(values).any():  # that a line is interrupted has to be sent as well
+                self._line(path, *SERIES[name])
+                self.stream.send_columns(path, at(which), self.rr.Scalars.columns(scalars=_shown(values[which])))
         self._notes(event, stage, numbers, began)
         self._moves(event, stage, numbers, began, moving, projection.moves)
         self.timelines.move(stage.base + event.total, event.round, began + event.seconds)
 
-    def exact(self, value: float, epsilon: float) -> None:
-        """The proven value, from the first evaluation to the last."""
+    def _break(self, base: int) -> None:
+        """End every line after so many evaluations: what comes next is of another search, and nothing lies between."""
+        at = self.timelines.columns(np.array([base]), np.array([self.timelines.seconds]), self.timelines.round)
+        for path in sorted(self.lines):
+            self.stream.send_columns(path, at, self.rr.Scalars.columns(scalars=np.array([np.nan])))
+
+    def exact(self, value: float, epsilon: float, base: int) -> None:
+        """The proven value, over the evaluations of the last search, before which there were ``base``."""
         self._line("search/g/exact", f"exact value (epsilon {epsilon:.3g})" if epsilon else "exact value", ink.PURPLE)
-        at = [self.rr.TimeColumn("evaluation", sequence=np.array([1, max(2, self.timelines.evaluation)]))]
+        at = [self.rr.TimeColumn("evaluation", sequence=np.array([base + 1, max(base + 2, self.timelines.evaluation)]))]
         self.stream.send_columns("search/g/exact", at, self.rr.Scalars.columns(scalars=np.full(2, value)))
 
     def separation(self, event: sr.EvaluationsFinished, began: float) -> None:
@@ -141,8 +153,8 @@ class SearchView:
                 self._kinds(event, path, where, values, at)
                 continue
             self._line(path, words, colour)
-            rows_shown = self.rr.Scalars.columns(scalars=_shown(values))
-            self.stream.send_columns(path, at(np.arange(values.size)), rows_shown)
+            few = _corners(values)
+            self.stream.send_columns(path, at(few), self.rr.Scalars.columns(scalars=_shown(values[few])))
 
     def _kinds(
         self,
@@ -200,6 +212,7 @@ class SearchView:
     def _line(self, path: str, words: str, colour: Colour, width: float = 1.5) -> None:
         if path not in self.known:
             self.known.add(path)
+            self.lines.add(path)
             self.stream.log(
                 path, self.rr.SeriesLines(names=[words], colors=[ink.legible(colour)], widths=[width]), static=True
             )
@@ -225,6 +238,18 @@ def _few(moves: np.ndarray) -> np.ndarray:
         return moves
     first = np.searchsorted(moves[:, 0], moves[:, 0], side="left")
     return moves[np.arange(len(moves)) - first < MOVES]
+
+
+def _corners(values: Floats) -> np.ndarray:
+    """Which of the values ``(k,)`` of a batch a line needs: the first, the last, and those that are not between their
+    neighbours on a straight line; of several in a row that are not finite the first."""
+    shown = _shown(values)
+    bends, finite = np.abs(np.diff(shown, 2)), np.isfinite(shown)
+    scale = np.max(np.abs(shown[finite]), initial=0.0)
+    kept = np.ones(values.size, dtype=bool)
+    kept[1:-1] = ~(bends <= STRAIGHT * scale)  # what is beside a gap stays
+    kept[1:] &= finite[1:] | finite[:-1]
+    return np.flatnonzero(kept)
 
 
 def _shown(values: Floats) -> Floats:

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from textwrap import wrap
 from typing import Any, final
 
 import numpy as np
 
 import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
-from sparserob_rerun.drawing.canvas import Axes, Drawing
+from sparserob_rerun.drawing.canvas import Axes, Drawing, ticks
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.explorer import Aim
 from sparserob_rerun.search.projection import outlines_on
 from sparserob_rerun.search.way import Shadow, Stage, shadow
 
-PIXELS, SIDE = 128, 384.0
-TRIED, LEG, LAST = 300, 400, 20  # points that stay visible, corners of the walk, and its last ones
-ROWS = {True: 50.0, False: 52.0}
-"""Units between two lines of words: of a search the panel is larger, and has more lines. A line is 22 pixels high."""
-BESIDE = 745.0  # where the words are: at the right of the map
-LETTERS = 46  # in a line; a word more does not fit there
+CELLS = 33
+"""Numbers of the map along either side. With a tenth of it a ridge is not seen; with ten times as many a map is a
+hundred times as large, of values of which nearly all are straight lines between those that were evaluated."""
+WIDTH, HEIGHT = 600.0, 400.0
+BAR, STEPS = (640.0, 26.0), 64  # the left side of the colour bar and its width, and its numbers
+TRIED, LEG, LAST = 150, 400, 20  # points that stay visible, corners of the walk, and its last ones
+ABOUT = (
+    "**g of a tuple**: the least cost of a control that meets the constraints at its few indices. Its maximum over all"
+    " tuples is J\\*, the least cost of a control that meets all."
+)
+"""What a person who has never seen the map has to know first."""
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 LIFT = 0.015  # points stand this share of the height above the surface
 POLE = 0.32
@@ -41,39 +45,34 @@ class Terrain:
     the tuple through which it is (``anchor (2,)``), ``value`` there, ``epsilon`` and ``level``, the stride of the grid.
     """
 
-    def __init__(self, rr: Any, stream: Any, unit: str = "", searches: bool = True) -> None:
-        """``unit``: of the time; empty where none is known. ``searches``: whether there is a search."""
-        self.rr, self.stream, self.unit, self.row = rr, stream, unit, ROWS[searches]
+    def __init__(self, rr: Any, stream: Any, unit: str = "", cost: str = "") -> None:
+        """``unit``: of the time, ``cost``: of g; empty where none is known."""
+        self.rr, self.stream, self.unit, self.cost = rr, stream, unit, cost
         self.known: sr.Landscape | None = None
-        self.lines, self.legend = 0, 0  # of words on the map, and of those below them about the search
+        self.words: dict[str, list[str]] = {"about": [], "map": [], "search": [], "exact": []}
         self.scale = (0.0, 1.0)
+        self.colours = rr.components.Colormap.Viridis
+        self._say("about", [ABOUT])
 
     def surface(self, landscape: sr.Landscape, aim: Aim) -> None:
-        """The values that are known, as an image with axes and as a mesh."""
+        """The values that are known, as numbers with a colour map, with axes and a colour bar, and as a mesh."""
         self.known = landscape
-        low, high = self.scale = self._scale(landscape, aim)
-        shown = landscape.picture(PIXELS)
-        colours = ink.sequential((np.where(np.isfinite(shown), shown, np.nan) - low) / (high - low))
-        colours[shown == np.inf] = ink.FORBIDDEN
-        image = np.flipud(colours.transpose(1, 0, 2))[:, :, :3]
-        self.stream.log(
-            "landscape/map/g", self.rr.Transform3D(scale=SIDE / PIXELS), self.rr.Image(np.ascontiguousarray(image))
-        )
+        self.scale = self._scale(landscape, aim)
+        self._numbers(landscape.picture(CELLS))
         (one, other), drawing, axes = landscape.names(self.unit), Drawing(), self._axes(landscape)
         drawing.frame(axes, "", room=1.4)
-        drawing.text(axes.width / 2, axes.height + 80.0, f"across: {one}", ink.GREY)
-        drawing.text(axes.width / 2, -62.0, f"up: {other}", ink.GREY)
+        drawing.text(axes.width / 2, axes.height + 62.0, f"across: {one}", ink.GREY)
+        drawing.text(axes.width / 2, -44.0, f"up: {other}", ink.GREY)
+        drawing.text(BAR[0] + BAR[1] / 2, -44.0, f"g{f' in {self.cost}' if self.cost else ''}", ink.GREY)
+        for value, words in _numbers_beside(self.scale):
+            drawing.text(BAR[0] + BAR[1] + 48.0, float(self._bar.at(0.0, value)[0, 1]), words, ink.GREY)
+        drawing.log(self.rr, self.stream, "landscape/map/axes", layers=("frame",))
+        self._anchor(landscape, axes)
         two = landscape.first[0] != landscape.second[0]
         weight = [f"epsilon {landscape.epsilon:.3g}"] if landscape.epsilon > 0.0 else []
         both = ["over the two indices that decide most"] if two else []
-        said = [(words, ink.INK) for words in [*both, *weight, *_halves(aim.words)]]
-        said += [(words, ink.GREY) for words in _said(landscape)]
-        said += [(words, ink.ORANGE) for words in _own(landscape, aim)]
-        for line, (words, colour) in enumerate(said):
-            drawing.text(BESIDE, self._line(line), words, colour)
-        self.lines = len(said)
-        drawing.log(self.rr, self.stream, "landscape/map/axes", layers=("frame",))
-        self._anchor(landscape, axes)
+        about = [", ".join([*both, *weight])]
+        self._say("map", [*_own(landscape, aim), *_said(landscape), *about, aim.words])
         across, up, values = landscape.shown
         place = [landscape.axes[k][landscape.at[k]] for k in (0, 1)]
         self.stream.log(
@@ -87,9 +86,52 @@ class Terrain:
                 sought=[aim.value],
                 epsilon=[landscape.epsilon],
                 level=[landscape.level],
+                names=list(landscape.names()),
             ),
         )
-        self._mesh(landscape, (low, high))
+        self._mesh(landscape, self.scale)
+
+    def _numbers(self, shown: Floats) -> None:
+        """The values ``(k, k)`` under the cursor, and the colour bar, whose values are those of its colours. Where no
+        decision meets the constraints there is no number, but a colour."""
+        rr, stream, limits = self.rr, self.stream, self.scale
+        size = len(shown)
+        place = rr.Transform3D(scale=(WIDTH / size, HEIGHT / size, 1.0))
+        image = np.flipud(np.where(np.isfinite(shown), shown, np.nan).T)
+        stream.log("landscape/map/g", place, self._coloured(image, limits))
+        nowhere = np.flipud((shown == np.inf).T)
+        if nowhere.any():
+            brown = np.zeros((size, size, 4), dtype=np.uint8)
+            brown[nowhere] = ink.FORBIDDEN
+            stream.log("landscape/map/infeasible", place, rr.Image(brown, draw_order=1.0))
+        else:
+            stream.log("landscape/map/infeasible", rr.Clear(recursive=False))
+        left, width = BAR
+        steps = limits[1] - (limits[1] - limits[0]) * (np.arange(STEPS) + 0.5) / STEPS
+        bar = rr.Transform3D(scale=(width, HEIGHT / STEPS, 1.0), translation=(left, 0.0, 0.0))
+        stream.log("landscape/map/bar", bar, self._coloured(steps[:, np.newaxis], limits))
+
+    def _coloured(self, image: Floats, limits: tuple[float, float]) -> Any:
+        """An image of numbers, with colours from the dark to the bright end."""
+        return self.rr.DepthImage(
+            np.ascontiguousarray(image, dtype=np.float32),
+            meter=1.0,
+            colormap=self.colours,
+            depth_range=limits,
+            magnification_filter=self.rr.components.MagnificationFilter.Linear,
+            draw_order=0.0,
+        )
+
+    @property
+    def _bar(self) -> Axes:
+        return Axes(BAR[0], 0.0, BAR[1], HEIGHT, (0.0, 1.0), self.scale)
+
+    def _say(self, part: str, lines: list[str]) -> None:
+        """Write what the map shows beside it, where a part of it has changed."""
+        if self.words[part] != lines:
+            self.words[part] = lines
+            text = "\n\n".join(line for one in self.words.values() for line in one if line)
+            self.stream.log("landscape/words", self.rr.TextDocument(text, media_type="text/markdown"))
 
     def _anchor(self, landscape: sr.Landscape, axes: Axes) -> None:
         """The tuple through which the slice goes, with the value that the slice has there."""
@@ -172,7 +214,7 @@ class Terrain:
 
     def _sketches(self, landscape: sr.Landscape, stage: Stage) -> None:
         """What a maximiser shows of itself, over where the indices are that decide in the middle of each."""
-        axes, legend = self._axes(landscape), Drawing()
+        axes, legend = self._axes(landscape), list[str]()
         for role, sketch in stage.sketches.items():
             path = f"landscape/map/sketch/{''.join(c if c.isalnum() else '_' for c in role)}"
             assert landscape.seen is not None
@@ -182,8 +224,7 @@ class Terrain:
             lower, upper = corners
             few = not sketch.points and sketch.count > SHOWN
             words = f"white: {role}, {SHOWN} of {sketch.count}" if few else f"white: {role}"
-            words = f"blue: {role}" if sketch.points else words
-            legend.text(BESIDE, self._line(self.lines + len(legend.labels)), words, ink.GREY)
+            legend.append(f"blue: {role}" if sketch.points else words)
             if sketch.points:
                 at = axes.at(lower[:, 0], lower[:, 1])
                 self.stream.log(
@@ -208,26 +249,18 @@ class Terrain:
             )
 
         if stage.walks:
-            words = "white: the walk, and where it is now"
-            legend.text(BESIDE, self._line(self.lines + len(legend.labels)), words, ink.GREY)
-        self.legend = len(legend.labels)
-        legend.log(self.rr, self.stream, "landscape/map/legend")
+            legend.append("white line: the walk of the search, and where it is now")
+        self._say("search", legend)
 
     def mark(self, words: str) -> None:
         """What is proven of the tuple through which the slice goes."""
         landscape = self.known
         if landscape is not None:
-            axes = self._axes(landscape)
-            at = axes.at(landscape.axes[0][landscape.at[0]], landscape.axes[1][landscape.at[1]])
+            at = self._axes(landscape).at(*(landscape.axes[k][landscape.at[k]] for k in (0, 1)))
             drawing = Drawing()
             drawing.dot(at, ink.PURPLE, 9.0)
-            for line, part in enumerate(_halves(words)):
-                drawing.text(BESIDE, self._line(self.lines + self.legend + line), part, ink.PURPLE)
             drawing.log(self.rr, self.stream, "landscape/map/exact")
-
-    def _line(self, number: int) -> float:
-        """How far down a line of words is."""
-        return self.row * number
+            self._say("exact", [f"pink: {words}"])
 
     def _scale(self, landscape: sr.Landscape, aim: Aim) -> tuple[float, float]:
         """What is dark and what is bright; one colour for a flat slice, which has no range. The value that the search
@@ -241,7 +274,7 @@ class Terrain:
 
     def _axes(self, landscape: sr.Landscape) -> Axes:
         ends = [(float(axis[0]), float(axis[-1])) for axis in landscape.axes]
-        return Axes(0.0, 0.0, SIDE, SIDE, ends[0], ends[1])
+        return Axes(0.0, 0.0, WIDTH, HEIGHT, ends[0], ends[1])
 
     def _mesh(self, landscape: sr.Landscape, scale: tuple[float, float]) -> None:
         across, up, shown = landscape.shown
@@ -326,15 +359,20 @@ def _said(landscape: sr.Landscape) -> list[str]:
 
 def _own(landscape: sr.Landscape, aim: Aim) -> list[str]:
     """The value at the anchor, and how far below it that of the search is, whose disturbances need not be the worst."""
-    below, here = landscape.value - aim.value, f"orange: the best tuple, g = {landscape.value:.6g}"
+    below, here = landscape.value - aim.value, f"orange dot: the best tuple, g = {landscape.value:.6g}"
     if not below > VISIBLE * max(1.0, abs(landscape.value)):
         return [here]
-    return [f"{here} on the map", f"its own g is {aim.value:.6g}, {below:.2g} below the map"]
+    return [
+        f"{here} on the map, where the disturbances of these two indices are the worst for them",
+        f"with its own disturbances g is {aim.value:.6g}, {below:.2g} below the map",
+    ]
 
 
-def _halves(words: str) -> list[str]:
-    """Words in lines of `LETTERS` at most."""
-    return wrap(words, LETTERS)
+def _numbers_beside(limits: tuple[float, float]) -> list[tuple[float, str]]:
+    """Round values beside the colour bar, with as many digits as tell them apart."""
+    values = ticks(*limits, 4)
+    digits = next(n for n in range(4, 18) if len({f"{value:.{n}g}" for value in values}) == values.size or n == 17)
+    return [(float(value), f"{value:.{digits}g}") for value in values]
 
 
 def _weight(epsilon: float) -> float:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any, Literal
+
+import numpy as np
 
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import ticks, view
-from sparserob_rerun.search import climb as stages
 from sparserob_rerun.search.search import LOGARITHMIC, NOTES
+from sparserob_rerun.search.terrain import BAR, HEIGHT
 
 FIRST = ("temperature", "depth", "constant", "radius", "reach", "spread", "slope")  # of what is noted, for the overview
 SHARES = ("accepted", "rejected", "local")
@@ -24,16 +26,37 @@ def landscape(searches: bool, answers: bool, horizon: float = 1.0) -> Any:
     name = "Landscape of g around the best tuple" + (", and the way of the search" if searches else "")
     letters = max(len(f"{time:.6g}") for time in ticks(0.0, horizon))
     left = EXTENT[0] - LETTER * max(0, letters - LETTERS)
-    return view("/landscape/map", f"{name}: when the run is over" if answers else name, (left, *EXTENT[1:]))
+    return view(
+        "/landscape/map",
+        f"{name}: when the run is over" if answers else name,
+        (left, *EXTENT[1:3], HEIGHT + BELOW[searches]),
+    )
 
 
-EXTENT = (-72.0, 1090.0, -94.0, 520.0)
+BELOW = {True: 82.0, False: 116.0}
+"""Units below the map, of a search, whose panel is large, and of the others: words are as high in both."""
+EXTENT = (-54.0, BAR[0] + BAR[1] + 100.0, -64.0, HEIGHT + BELOW[False])
 LETTER, LETTERS = 18.0, 2  # how much room a letter takes, and how many have it within the `EXTENT`
+MOST = 4  # searches whose climbs are beside one another; of more the last ones
+CLIMB = ("tried", "refused", "walk", "best", "exact")
 
 
-def climb() -> Any:
-    """The climb, one panel for each weight epsilon."""
-    return view("/search/stages", "g (up) over the evaluations (across), one panel for each epsilon", stages.EXTENT)
+def climb(rrb: Any, stages: Sequence[tuple[int, float]], budget: int) -> Any:
+    """The climb: of a search that goes on the last evaluations, as many as its ``budget`` (0: all of them); of one that
+    is over a plot for each of its ``stages``, of which each has how many evaluations there were before it, and its
+    weight epsilon."""
+    contents = [f"+ /search/g/{one}" for one in CLIMB]
+    if len(stages) < 2:
+        cursor = rrb.TimeRangeBoundary.cursor_relative
+        window = (cursor(seq=-budget), cursor(seq=0)) if budget else None
+        return series(rrb, "/search/g", "g over the last evaluations", contents, evaluations=window)
+    shown, plots = list(stages)[-MOST:], []
+    place = rrb.TimeRangeBoundary.absolute
+    ends = [place(seq=base) for base, _ in shown[1:]] + [rrb.TimeRangeBoundary.infinite()]
+    for (base, epsilon), end in zip(shown, ends, strict=True):
+        name = f"ε {epsilon:.3g}" if np.isfinite(epsilon) and epsilon > 0.0 else "g over the evaluations"
+        plots.append(series(rrb, "/search/g", name, contents, evaluations=(place(seq=base + 1), end)))
+    return rrb.Horizontal(*plots)
 
 
 def series(
@@ -43,13 +66,17 @@ def series(
     contents: list[str] | None = None,
     legend: Literal["left", "right", "below"] = "right",
     limits: tuple[float, float] | None = None,
+    evaluations: tuple[Any, Any] | None = None,
 ) -> Any:
     """A plot against the timeline that shows the whole of it, however long it is. ``legend``: the corner in which
     the names of its lines are, an upper one or the lower left one; ``limits``: of the axis upwards, where they are
-    known before."""
+    known before; ``evaluations``: the first and the last that are shown, and decide its height."""
     from rerun.encodings import TimeRange
 
-    everything = TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+    everything = rrb.TimeRangeBoundary.infinite()
+    start, end = evaluations or (everything, everything)
+    whole = evaluations is None  # a range of evaluations is none of another timeline
+    shown = [rrb.VisibleTimeRange("evaluation", start=start, end=end)] if evaluations else None
     return rrb.TimeSeriesView(
         origin=origin,
         contents=contents or ["+ $origin/**"],
@@ -60,7 +87,8 @@ def series(
             ],
             visible=contents is None,
         ),
-        axis_x=rrb.TimeAxis(view_range=everything),
+        axis_x=rrb.TimeAxis(view_range=TimeRange(start=start, end=end)) if whole else None,
+        time_ranges=shown,
         axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
     )
 
@@ -79,9 +107,9 @@ def _note(rrb: Any, name: str) -> Any:
     return series(rrb, "/search/notes", words[0].upper() + words[1:], [f"+ /search/notes/{name}"], limits=limits)
 
 
-def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:
-    """The tab of a search: what the maximiser has ``told`` of itself, and the coordinates that have ``moved``, each on
-    an axis of its own."""
+def tab(rrb: Any, told: Collection[str], moved: Collection[str], climbs: Any) -> Any:
+    """The tab of a search: its ``climbs``, what the maximiser has ``told`` of itself, and the coordinates
+    that have ``moved``, each on an axis of its own."""
     order = [name for name in (*LOGARITHMIC, *NOTES) if name in told]
     names = [*dict.fromkeys([*order, *sorted(told)])]
     mine = [_note(rrb, name) for name in names]
@@ -89,7 +117,7 @@ def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:
         series(rrb, "/search/moves", f"Where it moves: {name}", [f"+ /search/moves/{name}"]) for name in sorted(moved)
     ]
     left = rrb.Vertical(
-        climb(),
+        climbs,
         series(rrb, "/search/g", "g, with the share of the regulariser, over the evaluations", legend="below"),
         row_shares=[3, 2],
     )

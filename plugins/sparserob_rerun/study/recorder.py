@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import shorten
 from typing import Any, final
+from zlib import crc32
 
 import numpy as np
 
@@ -41,6 +42,11 @@ class StudyOpening:
     event: sr.SweepStarted
     waits: bool = False
 
+    @property
+    def application(self) -> str:
+        """The name of the viewer's application: it keeps one arrangement for each."""
+        return f"sparserob study {crc32(repr((list(self.event.axes), self.event.arrangement)).encode()):08x}"
+
 
 @final
 class StudyRecorder:
@@ -49,7 +55,7 @@ class StudyRecorder:
     rest, urgent, behind, ended = math.inf, False, False, math.inf
 
     def __init__(self, rr: Any, stream: Any, opening: StudyOpening) -> None:
-        self.rr, self.stream, self.event = rr, stream, opening.event
+        self.rr, self.stream, self.event, self.opening = rr, stream, opening.event, opening
         self.board, self.broken = Board(self.event), dict[str, str]()
         self.rows: dict[int, Mapping[str, Any]] = dict(self.event.rows)
         self.newest: deque[int] = deque(self.rows, maxlen=board.LINES)
@@ -58,6 +64,8 @@ class StudyRecorder:
         self.text = "its points are found on the way" if searched else self._done()
         self.over = ""
         self.seconds, self.next = 0.0, 0.0
+        stream.send_recording_name(self.event.title)
+        stream.send_property("study", rr.AnyValues(title=[self.event.title], axes=list(self.event.axes)))
         self._tell(f"study: {self.event.title}")
         if self.rows:
             self._tell(f"{len(self.rows)} points were finished before")
@@ -85,6 +93,11 @@ class StudyRecorder:
             self._picture()
         else:
             self.rest = max(0.0, self.next - time.monotonic())
+
+    @property
+    def arrangement(self) -> Any:
+        """How everything is arranged."""
+        return layout(self.opening)
 
     def idle(self) -> None:
         """Draw what came since the last picture."""

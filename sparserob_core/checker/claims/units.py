@@ -36,7 +36,9 @@ MOST_HELD = 16_000_000  # numbers that tell what inputs do on every piece, at on
 # With a tenth of it, runs would be refused that were honest in the units of their whole range; with ten times as much,
 # a control of 1 in a range of 1e7 would forgive seven digits.
 BEYOND = 2.0**20
-TINY = 1e-300  # the unit of a row that has no size at all: nothing of it is excused
+# Of its unit, 1 at most, that of a row whose bound, width and nominal values are 0: a billionth of it is excused, which
+# is no rounding of any number that the row could have, but more than the balls around a 0. The run asks for more.
+NOTHING = 2.0**-50
 MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 
 
@@ -77,7 +79,7 @@ class RowUnits:
         sizes = np.maximum(sizes, np.where(np.isfinite(across), across, 0.0))
         if (resolved > sizes).any() and self.nominal is not None:
             sizes = np.maximum(sizes, self.nominal(*self._rows_of(states=False)))
-        return np.asarray(np.minimum(resolved, np.maximum(sizes, TINY)))
+        return np.asarray(np.minimum(resolved, np.where(sizes > 0.0, sizes, NOTHING * np.minimum(resolved, 1.0))))
 
     def least(self, direction: Array, width: float) -> float:
         """The least unit of a direction ``c (d,)`` of a curved set that reaches ``width`` from its centre along it:

@@ -18,6 +18,11 @@ from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Separation
 
+# The size of a row that has none, in its unit: bound, width and nominal values are 0, as those of a control that is to
+# be 0. A billionth of it is excused, which is above the remainders of series that enclose a 0, and no rounding of any
+# number that a row could have. With ten digits more such rows stay open.
+NOTHING = 2.0**-150
+
 
 class StateConstraint(Source):
     """``c'(x(t) - r(t)) + g'u(t) <= h(c)`` for all ``t`` in ``[start, stop]``, parameters and disturbances, and for the
@@ -170,7 +175,8 @@ class StateConstraint(Source):
         key = x.tobytes()
         if key not in self._scales:
             self._scales.clear()
-            self._scales[key] = float(np.maximum(sizes, self._along(x, rows))[small].min(initial=1.0))
+            least = float(np.maximum(sizes, self._along(x, rows))[small].min(initial=1.0))
+            self._scales[key] = max(least, NOTHING)
         return self._scales[key]
 
     def _along(self, x: Array, rows: Array) -> Array:

@@ -19,7 +19,7 @@ from sparserob_core.experiment.assemble import build, control_problem_of, dictio
 from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
-from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.run.given import GivenConfig, as_config, as_run

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
-from sparserob_core.experiment.config.reader import read_source
+from sparserob_core.experiment.config.reading.reader import read_source
 from sparserob_core.experiment.directory.finished import stored_run
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.result import relative_gap

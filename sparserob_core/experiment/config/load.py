@@ -12,9 +12,10 @@ from pydantic import ValidationError
 
 from sparserob_core.encodings import name_of, path_of
 from sparserob_core.errors import ConfigError, InputError, Path, PluginError, UnknownPluginError, dotted
+from sparserob_core.experiment.config.extending import extended
 from sparserob_core.experiment.config.matrices.files import resolve
-from sparserob_core.experiment.config.overrides import Override, apply_override, parse_overrides
-from sparserob_core.experiment.config.reader import Source, read_source, read_value
+from sparserob_core.experiment.config.reading.overrides import Override, apply_override, parse_overrides
+from sparserob_core.experiment.config.reading.reader import Source, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.messages import NOT_TEXT, Complaint, complaints, malformed, models_in
@@ -60,10 +61,12 @@ def load_config(
     """Read a config, apply the overrides, and check every key of it against the installed plugins.
 
     ``known``: the components that there are, for a config that somebody else has left. No plugin that the config names
-    is loaded then; a component that is not known stands as it is, and is refused by its name where it is built.
+    is loaded then, nor a config that it extends; a component that is not known stands as it is, and is refused by its
+    name where it is built.
     Raises `ConfigError`: one line for each key at fault, ``file:line:column: key.path: what is wrong (got ...)``.
     """
     given = read_source(config)
+    given = extended(given) if known is None else given
     if "axes" in given.data and "problem" not in given.data:
         raise ConfigError(f"{given.name}: expected a config, got a study, which has axes; `sparserob sweep` takes it")
     changes = tuple(parse_overrides(overrides, read_value))

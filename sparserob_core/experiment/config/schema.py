@@ -8,6 +8,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
+from sparserob_core.experiment.config.extending import EXTENDS, MEANING
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.config.set_options import shorthand
 from sparserob_core.experiment.plugins.components import Part, Registry
@@ -62,6 +63,8 @@ def config_schema(registry: Registry) -> dict[str, Any]:
     for unused in ("Entry", "MaximiserEntry"):
         parts.pop(unused, None)
     _add_kinds(registry, parts)
+    schema["properties"] = {EXTENDS: {"type": "string", "description": MEANING}, **schema["properties"]}
+    schema["anyOf"] = [{"required": schema.pop("required")}, {"required": [EXTENDS]}]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "SparseRob config"}
 
 

@@ -123,7 +123,7 @@ class StoredRun:
         """What the indices of arrays say whose version did not write it down: it follows from the method."""
         if not arrays or FORMULATIONS in arrays:
             return "reduced"
-        from sparserob_core.experiment.config.reader import read_source
+        from sparserob_core.experiment.config.reading.reader import read_source
 
         method = read_source(self.directory / "config.yaml").data.get("method")
         entry = {"name": method} if isinstance(method, str) else method if isinstance(method, Mapping) else {}

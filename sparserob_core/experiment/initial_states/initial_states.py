@@ -16,9 +16,9 @@ from sparserob_core.control.studies.initial_states import InitialPlane, check_st
 from sparserob_core.control.transcription.own_units import walls
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
 from sparserob_core.errors import InputError, SparseRobError
-from sparserob_core.experiment.assemble import assemble, name_of, tools_of
+from sparserob_core.experiment.assemble import assemble, name_of, tools_of, transcribed_by
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
 from sparserob_core.experiment.initial_states.feasible_set import ON_EDGE, InitialStates
 from sparserob_core.experiment.initial_states.search import InitialStatesSearch
@@ -76,7 +76,8 @@ def initial_states(
         begun = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
         model = from_state(model, np.append(_about(about, model.stated), begun))
     pair = check_states(states, model.stated.system.states)
-    own, units = in_own_units(model)  # what is looked at and what is told are in other units (docs/decisions/0016)
+    with transcribed_by(tools.deadline):
+        own, units = in_own_units(model)  # what is looked at and what is told are in other units (docs/decisions/0016)
     x = units.states[list(pair)]
     size = np.full(2, _far(own.problem)) if limit is None else limit / x
     least = THINNEST * size * np.minimum(1.0, walls(own.problem)[list(pair)])

@@ -80,7 +80,8 @@ class InitialStatesSearch:
         )
         limit = self._size(self.plane.radius)
         try:
-            framed = self._framed()
+            with self.tools.deadline.enforced():
+                framed = self._framed()
         except KeyboardInterrupt as pressed:
             self._interrupt(pressed)
             if self.frame is None:
@@ -93,7 +94,8 @@ class InitialStatesSearch:
             return self._finished(bare, status="infeasible", message=message)
         try:
             self._tell("direction", len(framed), directions)
-            supports = sandwich(self._ask, framed, 0 if self.interrupted else directions, 0.1 * CLOSED)
+            with self.tools.deadline.enforced():
+                supports = sandwich(self._ask, framed, 0 if self.interrupted else directions, 0.1 * CLOSED)
         except KeyboardInterrupt as pressed:
             self._interrupt(pressed)
             supports = sorted([*framed, *self.asked], key=lambda one: float(np.arctan2(*one.direction[::-1])))

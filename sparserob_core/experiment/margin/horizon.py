@@ -58,10 +58,11 @@ class HorizonSearch:
         longest = self.problem.horizon
         scan = longest * np.arange(1, max(count, SCAN) + 1) / max(count, SCAN)
         try:
-            stuck = self._cover(scan.tolist())
-            if count:
-                for horizon in scan:
-                    self._run(float(horizon))
+            with self.tools.deadline.enforced():
+                stuck = self._cover(scan.tolist())
+                if count:
+                    for horizon in scan:
+                        self._run(float(horizon))
         except KeyboardInterrupt as pressed:
             stuck = str(pressed) or "interrupted from the keyboard"
         proven = [point for point in self.points.values() if point.status in FEASIBLE]

@@ -13,10 +13,10 @@ import numpy as np
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError, SparseRobError, named
-from sparserob_core.experiment.assemble import assemble, name_of, tools_of
+from sparserob_core.experiment.assemble import assemble, name_of, tools_of, transcribed_by
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import ProblemKeys
-from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
 from sparserob_core.experiment.margin.causal import causal_upper
 from sparserob_core.experiment.margin.horizon import HORIZON, HorizonSearch, horizon_search
@@ -26,6 +26,7 @@ from sparserob_core.experiment.margin.search import Margin, MarginSearch
 from sparserob_core.experiment.run.events import Broadcast, Observer, SweepFinished, SweepStarted
 from sparserob_core.experiment.run.given import GivenConfig, as_config
 from sparserob_core.sip.events import Event, Notify, ignore
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
 from sparserob_core.sip.result import Result
@@ -72,7 +73,9 @@ def margin(
         notify(event)
         broadcast(event)
 
-    search = _search(loaded, str(of), float(tolerance), heard if broadcast.heard else notify)
+    tools = tools_of(loaded)
+    with transcribed_by(tools.deadline):
+        search = _search(loaded, tools, str(of), float(tolerance), heard if broadcast.heard else notify)
     answer, stopped, deadline = "", "", search.tools.deadline
     try:
         if out is None and not write:
@@ -165,11 +168,10 @@ def _between(lower: float, upper: float) -> str:
     return f"{lower:.9g} to {upper:.9g}" if lower != upper else f"{lower:.9g}"
 
 
-def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> MarginSearch | HorizonSearch:
+def _search(loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Notify) -> MarginSearch | HorizonSearch:
     from sparserob_core.control.transcription.terms.accumulated import accumulated
     from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
-    tools = tools_of(loaded)
     experiment = assemble(loaded, tools.deadline).of_control(
         "config: expected a control problem, whose sets can be scaled"
     )

@@ -123,11 +123,12 @@ class MarginSearch:
         sides: Sides | None = None
         try:
             self.told.say(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
-            found = self._found()
-            self.cuts = found.cuts
-            sides = self._sides(found)
-            feasible = sides[2]
-            curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
+            with self.tools.deadline.enforced():
+                found = self._found()
+                self.cuts = found.cuts
+                sides = self._sides(found)
+                feasible = sides[2]
+                curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
         except KeyboardInterrupt as pressed:
             said = str(pressed) or "interrupted from the keyboard"
             sides, known = self._known(said, sides)
@@ -135,7 +136,8 @@ class MarginSearch:
         causal, ended = np.nan, None
         if self.beyond is not None:
             try:
-                causal, ended = self.beyond(self.results)
+                with self.tools.deadline.enforced():
+                    causal, ended = self.beyond(self.results)
             except KeyboardInterrupt as pressed:
                 self.tools.deadline.interrupt(pressed)
         status, message, feasible, infeasible = sides

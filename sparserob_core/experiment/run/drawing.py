@@ -24,8 +24,10 @@ from sparserob_core.experiment.figures.switching import Switching
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
 from sparserob_core.experiment.run.landscape import (
+    Axis,
     Landscape,
     LandscapeAxes,
+    Reach,
     deciding_again,
     deciding_pair,
     deciding_slots,
@@ -217,9 +219,9 @@ def _landscape(experiment: Experiment, result: Result, directory: Path, notify: 
 def landscape_of(
     inspection: Inspection, trace: SearchTrace, title: str, notify: Notify = ignore
 ) -> LandscapeData | None:
-    """The landscape through the best tuple of the last epsilon, over where the two indices are that decide most there,
-    or along the only coordinate that can move; ``None`` where no tuple with a finite value was kept, or nothing can
-    move.
+    """The landscape through the best tuple of the last epsilon, over the two coordinates of its deciding indices along
+    which g moves most, or along the only coordinate that can move; ``None`` where no tuple with a finite value was
+    kept, or nothing can move.
 
     It ends with the finest grid that is complete after `SECONDS`; ``notify`` receives `StudyProgress`.
     """
@@ -238,7 +240,11 @@ def landscape_of(
     count = trace.points.shape[1] // width
     g, tuples = inspection.relaxed_value(count, epsilon), trace.points[mine].reshape(mine.size, count, width)
     anchor = trace.points[top].reshape(count, width)
-    value, axes = g.at(anchor), LandscapeAxes.over(g, count)
+    value, reach = g.at(anchor), dict[Axis, Reach]()
+    pair = deciding_pair(g, anchor)
+    for _ in LandscapeAxes.measure(g, anchor, pair, reach):
+        pass
+    axes = LandscapeAxes.over(g, count, reach=reach)
     accepted = trace.notes.get("accepted", np.full(trace.value.size, np.nan))[mine]
     if axes is None:
         if not moving_of(g):
@@ -258,7 +264,6 @@ def landscape_of(
             visited_values=trace.value[mine],
             accepted=accepted,
         )
-    pair = deciding_pair(g, anchor)
     landscape = Landscape(g, anchor, *axes.places(pair, anchor), GRID, epsilon, axes)
     _fill(landscape, notify)
     notes = {name: column[mine] for name, column in trace.notes.items()}

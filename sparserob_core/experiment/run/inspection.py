@@ -45,10 +45,11 @@ class RelaxedValue:
 
     ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation, ``gradient()``
     the slopes ``(D, width)`` of ``g`` there, as far as it has some (`TupleValue.gradient`); ``deciding()`` are the
-    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``interchangeable``: every index is imposed
-    as every other one, so that two beside one another say the same; those of a policy have a deviation each. ``slot``
-    is the box ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names`,
-    `Inspection.kinds`.
+    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``optimum()`` is the decision ``(n,)`` of
+    that evaluation with the constraints that carry its multipliers, or ``None`` where there is none.
+    ``interchangeable``: every index is imposed as every other one, so that two beside one another say the same; those
+    of a policy have a deviation each. ``slot`` is the box ``(width,)`` of one index, ``names`` and ``kinds`` say what
+    its coordinates are: see `Inspection.names`, `Inspection.kinds`.
     """
 
     at: Callable[[Array], float]
@@ -59,6 +60,7 @@ class RelaxedValue:
     names: tuple[str, ...]
     kinds: tuple[CoordinateKind, ...]
     interchangeable: bool = True
+    optimum: Callable[[], tuple[Array, tuple[Cut, ...]] | None] = lambda: None
 
     @property
     def coordinates(self) -> tuple[int, ...]:
@@ -202,6 +204,13 @@ class Inspection:
         def gradient() -> Array:
             return cost * value.gradient(value.slots.ravel()).reshape(value.slots.shape) / units
 
+        def optimum() -> tuple[Array, tuple[Cut, ...]] | None:
+            decision = value.solution.x
+            if value.solution.status != "optimal" or not np.isfinite(decision).all():
+                return None
+            cuts = value.rows().cuts
+            return (decision, cuts) if own is None else (decision * own.decision, UsersUnits(own).cuts(cuts))
+
         slot = value.layout.slot
         return RelaxedValue(
             lambda slots: cost * value.at(np.ravel(np.clip(slots / units, slot.lower, slot.upper))),
@@ -211,6 +220,7 @@ class Inspection:
             Box(slot.lower * units, slot.upper * units),
             self.names(width),
             self.kinds(width),
+            optimum=optimum,
         )
 
     def _policy_value(self) -> RelaxedValue:

@@ -1,5 +1,5 @@
-"""The landscape of ``g`` over where the two indices are that decide most, the others held where the best tuple has
-them: which two these are in a tuple, the axes of the map, and its values.
+"""The landscape of ``g`` over two coordinates of the two indices that decide most, the others held where the best
+tuple has them: which indices these are in a tuple, which coordinates move g most, and the values of the map.
 
 It is filled from coarse to fine by evaluations of its own, of another program with another solver, on lines that only
 the options and the tuple decide; two of these lines go through the tuple itself.
@@ -27,8 +27,16 @@ seconds ends on a busy machine."""
 FLAT = 1e-9  # of g: smaller differences are the solver's
 CLOSE = 0.01  # of the distance of two lines of the grid
 
+PROBES = 5
+"""Values of a coordinate at which g is asked how far it moves along it. With two of them a ridge between the ends is
+not seen; with fifty the choice of the axes takes as long as a map."""
+
 Place: TypeAlias = tuple[int, int]
 """Of a coordinate of a tuple: ``(slot, coordinate)``."""
+Axis: TypeAlias = tuple[int, int]
+"""Of an axis of a map: ``(rank, coordinate)`` of the index that decides most (rank 0) or of the other (1)."""
+Reach: TypeAlias = tuple[float, float]
+"""How far g moves along an axis: on which share of it g is infinite, and the range of its finite values."""
 NEAR = 0.05
 """Indices that are nearer to one another, in widths of the box, stand for one constraint and move together. A tenth of
 it, and two that a search has put beside one another hide that g depends on them; ten times, and all of them are one."""
@@ -120,6 +128,19 @@ class Landscape:
             self.level = stride
             yield True
 
+    def cross(self) -> Iterator[None]:
+        """Evaluate the line of ``first`` through the anchor, one point at each step."""
+        for i in range(self.axes[0].size):
+            self._fill(i, self.at[1])
+            yield
+
+    @property
+    def reach(self) -> Reach:
+        """How far g moves along ``first``, of what `cross` has evaluated."""
+        values = self.values[:, self.at[1]]
+        known = values[np.isfinite(values)]
+        return float(np.mean(values == np.inf)), float(np.ptp(known)) if known.size else 0.0
+
     def _fill(self, i: int, j: int) -> None:
         slots = self.anchor.copy()
         for place, moving, to in zip(
@@ -163,12 +184,12 @@ class Landscape:
         return bool(np.isfinite(self.shown[2]).all() and high - low <= FLAT * max(1.0, abs(high)))
 
     def picture(self, size: int) -> Array:
-        """The values ``(size, size)`` on an even grid, between those that are known in straight lines; beside an
-        infinite value as the nearest of them."""
+        """The values ``(size, size)`` in the middles of even cells, between those that are known in straight lines;
+        beside an infinite value as the nearest of them."""
         across, up, values = self.shown
         shares = []
         for axis in (across, up):
-            even = np.linspace(axis[0], axis[-1], size)
+            even = axis[0] + (axis[-1] - axis[0]) * (np.arange(size) + 0.5) / size
             left = np.clip(np.searchsorted(axis, even, side="right") - 1, 0, axis.size - 2)
             shares.append((left, (even - axis[left]) / (axis[left + 1] - axis[left])))
         (i, s), (j, t) = shares
@@ -209,19 +230,40 @@ class LandscapeAxes:
         return self.coordinates[0] == self.coordinates[1]
 
     @classmethod
-    def over(cls, g: RelaxedValue, count: int, named: tuple[str, str] | None = None) -> LandscapeAxes | None:
-        """The axes of the map of tuples of ``count`` indices: those ``named``, or else the first coordinate of an
-        index, such as its time, of two of them, or two coordinates of the only one; ``None`` where fewer than two can
-        move. Raises `InputError` for a name that there is not."""
+    def over(
+        cls,
+        g: RelaxedValue,
+        count: int,
+        named: tuple[str, str] | None = None,
+        reach: Mapping[Axis, Reach] | None = None,
+    ) -> LandscapeAxes | None:
+        """The axes of the map of tuples of ``count`` indices: those ``named``, or else the two along which g moves most
+        as the ``reach`` says (`measure`). Of equals, and where nothing is known, the first coordinate of an index,
+        such as its time, of two of them, or two coordinates of the only one; ``None`` where fewer than two can move.
+        Raises `InputError` for a name that there is not."""
         if named is not None:
             one, other = (coordinate(name, g) for name in named)
             if one == other:
                 raise InputError(f"landscape: coordinates: expected two, got {named[0]!r} twice")
             return cls((one[0], other[0]), (one[1], other[1]))
-        moving = moving_of(g)
-        if not moving or len(moving) * count < 2:
+        known = reach or {}
+        axes = sorted(axes_of(g, count), key=lambda axis: known.get(axis, (0.0, 0.0)), reverse=True)
+        if len(axes) < 2:
             return None
-        return cls((0, 1), (moving[0], moving[0])) if count > 1 else cls((0, 0), (moving[0], moving[1]))
+        (rank, c), (next_rank, k) = sorted(axes[:2], key=lambda axis: axis[::-1])
+        return cls((rank, next_rank), (c, k))
+
+    @staticmethod
+    def measure(g: RelaxedValue, anchor: Array, pair: tuple[int, int], reach: dict[Axis, Reach]) -> Iterator[None]:
+        """Evaluate g of the tuple ``anchor (D, width)``, of which the indices ``pair`` decide most, along every
+        possible axis, one point at each step, and note the ``reach`` of each; where there is no choice, nothing is
+        evaluated."""
+        axes = axes_of(g, 1 if pair[0] == pair[1] else 2)
+        for rank, c in axes if len(axes) > 2 else ():
+            other = next((r, k) for r, k in axes if (r, k) != (rank, c))
+            line = Landscape(g, anchor, (pair[rank], c), (pair[other[0]], other[1]), PROBES)
+            yield from line.cross()
+            reach[rank, c] = line.reach
 
     def places(self, pair: tuple[int, int], anchor: Array) -> tuple[Place, Place]:
         """The places of the axes in a tuple ``(D, width)`` of which the indices ``pair`` decide most."""
@@ -239,11 +281,15 @@ class LandscapeAxes:
         return np.sort(points, axis=1) if self.orders else points
 
 
+def axes_of(g: RelaxedValue, count: int) -> list[Axis]:
+    """What a map of tuples of ``count`` indices may be over: every coordinate that can move, of one index or of two."""
+    return [(rank, c) for c in moving_of(g) for rank in range(min(2, count))]
+
+
 def moving_of(g: RelaxedValue) -> list[int]:
     """The coordinates of an index that a map may be over: those that can move, disturbances left out, and directions
-    where there is anything else."""
-    moving = [k for k in g.coordinates if g.kinds[k] != "direction"]
-    return moving or list(g.coordinates)
+    last, which say least to a reader."""
+    return sorted(g.coordinates, key=lambda k: g.kinds[k] == "direction")
 
 
 def coordinate(name: str, g: RelaxedValue) -> tuple[int, int]:

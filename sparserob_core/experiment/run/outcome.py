@@ -23,7 +23,7 @@ from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.reader import Source, require_readable, write_yaml
+from sparserob_core.experiment.config.reading.reader import Source, require_readable, write_yaml
 from sparserob_core.experiment.config.stated.source import component_keys, dictionary_keys, source_of
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.provenance import git_revision, provenance

@@ -12,7 +12,7 @@ from sparserob_core.control.transcription.provable import SECONDS, announced, un
 from sparserob_core.errors import InputError, SparseRobError, named
 from sparserob_core.experiment.assemble import Anew, UntranscribedExperiment, assemble_in_time, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.directory.provenance import git_revision, provenance

@@ -10,9 +10,9 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.errors import InputError, Path, dotted
-from sparserob_core.experiment.config.overrides import parse_overrides, parse_value
 from sparserob_core.experiment.config.plain import BESIDE
-from sparserob_core.experiment.config.reader import read_value
+from sparserob_core.experiment.config.reading.overrides import parse_overrides, parse_value
+from sparserob_core.experiment.config.reading.reader import read_value
 from sparserob_core.experiment.config.run_config import SLOTS
 from sparserob_core.experiment.plugins.messages import shown
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,11 +15,11 @@ import numpy as np
 from sparserob_core.arguments import is_whole
 from sparserob_core.encodings import name_of, path_of
 from sparserob_core.errors import ConfigError, InputError
+from sparserob_core.experiment.config.extending import extended, movable
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.matrices.files import resolve
-from sparserob_core.experiment.config.overrides import parse_overrides
 from sparserob_core.experiment.config.plain import BESIDE, difference, identity, value_text
-from sparserob_core.experiment.config.reader import Source, read_source, read_value, write_yaml
+from sparserob_core.experiment.config.reading.overrides import parse_overrides
+from sparserob_core.experiment.config.reading.reader import Source, read_source, read_value, write_yaml
 from sparserob_core.experiment.plugins.messages import nearest, shown
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.sweep.axes import FIXED, MOST, Axis, parse_axes
@@ -262,11 +261,8 @@ def _fault(source: Source, key: str, said: str) -> ConfigError:
 def _based(source: Source) -> Source:
     """The base of a study, which can be moved: the files of its plugins by their whole names, the numbers of matrices
     instead of their files, its own name as title."""
-    data = copy.deepcopy(source.data)
-    list(resolve(data, lambda _: source.folder))  # what is wrong with one is said where a config is checked
-    files = data.get("plugins")
-    if isinstance(files, list) and all(isinstance(file, str) for file in files):
-        data["plugins"] = [name_of((source.folder / path_of(file)).resolve()) for file in files]
+    source = extended(source)
+    data, _ = movable(source)  # what is wrong with a matrix is said where a config is checked
     if not data.get("title"):
         data["title"] = Path(source.name).stem
     return replace(source, data=data)

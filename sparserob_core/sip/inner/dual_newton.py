@@ -338,7 +338,8 @@ def _non_negative(
     support: Bool[np.ndarray, " v"],
 ) -> Float[Array, " v"]:
     """argmin ``1/2 v'Hv - linear'v``, ``v >= 0`` where signed, by active sets from a first support (Lawson and Hanson
-    1974, chapter 23)."""
+    1974, chapter 23). Raises `numpy.linalg.LinAlgError` where they go round, as rounding lets them where rows crowd:
+    a step to such a point has never led to an optimum, and takes as long as all others together."""
     passive = support | ~signed
     v = np.zeros(signed.size)
     for _ in range(3 * signed.size + 10):
@@ -356,12 +357,12 @@ def _non_negative(
             continue
         v = wanted
         if passive.all():
-            break
+            return v
         pull = np.where(passive, -np.inf, linear - hessian @ v)
         if not pull.max() > 1e-13 * float(np.abs(linear).max()):
-            break
+            return v
         passive[int(np.argmax(pull))] = True
-    return v
+    raise np.linalg.LinAlgError("active sets go round")
 
 
 @shaped

@@ -86,7 +86,7 @@ class UsersUnits:
             cost_scale=own.cost_scale * self.cost,
             ray=None if own.ray is None else own.ray * self.decision,
             worst=None if own.worst is None else self._witness(own.worst),
-            indices=self._cuts(own.indices),
+            indices=self.cuts(own.indices),
             history=tuple(self._round(event) for event in own.history),
             trace=None if own.trace is None else self._trace(own.trace),
             dual=self._dual(own.dual, infeasible=own.status == "infeasible"),
@@ -138,10 +138,10 @@ class UsersUnits:
             proven=own.proven * self.cost,
             violation=own.violation * self._row_unit(own.worst_family, row),
             separations={name: self._separation(name, one) for name, one in own.separations.items()},
-            imposed=self._cuts(own.imposed),
+            imposed=self.cuts(own.imposed),
             multipliers=frozen(np.array(multipliers, dtype=float)),
-            added=self._cuts(own.added),
-            dropped=self._cuts(own.dropped),
+            added=self.cuts(own.added),
+            dropped=self.cuts(own.dropped),
         )
 
     def _evaluations(self, own: EvaluationsFinished) -> EvaluationsFinished:
@@ -209,14 +209,15 @@ class UsersUnits:
         return replace(
             own,
             bound=own.bound if infeasible else own.bound * self.cost,
-            cuts=self._cuts(own.cuts),
+            cuts=self.cuts(own.cuts),
             mu=own.mu * self.cost / self.equalities if own.mu.size == self.equalities.size else own.mu,
             z=None if own.z is None else own.z * self.cost / self.image,
             fixed=own.fixed * self.cost,
             at=None if own.at is None else own.at * self.decision,
         )
 
-    def _cuts(self, own: Sequence[Cut]) -> tuple[Cut, ...]:
+    def cuts(self, own: Sequence[Cut]) -> tuple[Cut, ...]:
+        """Constraints of the program in its own units, with their multipliers, in the user's."""
         return tuple(
             Cut(
                 cut.family,

@@ -193,8 +193,8 @@ class TupleValue:
         """The indices ``(k, most)`` of each of ``k`` tuples whose constraints have the largest multipliers, by the rows
         that were ``imposed`` there; the largest first, -1 where fewer have one.
 
-        A constraint that stays as it is where the first of the `coordinates` moves, such as one at the end of the
-        horizon, does not count.
+        A constraint that stays as it is wherever the `coordinates` move, such as one at the end of the horizon of a
+        system without parameters, does not count.
         """
         count, rows = len(self.slots), self._h.shape[1]
         tuples = np.repeat(np.arange(len(imposed)), [one.positions.size for one in imposed])
@@ -210,11 +210,11 @@ class TupleValue:
 
     @cached_property
     def _moving(self) -> np.ndarray:
-        """Which rows of an index ``(r,)`` move with the first of its `coordinates`, such as its time."""
+        """Which rows of an index ``(r,)`` move with any of its `coordinates`, such as its time."""
         moving = np.zeros(self._h.shape[1], dtype=bool)
         for family, first, last in self._columns:
             box = family.index_set
-            mine = [c for c in self.coordinates[:1] if c < box.dimension]
+            mine = [c for c in self.coordinates if c < box.dimension]
             moving[first:last] = bool((box.upper[mine] > box.lower[mine]).any())
         return moving
 

@@ -20,7 +20,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.comparison.compare import compare, comparison_remarks, comparison_table
 from sparserob_core.experiment.comparison.figure import draw_comparison, write_comparison
 from sparserob_core.experiment.comparison.labels import labels
-from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from tests.support.stub import Command
 

@@ -13,8 +13,8 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.experiment.config.overrides import quoted
-from sparserob_core.experiment.config.reader import read_value, write_yaml
+from sparserob_core.experiment.config.reading.overrides import quoted
+from sparserob_core.experiment.config.reading.reader import read_value, write_yaml
 
 BILLION_LAUGHS = b"a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + b"".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n".encode() for i in range(1, 12)

@@ -20,7 +20,7 @@ from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.matrices import files
 from sparserob_core.experiment.config.matrices.packed import pack, unpack
-from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.sweep.plan import make_plan
 from tests.support.places import PLANTS, needs_plants
 

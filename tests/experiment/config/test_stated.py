@@ -13,7 +13,7 @@ import sparserob_core as sr
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.experiment.assemble import problem_of
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.experiment.config.reader import Source, require_readable, write_yaml
+from sparserob_core.experiment.config.reading.reader import Source, require_readable, write_yaml
 from sparserob_core.experiment.config.stated.problem import WRITTEN, WRITTEN_OF_SYSTEM
 from sparserob_core.experiment.config.stated.source import component_keys, dictionary_keys, source_of
 from sparserob_core.experiment.plugins.registry import load_registry

@@ -138,7 +138,7 @@ def benchmark(
 
 def _choice(text: str) -> str | Mapping[str, Any]:
     """A name, or a mapping with a name and options."""
-    from sparserob_core.experiment.config.reader import read_value
+    from sparserob_core.experiment.config.reading.reader import read_value
 
     value = read_value(text) if text.strip().startswith("{") else text
     if isinstance(value, str | Mapping):

@@ -78,7 +78,7 @@ def sweep(
     interrupted.
     """
     from sparserob_core.experiment.cli.shell.live_table import LiveTable
-    from sparserob_core.experiment.config.reader import read_value
+    from sparserob_core.experiment.config.reading.reader import read_value
     from sparserob_core.experiment.run.viewer import recorded, recorder
     from sparserob_core.experiment.sweep.study import remarks_of, shown
     from sparserob_core.experiment.sweep.sweep import outline

@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.config.reader import Source
+from sparserob_core.experiment.config.reading.reader import Source
 from sparserob_core.experiment.config.stated.problem import problem_keys
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.guards import unguarded

@@ -6,7 +6,7 @@ import io
 import json
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path as File
 from typing import TYPE_CHECKING, Any, final
@@ -31,12 +31,15 @@ __all__ = ["Source", "read_source", "read_value", "require_readable", "write_yam
 @dataclass(frozen=True, eq=False)
 class Source:
     """A config as it was given: its ``data``, and its ``text``, which says where each key of it stands. ``name`` is the
-    file as the user wrote it."""
+    file as the user wrote it. Of one that extends a ``base`` the ``data`` hold what the base says too, and ``own`` what
+    it says itself."""
 
     name: str
     folder: File
     data: dict[str, Any]
     text: str = ""
+    base: Source | None = None
+    own: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
     def marks(self) -> object:
@@ -48,14 +51,20 @@ class Source:
         except (YAMLError, ValueError):
             return None
 
+    def writer(self, path: Path) -> Source:
+        """The config of the chain that decides what stands at ``path``; this one, where none does."""
+        if self.base is None or _decides(self.own, path) or not _decides(self.base.data, path):
+            return self
+        return self.base.writer(path)
+
     def where(self, path: Path) -> str:
         """``file:line:column`` of the key, or of the nearest one above it that was written."""
-        line, column = self.position(path)
-        return self.name if not self.text else f"{self.name}:{line + 1}:{column + 1}"
+        writer, (line, column) = self.writer(path), self.position(path)
+        return writer.name if not writer.text else f"{writer.name}:{line + 1}:{column + 1}"
 
     def position(self, path: Path) -> tuple[int, int]:
         """Line and column of the same, counted from 0; ``(0, 0)`` where positions are unknown."""
-        node, place = self.marks, (0, 0)
+        node, place = self.writer(path).marks, (0, 0)
         for step in path:
             found = _position(node, step)
             if found is None:
@@ -210,6 +219,17 @@ def _position(node: Any, step: str | int) -> tuple[tuple[int, int], object] | No
     except (KeyError, IndexError, AttributeError, TypeError):
         pass
     return None
+
+
+def _decides(data: Any, path: Path) -> bool:
+    """Whether there is a value at ``path``, or one above it that leaves no room for others."""
+    for step in path:
+        if not isinstance(data, Mapping):
+            return True
+        if step not in data:
+            return False
+        data = data[step]
+    return True
 
 
 def _plain(value: Any) -> Any:

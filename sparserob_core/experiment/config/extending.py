@@ -1,0 +1,88 @@
+"""A config that begins from another one: ``extends: base.yaml``."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path as File
+from typing import Any
+
+from sparserob_core.encodings import name_of, path_of
+from sparserob_core.errors import ConfigError, Path
+from sparserob_core.experiment.config.matrices.files import resolve
+from sparserob_core.experiment.config.reading.reader import Source, read_source
+from sparserob_core.experiment.config.run_config import SLOTS, RunConfig
+from sparserob_core.experiment.plugins.messages import Complaint, models_in, shown
+
+EXTENDS = "extends"
+MEANING = (
+    "The file of a config, relative to this one, whose keys hold where this one says nothing. Keys of sections and of"
+    " components of the same name are taken one by one; any other value stands in the place of the other's."
+)
+SECTIONS = {(name,) for name, field in RunConfig.model_fields.items() if [*models_in(field.annotation)]}
+"""Where keys are taken one by one, beside components of one name."""
+
+
+def extended(source: Source) -> Source:
+    """The config with what the one that it extends says beside it, and so on along the chain.
+
+    Keys of sections, and of components of the same name, are taken one by one; any other value, a list, a set or a
+    system, stands in the place of the other's. Raises `ConfigError` where there is no such file, or a circle.
+    """
+    return _extended(source, ())
+
+
+def movable(source: Source) -> tuple[dict[str, Any], list[Complaint]]:
+    """The data of a config as they may stand elsewhere: the files of its plugins by their whole names, the numbers of
+    matrices instead of their files; and what is wrong with these."""
+    data = copy.deepcopy(source.data)
+    wrong = list(resolve(data, lambda _: source.folder))
+    files = data.get("plugins")
+    if isinstance(files, list) and all(isinstance(file, str) for file in files):
+        data["plugins"] = [name_of((source.folder / path_of(file)).resolve()) for file in files]
+    return data, wrong
+
+
+def _extended(source: Source, above: tuple[File, ...]) -> Source:
+    if EXTENDS not in source.data:
+        return source
+    stated = source.data[EXTENDS]
+    if not isinstance(stated, str) or not stated:
+        raise _fault(source, f"expected the file of a config (got {shown(stated)})")
+    above = (*above, File(source.name).resolve())
+    file = source.folder / path_of(stated)
+    if file.resolve() in above:
+        circle = " -> ".join(one.name for one in (*above[above.index(file.resolve()) :], file))
+        raise _fault(source, f"the configs extend one another in a circle: {circle}")
+    try:
+        base = read_source(file)
+    except ConfigError as error:
+        raise _fault(source, str(error)) from None
+    base = _extended(base, above)
+    data, wrong = movable(base)
+    if wrong:
+        raise ConfigError("\n".join(f"{base.where(one.path)}: {one}" for one in wrong))
+    own = {key: value for key, value in source.data.items() if key != EXTENDS}
+    return replace(source, data=_over(data, own, ()), base=base, own=own)
+
+
+def _fault(source: Source, said: str) -> ConfigError:
+    return ConfigError(f"{source.where((EXTENDS,))}: {EXTENDS}: {said}")
+
+
+def _over(base: object, own: object, path: Path) -> Any:
+    """The value at ``path`` of a config that extends another one, of the values in both."""
+    slot = next((slot for place, slot in SLOTS.items() if place == path), None)
+    if slot is not None:
+        base, own = ({"name": value} if isinstance(value, str) else value for value in (base, own))
+    elif path and path not in SECTIONS:
+        return copy.deepcopy(own)
+    if not isinstance(base, Mapping) or not isinstance(own, Mapping):
+        return copy.deepcopy(own)
+    name = None if slot is None else base.get("name", slot.name)
+    if slot is not None and own.get("name", name) != name:
+        return copy.deepcopy(own)
+    told = {} if name is None else {"name": name}
+    both = {key: _over(base[key], own[key], (*path, key)) if key in base else own[key] for key in own}
+    return {**told, **base, **copy.deepcopy(both)}
