@@ -111,13 +111,21 @@ class RowUnits:
         return self._measured(self._middle, states=True)[1]
 
     def slack(self, direction: Array, limit: arb) -> float:
-        """What counts as none in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its facet, or
-        the sum of those of the facets that it is a sum of."""
+        """How closely doubles tell ``c'x`` in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its
+        facet, or the sum of those of the facets that it is a sum of."""
         shape = known(self.shape)
         if shape.facets is None:
             width = float(limit.mid()) - float(direction @ shape.centre)
             return TOLERANCE * max(width, RESOLVED * float(np.abs(direction) @ self.sums))
         return TOLERANCE * float(shape.shares(direction) @ self.resolved)
+
+    def excused(self, direction: Array, limit: arb) -> float:
+        """What a claim excuses in any direction, likewise (decision 0088)."""
+        shape = known(self.shape)
+        if shape.facets is None:
+            width = float(limit.mid()) - float(direction @ shape.centre)
+            return TOLERANCE * max(width, float(np.abs(direction) @ self.floors))
+        return TOLERANCE * float(shape.shares(direction) @ self.rows)
 
     @property
     def _middle(self) -> tuple[float, ...]:
