@@ -113,19 +113,20 @@ class RowUnits:
     def slack(self, direction: Array, limit: arb) -> float:
         """How closely doubles tell ``c'x`` in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its
         facet, or the sum of those of the facets that it is a sum of."""
-        shape = known(self.shape)
-        if shape.facets is None:
-            width = float(limit.mid()) - float(direction @ shape.centre)
-            return TOLERANCE * max(width, RESOLVED * float(np.abs(direction) @ self.sums))
-        return TOLERANCE * float(shape.shares(direction) @ self.resolved)
+        return self._share(direction, limit, lambda: self.resolved, lambda: RESOLVED * self.sums)
 
     def excused(self, direction: Array, limit: arb) -> float:
         """What a claim excuses in any direction, likewise (decision 0088)."""
+        return self._share(direction, limit, lambda: self.rows, lambda: self.floors)
+
+    def _share(self, direction: Array, limit: arb, facets: Callable[[], Array], least: Callable[[], Array]) -> float:
+        """`TOLERANCE` of a direction's unit: of those of the ``facets (k,)``, or, of a curved set, of its width, no
+        less than what the ``least (d,)`` of the states make."""
         shape = known(self.shape)
         if shape.facets is None:
             width = float(limit.mid()) - float(direction @ shape.centre)
-            return TOLERANCE * max(width, float(np.abs(direction) @ self.floors))
-        return TOLERANCE * float(shape.shares(direction) @ self.rows)
+            return TOLERANCE * max(width, float(np.abs(direction) @ least()))
+        return TOLERANCE * float(shape.shares(direction) @ facets())
 
     @property
     def _middle(self) -> tuple[float, ...]:
