@@ -22,6 +22,7 @@ from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Stopped, Worst
+from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.loop_tube import LoopTube
@@ -444,7 +445,7 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = RowUnits(case.problem, scene, everything, horizon, horizon, varying=case.changing).sums
     answers, found = answers_of(case), []
-    last = answers.loop.nodes[-1].tolist() if case.looped else _unreached(case)
+    last = answers.loop.nodes[-1].tolist() if case.looped else _unreached(case, scene)
     for state, value in case.equalities:
         if case.several:
             raise Unchecked("the checker knows fixed final states beside disturbances of one class")
@@ -455,13 +456,15 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     return found
 
 
-def _unreached(case: Case) -> list[list[arb]]:
+def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
     """The final state ``(d, 1)`` where no uncertainty reaches what is fixed of it, whatever the control."""
     if isinstance(case.changing, SpreadFlow):
         raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
     for state, _ in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
+    if isinstance(case.changing, VaryingFlow):  # over many orbits, in units that follow them
+        return list(VaryingTube(case.changing, scene, np.eye(case.problem.system.states)).nodes[-1].tolist())
     return case.nominal_states[-1].tolist()
 
 

@@ -134,6 +134,16 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
     return value - limit, slack
 
 
+def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
+    """How much of that counts as none: what a claim excuses of a constraint on the state, which may be less than the
+    ``slack`` up to which its figure is known; of others the slack."""
+    name, direction = str(data.get("constraint")), numbers(data.get("direction"), "direction")
+    if commanded(case, name) is not None or (name == EQUALS and case.equalities):
+        return slack
+    window = case.window(name)
+    return min(slack, case.units(window).excused(direction, window.limit(direction, number(data, "time"))))
+
+
 def _farthest(
     case: Case, direction: tuple[Array, Array], time: float, parameter: Sequence[float], piece: int | None
 ) -> arb:

@@ -125,13 +125,29 @@ class RowUnits:
         return self._measured(self._middle, states=True)[1]
 
     def slack(self, direction: Array, limit: arb) -> float:
-        """What counts as none in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its facet, or
-        the sum of those of the facets that it is a sum of."""
+        """How closely doubles tell ``c'x`` in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its
+        facet, or the sum of those of the facets that it is a sum of."""
+        return self._share(
+            direction,
+            limit,
+            lambda: self.resolved,
+            lambda width: max(RESOLVED * float(np.abs(direction) @ self.sums), self.least(direction, width)),
+        )
+
+    def excused(self, direction: Array, limit: arb) -> float:
+        """What a claim excuses in any direction, likewise (decision 0088)."""
+        return self._share(direction, limit, lambda: self.rows, lambda width: self.least(direction, width))
+
+    def _share(
+        self, direction: Array, limit: arb, facets: Callable[[], Array], least: Callable[[float], float]
+    ) -> float:
+        """`TOLERANCE` of a direction's unit: of those of the ``facets (k,)``, or, of a curved set, of its width, but
+        no less than the ``least`` for that width."""
         shape = known(self.shape)
         if shape.facets is None:
             width = float(limit.mid()) - float(direction @ shape.centre)
-            return TOLERANCE * max(width, RESOLVED * float(np.abs(direction) @ self.sums), self.least(direction, width))
-        return TOLERANCE * float(shape.shares(direction) @ self.resolved)
+            return TOLERANCE * max(width, least(width))
+        return TOLERANCE * float(shape.shares(direction) @ facets())
 
     @property
     def _middle(self) -> tuple[float, ...]:

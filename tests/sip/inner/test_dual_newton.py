@@ -12,7 +12,14 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.run.conclusion import fewest
 from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.inner.dual_newton import DualNewton, _Dual, from_nothing, newton_solve, not_separable
+from sparserob_core.sip.inner.dual_newton import (
+    DualNewton,
+    _Dual,
+    _non_negative,
+    from_nothing,
+    newton_solve,
+    not_separable,
+)
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.testing.solvers import (
     badly_scaled_instances,
@@ -131,6 +138,16 @@ def test_what_it_is_not_for_is_given_up_in_words() -> None:
     solution = solve_finite(coupled, DualNewton())
     assert solution.status == "failed"
     assert any("couples variables" in said for said in solution.attempts)
+
+
+def test_active_sets_that_go_round_are_given_up() -> None:
+    """An indefinite matrix lets them; of rows that crowd, rounding does, and each step took 3 sets a row."""
+    curved, linear, free = np.array([[1.3, 0.8], [0.3, -0.3]]), np.array([0.9, 0.4]), np.zeros(2, dtype=bool)
+    with pytest.raises(np.linalg.LinAlgError, match="go round"):
+        _non_negative(curved, linear, ~free, free)
+    definite = curved.T @ curved
+    found = _non_negative(definite, linear, ~free, free)
+    assert (found >= 0.0).all() and (definite @ found - linear >= -1e-12).all()
 
 
 def test_a_program_that_no_answer_meets_is_not_claimed_to_be_solved() -> None:
