@@ -124,8 +124,8 @@ class ConvexSet(ABC):
         flat, axes = self.halfspaces(), np.eye(self.dimension)
         if flat is None or not self.is_bounded:
             return axes
-        H, radii = flat[0], (self.support(axes) + self.support(-axes)) / 2.0
-        closed = self.support(H) + self.support(-H) <= CLOSED * (np.abs(H) @ radii)
+        H, radii = flat[0], self.width(axes) / 2.0
+        closed = self.width(H) <= CLOSED * (np.abs(H) @ radii)
         return null_space(H[closed]) if closed.any() else axes
 
     @property
@@ -133,7 +133,7 @@ class ConvexSet(ABC):
         """Rows ``N (b, d)`` that span what `normals` span, in whose coordinates ``c = z N`` the set is about round: it
         reaches about as far along every ``z`` of the same length. In other units of the set ``z`` stays the same."""
         axes = self.normals
-        width = self.support(axes) + self.support(-axes)
+        width = self.width(axes)
         return few_digits(axes / np.where((width > 0.0) & np.isfinite(width), width / 2.0, 1.0)[:, None])
 
     @shaped
@@ -165,6 +165,12 @@ class ConvexSet(ABC):
         """``max {|c'x| : x in the set}`` of directions ``(..., d)``, as ``(...,)``."""
         farthest: Array = np.maximum(self.support(directions), self.support(-directions))
         return farthest
+
+    @shaped
+    def width(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
+        """``max c'x - min c'x`` over the set for directions ``(..., d)``, as ``(...,)``."""
+        between: Array = self.support(directions) + self.support(-directions)
+        return between
 
     @property
     def radius_bound(self) -> float:
@@ -328,7 +334,7 @@ class ConvexSet(ABC):
         `PIVOTS` suffice.
         """
         N = self.normals
-        widths = (self.support(N) + self.support(-N)) / 2
+        widths = self.width(N) / 2
         widths = np.where(widths > 0, widths, 1.0)[:, None]
         into, back = N.T / widths.T, N / widths  # to coordinates in which the bounding box is a cube; of directions
         origins, rays = origins @ into, rays @ into

@@ -391,6 +391,14 @@ class Spread:
         return np.concatenate(found)
 
     @cached_property
+    def lost(self) -> float:
+        """Of their size, by how much points of the sets that are written down miss the deviations that they stand for:
+        what is `missed`, and rounding of points that are far from 0 beside how far they deviate."""
+        moving = self.radii > 0.0 if self.still is None else (self.radii > 0.0) & ~self.still
+        far = (np.abs(self.middle) / np.where(moving, self.radii, np.inf)).max(initial=0.0)
+        return float(self.missed + np.finfo(float).eps * (1.0 + far))
+
+    @cached_property
     def chords(self) -> Array:
         """How long the set is along each axis through the middle, ``(Q,)``, in parts of the axis: for all ``a`` in its
         span, the width of the set along ``a`` is at least that times ``|a_i|``. Of a set without an interior the axes

@@ -227,7 +227,9 @@ def test_a_zonotope_has_the_facets_that_its_generators_span():
     assert len(np.unique(np.round(H, 9), axis=0)) == 6
     assert h == pytest.approx(hexagon.support(H))
     flat = sr.load_registry().build("set", "zonotope", {"generators": [[1, 1]]}).build(2)
-    assert flat.halfspaces() is None
+    across, room = flat.halfspaces()  # of a segment its ends, and what it does not reach across
+    assert np.abs(across @ np.array([1.0, -1.0])) == pytest.approx(np.array([0.0, 2.0] * 2) / np.sqrt(2.0), abs=1e-12)
+    assert (across[:2] == -across[2:]).all() and room == pytest.approx(flat.support(across), abs=1e-12)
     assert flat.support(np.array([[1.0, -1.0], [1.0, 1.0]])) == pytest.approx([0.0, 2.0])
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, balls
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
-from sparserob_core.checker.sets.shape import Shape, along, total
+from sparserob_core.checker.sets.shape import NEAR, Shape, along, total
 from sparserob_core.control.sets.sets import Cylinder, Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array
 
@@ -243,8 +243,8 @@ class Joint(Shape):
     def holds(self, point: Sequence[arb]) -> bool:
         return all(part.holds(point[place]) for part, place in zip(self.parts, self.places, strict=True))
 
-    def member(self, point: Sequence[float] | Array) -> list[arb] | None:
-        each = [part.member(point[place]) for part, place in zip(self.parts, self.places, strict=True)]
+    def member(self, point: Sequence[float] | Array, near: float = NEAR) -> list[arb] | None:
+        each = [part.member(point[place], near) for part, place in zip(self.parts, self.places, strict=True)]
         known = [one for one in each if one is not None]
         return [x for one in known for x in one] if len(known) == len(each) else None
 

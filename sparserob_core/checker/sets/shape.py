@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 # Of a set's size: what is no further off counts as no direction of its own, and a point as one of the set. Nothing
 # false is believed with more of it: points are replaced by some of the set. A run's own number is a tenth of it.
 NEAR = 1e-8
+WRITTEN = 1e-13  # of a point's size, what rounding of its numbers may have moved it; a tenth is what products of norms round
 PARALLEL = 1e-12  # of unit vectors: rows that differ by less are opposite ones
 SPARE = 20  # bits of the working precision by which a point that is to be in a set is drawn inwards
 
@@ -54,21 +55,22 @@ class Shape(ABC):
         out of it."""
         if self.holds(balls(point)):
             return True
-        if self.member(point) is not None:
+        if self.member(point, WRITTEN) is not None:
             raise Unchecked(f"rounding may have taken a point out of the {self.source.kind}")
         return False
 
-    def member(self, point: Sequence[float] | Array) -> list[arb] | None:
+    def member(self, point: Sequence[float] | Array, near: float = NEAR) -> list[arb] | None:
         """The point of the set that an exact one stands for: itself, or one of the set next to it, since floats are
-        seldom in a thin one; of a set without an interior one along its `segments`. ``None`` where there is none."""
+        seldom in a thin one; of a set without an interior one along its `segments`. ``None`` where there is none as ``near``, in parts of the
+        size of both."""
         if self.segments is None and self.holds(balls(point)):
             return balls(point)
-        near = self.nearest(np.asarray(point, dtype=float))
-        if near is None:
+        found = self.nearest(np.asarray(point, dtype=float))
+        if found is None:
             return None
-        size = NEAR * max(max(self.radius, default=0.0), float(np.abs(point).max(initial=0.0)))
-        far = total(abs(a - b) for a, b in zip(near, balls(point), strict=True))
-        return near if far <= size else None
+        size = max(max(self.radius, default=0.0), float(np.abs(point).max(initial=0.0)))
+        far = total(abs(a - b) for a, b in zip(found, balls(point), strict=True))
+        return found if far <= near * size else None
 
     def nearest(self, point: Array) -> list[arb] | None:
         """A point of the set next to another one, in what its `segments` span where it has some; ``None`` of a kind

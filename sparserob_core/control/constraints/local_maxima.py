@@ -252,7 +252,7 @@ def step_out(
     """
     points, values, middle = points.copy(), values.copy(), convex.interior_point()
     axes = np.eye(middle.size)
-    every, moves = np.arange(values.size), DIFFERENCE * (convex.support(axes) + convex.support(-axes)) * axes
+    every, moves = np.arange(values.size), DIFFERENCE * convex.width(axes) * axes
     for _ in range(STEPS):
         inner = np.repeat(points[:, None], 2 * middle.size, axis=1)
         inner[:, :, 1:] += INWARD * (middle - inner[:, :, 1:]) + np.vstack([moves, -moves])

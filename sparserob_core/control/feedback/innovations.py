@@ -58,22 +58,27 @@ def innovations_seen(
     return np.concatenate([D.reshape(K, d, -1), begun], axis=2)
 
 
-def unfelt(response: Response, model: DisturbanceModel, far: Array, least: float) -> np.ndarray:
-    """Which entries of a disturbance of at most ``far (mw,)`` bring no state further than ``least`` by any breakpoint,
-    block by block, ``(blocks, mw)``."""
-    grid, steps = response.grid, response.steps(KNOWN)
-    assert model.starts is not None
-    block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
-    pushes = steps.Gamma[0, response.which] @ grid.of_modes(steps.E[0])[grid.modes]
-    pushes = pushes * far
-    nodes = np.zeros((response.initial_state.size, model.block_count, pushes.shape[2]))
-    most = np.zeros(nodes.shape[1:])
-    if (np.abs(pushes).max(axis=(0, 1)) > least).all():
-        return most > 0.0
+def unfelt(
+    response: Response, model: DisturbanceModel | None, far: Array, begun: Array, rows: Array, least: float
+) -> np.ndarray:
+    """Which entries ``(Q,)`` of a disturbance of at most ``far (mw,)``, block after block, and then of initial states
+    that deviate by at most ``begun (d,)``, or none, ``(0,)``, bring none of the ``rows (r, d)`` further than ``least``
+    at any breakpoint."""
+    grid, steps, first = response.grid, response.steps(KNOWN), 0
+    if model is not None:
+        assert model.starts is not None
+        first = model.block_count * far.size
+        block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
+        pushes = steps.Gamma[0, response.which] @ grid.of_modes(steps.E[0])[grid.modes] * far
+        own = block[:, None] * far.size + np.arange(far.size)
+    nodes = np.zeros((response.initial_state.size, first + begun.size))
+    nodes[:, first:] = np.eye(len(nodes), begun.size) * begun
+    most = np.abs(rows @ nodes).max(axis=0, initial=0.0)
     for piece in range(grid.pieces):
-        nodes = np.tensordot(steps.Phi[0, response.which[piece]], nodes, axes=1)
-        nodes[:, block[piece]] += pushes[piece]
-        most = np.maximum(most, np.abs(nodes).max(axis=0))
+        nodes = steps.Phi[0, response.which[piece]] @ nodes
+        if first:
+            nodes[:, own[piece]] += pushes[piece]
+        most = np.maximum(most, np.abs(rows @ nodes).max(axis=0, initial=0.0))
     return most <= least
 
 

@@ -100,7 +100,7 @@ class Zonotope(ConvexSet):
         H = np.vstack([*within, turned[rank:]])
         H, both, size = (
             np.vstack([H, -H]),
-            np.tile(self.support(H) + self.support(-H), 2),
+            np.tile(self.width(H), 2),
             np.abs(self.generators).sum(axis=0),
         )
         room = np.where(both > CLOSED * (np.abs(H) @ size), 0.0, ROUNDED)

@@ -24,17 +24,22 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.measurable import MISSED
-from sparserob_core.control.transcription.own_units import THIN, added_up, fixed, units_of_steps
+from sparserob_core.control.transcription.own_units import added_up, fixed, rows_in_sizes, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import CLOSED, Array, ConvexSet
+from sparserob_core.shapes import read_only
+from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import Formulation
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
+# Of the size of a row, what an entry of a deviation does to it at most that nothing answers. With a tenth of it, initial
+# states that deviate by 1e-10 are answered by gains of 1e10, and their programs fail; with ten times as much, costs are
+# off by more than decision 0088 excuses.
+STILL = 1e-9
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
@@ -213,7 +218,7 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
     problem, disturbance, begins = own.problem, own.functionals.disturbance, own.problem.initial_set is not None
     pieces = measurable_pieces(own.functionals)
     spread = _spread(own, pieces, None)
-    still = _still(own, spread)
+    still: np.ndarray = read_only(_still(own, spread))
     spread = replace(spread, still=still)
     blocks = 0 if disturbance is None else disturbance.block_count
     deviations = np.tile(units.disturbances[: problem.system.disturbances], blocks)
@@ -328,23 +333,29 @@ def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | N
 
 
 def _still(own: Posed, spread: Spread) -> np.ndarray:
-    """Which entries ``(Q,)`` of the disturbance do no more to any state, and of the initial state deviate by no more,
-    than doubles resolve: gains on these would be without measure. All of a set, or of a box those entries. None beside
-    fixed final states, which hold at every deviation."""
-    initial, disturbance, bound = own.problem.initial_set, own.functionals.disturbance, own.problem.disturbance
-    found = np.zeros(spread.size, dtype=bool)
+    """Which entries ``(Q,)`` of the disturbance, and of the initial state, do no more to any row than doubles resolve
+    of what the row keeps (decision 0088): gains on these would be without measure. All of a set, or of a box those
+    entries. None beside fixed final states, which hold at every deviation."""
+    found, model = np.zeros(spread.size, dtype=bool), own.functionals.disturbance
     if fixed(own.problem)[1].size:
         return found
-    if initial is not None:
-        still = initial.support(np.eye(initial.dimension)) + initial.support(-np.eye(initial.dimension)) <= CLOSED
-        if still.all() or initial.is_box:
-            found[spread.size - still.size :] = still
-    if bound is not None and disturbance is not None and disturbance.kind == "piecewise_constant":
-        far = bound.support(np.eye(bound.dimension)) + bound.support(-np.eye(bound.dimension))
-        still = unfelt(own.functionals.response, disturbance, far, THIN)
-        still = still if bound.is_box else np.repeat(still.all(axis=1, keepdims=True), bound.dimension, axis=1)
-        found[: still.size] = still.ravel()
+    held = None if model is None or model.kind != "piecewise_constant" else own.problem.disturbance
+    sets = [held, own.problem.initial_set]
+    far, begun = (np.zeros(0) if one is None else one.width(np.eye(one.dimension)) for one in sets)
+    rows = rows_in_sizes(own.constraints, own.problem.system.states)
+    still = unfelt(own.response, None if held is None else model, far, begun, rows, STILL)
+    begins = [still[still.size - begun.size :]] * (1 + _begins_anew(own))
+    blocks = still[: still.size - begun.size].reshape(-1, max(far.size, 1))
+    if held is not None:
+        found[: blocks.size] = _of_all(held, blocks).ravel()
+    if own.problem.initial_set is not None:
+        found[spread.size - begun.size * len(begins) :] = _of_all(own.problem.initial_set, np.array(begins)).ravel()
     return found
+
+
+def _of_all(convex: ConvexSet, still: np.ndarray) -> np.ndarray:
+    """The entries ``(k, q)`` of points of a set that are still; of one that is no box all of a point, or none."""
+    return still if convex.is_box else np.repeat(still.all(axis=1, keepdims=True), convex.dimension, axis=1)
 
 
 def _begins_anew(posed: Posed) -> bool:

@@ -297,7 +297,7 @@ class RobustRows(Working):
             for cut, y, w in zip(self.cuts, answer.y, named, strict=True)
             if y > 0.0
         )
-        return Dual(bound - (ROUNDING + self.counterpart.spread.missed) * size, cuts, answer.mu, at=at)
+        return Dual(bound - (ROUNDING + self.counterpart.spread.lost) * size, cuts, answer.mu, at=at)
 
     @property
     def at_rest(self) -> Dual:

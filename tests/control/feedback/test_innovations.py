@@ -97,8 +97,8 @@ def test_gains_have_effects_on_all_that_is_seen_though_they_answer_less() -> Non
     assert same.variables == answers(D, np.tril(np.ones((K, K), dtype=bool)), 2).variables
 
 
-def test_what_a_disturbance_does_to_no_state_by_any_breakpoint_is_unfelt() -> None:
-    """``x' = 3 x + w``: what acts early grows; a second entry acts on a state that forgets."""
+def test_what_a_deviation_does_to_no_row_by_any_breakpoint_is_unfelt() -> None:
+    """``x' = 3 x + w``: what acts early grows; a second entry acts on a state that forgets, and so does the beginning."""
     problem = sr.OptimalControlProblem(
         system=LinearSystem(np.diag([3.0, -3.0]), np.ones((2, 1))),
         horizon=2.0,
@@ -110,8 +110,15 @@ def test_what_a_disturbance_does_to_no_state_by_any_breakpoint_is_unfelt() -> No
     functionals = prepare(problem, grid, grid).functionals
     pushed = (np.exp(1.5) - 1.0) / 3.0 * np.exp(1.5 * np.arange(3, -1, -1))
     forgot = (1.0 - np.exp(-1.5)) / 3.0
+    response, model, rows = functionals.response, functionals.disturbance, np.array([[0.5, 0.0], [0.0, -2.0]])
     for least in (*(pushed * 1.001), *(pushed * 0.999), forgot * 1.001, forgot * 0.999):
-        found = unfelt(functionals.response, functionals.disturbance, np.ones(2), least)
+        found = unfelt(response, model, np.ones(2), np.zeros(0), np.eye(2), least).reshape(4, 2)
         assert found.tolist() == [[one <= least, forgot <= least] for one in pushed.tolist()]
-    found = unfelt(functionals.response, functionals.disturbance, np.array([0.0, 1.0]), 1e-12)
-    assert found.tolist() == [[True, False]] * 4
+        found = unfelt(response, model, np.ones(2), np.array([0.1, 0.2]), rows, least)
+        effects = [[0.5 * one, 2.0 * forgot] for one in pushed.tolist()]
+        assert found[:8].reshape(4, 2).tolist() == [[one <= least for one in pair] for pair in effects]
+        assert found[8:].tolist() == [0.05 * np.exp(6.0) <= least, 0.4 <= least]
+        assert unfelt(response, None, np.zeros(0), np.array([0.1, 0.2]), rows, least).tolist() == found[8:].tolist()
+    found = unfelt(response, model, np.array([0.0, 1.0]), np.zeros(0), np.eye(2), 1e-12)
+    assert found.tolist() == [True, False] * 4
+    assert unfelt(response, model, np.ones(2), np.ones(2), np.zeros((0, 2)), 0.0).all()

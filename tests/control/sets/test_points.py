@@ -147,9 +147,9 @@ def test_effects_are_those_of_the_gains_on_all_that_is_seen(place: str, thick: f
     assert loop.spread.support(effects[-1]) == pytest.approx(loop.spread.support(loop.effects(x)[-1]), abs=1e-14)
 
 
-def test_what_is_still_is_what_no_state_feels() -> None:
-    """Of initial states widths of 1e-9, of disturbances what moves no state by 2^-37; none beside fixed final states,
-    all of a ball or nothing, but every side of a box for itself."""
+def test_what_is_still_is_what_no_row_feels() -> None:
+    """What moves no row by a billionth of its size, 0.6 here; none beside fixed final states, all of a ball or nothing,
+    but every side of a box for itself. A plant that amplifies makes rows feel what states of their own size do not."""
     options: dict[str, Any] = {
         "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
         "policy": {"name": "affine", "cost": "peak"},
@@ -163,11 +163,38 @@ def test_what_is_still_is_what_no_state_feels() -> None:
 
     end = [{"box": [0.3, 0.3]}]
     assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "box": [1e-12, 0.03]}) == [True, False]
-    assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "box": [1e-7, 0.03]}) == [False, False]
+    assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "box": [1e-8, 0.03]}) == [False, False]
     assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "norm": {"p": 2, "radius": 1e-12}}) == [True] * 2
-    assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "norm": {"p": 2, "radius": 1e-6}}) == [False] * 2
+    assert still(terminal=end, initial_state={"centre": [1.0, 0.0], "norm": {"p": 2, "radius": 1e-8}}) == [False] * 2
     assert still(terminal=end, disturbance={"box": [1e-13, 0.03]}) == [True, False] * 4
-    assert still(terminal=end, disturbance={"box": [1e-9, 0.03]}) == [False, False] * 4
+    assert still(terminal=end, disturbance={"box": [1e-8, 0.03]}) == [False, False] * 4
+    assert still(terminal=[{"box": [30.0, 30.0]}], disturbance={"box": [1e-8, 0.03]}) == [True, False] * 4
     assert still(terminal=end, disturbance={"zonotope": {"generators": [[1e-13, 0], [0, 0.03]]}}) == [False] * 8
+    ball = [{"norm": {"p": 2, "radius": 0.3}}]
+    assert still(terminal=ball, disturbance={"box": [1e-13, 0.03]}) == [True, False] * 4
     fixed = [{"equals": [0, 0]}]
     assert still(terminal=fixed, initial_state={"centre": [1.0, 0.0], "box": [1e-12, 0.03]}) == [False, False]
+
+
+def test_what_an_unstable_plant_amplifies_is_not_still() -> None:
+    """``x' = 10 x + u + w`` over three units of time: a state of 1 is e^-30 of what it could become."""
+    plant = {"A": [[10.0]], "B": [[1.0]]}
+    model = assemble(
+        load_config(
+            {
+                "problem": {
+                    "name": "linear",
+                    "system": plant,
+                    "horizon": 3.0,
+                    "initial_state": [0.01],
+                    "control": {"box": [1.0]},
+                    "disturbance": {"box": [1e-3]},
+                    "terminal": [{"box": [0.5]}],
+                },
+                "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 6}},
+                "policy": {"name": "affine", "cost": "peak"},
+            }
+        )
+    ).model
+    assert model.feedback is not None
+    assert not model.feedback.loop.spread.still.any()  # type: ignore[union-attr]
