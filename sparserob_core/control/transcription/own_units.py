@@ -46,7 +46,7 @@ def rough_units(problem: OptimalControlProblem) -> Units:
     index = ParameterIndex(system.parameters)
     parameters = np.ones(0) if system.parameters is None else power_of_two(_widths(system.parameters))
     every = [mode.matrices(looked_at(index)) for mode in system.forced.modes]
-    A, B, E = (np.abs(np.concatenate([one[part] for one in every])).max(axis=0) for part in range(3))
+    A, B, E = _largest(every)
     # a fast system is coupled through for a time of about 1/norm only; the eigenvalues do not depend on the units
     fastest = max(float(np.abs(np.linalg.eigvals(one[0])).max()) for one in every)  # LAPACK balances
     lasting = float(power_of_two(np.array(min(time, 1.0 / fastest if fastest > 0.0 else np.inf))))
@@ -110,7 +110,8 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     if sides is not None:
         beside = Moving(moved, sides[0]).at(times) if moved.moves else None
         found = reaches(functionals, constraint.parameters, control, sides[0], times, beside, constraint.gains)
-        return units_of_sides(*constraint_sides(constraint), *found)
+        near = np.abs(sides[0]) @ _driven(functionals, constraint.parameters, control)
+        return units_of_sides(*constraint_sides(constraint), *found, near)
     box = constraint.index_set
     z = sampled(box.dimension - 1 - constraint.parameters.count)
     indices = np.hstack([np.tile(box.lower[: box.dimension - z.shape[1]], (z.shape[0], 1)), z])
@@ -121,7 +122,8 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
         return np.ones(1)
     reach, added = reaches(functionals, constraint.parameters, control, directions, times)
     added = added + moved.reach(directions)
-    if (THIN * added > 1.0).all():
+    near = np.abs(directions) @ _driven(functionals, constraint.parameters, control)
+    if (THIN * np.minimum(added, near) > 1.0).all():
         reach = reach + moved.reach(directions)
         return np.maximum(1.0, power_of_two(np.array([POINT * reach[reach > 0.0].min(initial=added.max())])))
     return np.maximum(1.0, power_of_two(np.array([RESOLVED * added.max()])))
@@ -164,12 +166,12 @@ def rows_in_sizes(constraints: Sequence[StateConstraint], d: int) -> Array:
     return np.vstack(found)
 
 
-def units_of_sides(H: Array, h: Array, reach: Array, added: Array) -> Array:
+def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array | float = np.inf) -> Array:
     """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
-    those of them that are not 0, nor `THIN` beside the sums ``added (r,)``; of a row whose width is, ``reach`` alone,
-    since nothing is left to keep away from it. No less than what double precision resolves of these. A power of two,
+    those of them that are not 0, nor `THIN` beside the sums ``added (r,)``, or beside what these are without growth,
+    ``driven (r,)``; of a row whose width is, ``reach`` alone, since nothing is left to keep away from it. No less than what double precision resolves of these. A power of two,
     1.2 to 2.5 times below that."""
-    across, thin = widths(H, h), np.where(np.isfinite(added), THIN * added, 0.0)
+    across, thin = widths(H, h), np.where(np.isfinite(added), THIN * np.minimum(added, driven), 0.0)
     near = np.where(across > thin, np.stack([np.abs(h), across]), 0.0)
     reach = np.where(across > thin, 1.0, POINT) * reach
     sizes = np.vstack([reach[None], np.where(near > thin, near, 0.0)])
@@ -232,6 +234,26 @@ def reaches(
         sums = sums + np.abs(G) @ extent(control)
     reach = np.maximum(np.maximum(high, low), 0.0).max(axis=(0, 1))
     return reach, sums.max(axis=(0, 1))
+
+
+def _driven(functionals: WorstCase, parameters: ParameterIndex, control: ConvexSet) -> Array:
+    """How far each state comes from 0 by all that acts on it for the whole horizon and one coupling, ``(d,)``: what no
+    instability has amplified."""
+    response, time = functionals.response, float(functionals.response.grid.breakpoints[-1])
+    A, B, E = _largest([mode.matrices(looked_at(parameters)) for mode in response.system.forced.modes])
+    inputs, begun = extent(control), np.abs(response.initial_state)
+    if functionals.initial is not None:
+        begun = begun + extent(functionals.initial)
+    far = begun + time * B @ np.concatenate([inputs, np.ones(B.shape[1] - inputs.size)])
+    if functionals.disturbance is not None:
+        far = far + time * E @ extent(functionals.disturbance.bound)
+    return np.asarray(far + time * A @ far)
+
+
+def _largest(every: Sequence[tuple[Array, Array, Array]]) -> list[Array]:
+    """The absolute entries of ``A``, ``B`` and ``E``, with the drift as one more column of ``B``, at the largest of
+    some parameters and in any of the phases."""
+    return [np.abs(np.concatenate([one[part] for one in every])).max(axis=0) for part in range(3)]
 
 
 def fixed(problem: OptimalControlProblem) -> tuple[Array, Array]:
