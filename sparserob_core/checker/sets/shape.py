@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 # Of a set's size: what is no further off counts as no direction of its own, and a point as one of the set. Nothing
 # false is believed with more of it: points are replaced by some of the set. A run's own number is a tenth of it.
 NEAR = 1e-8
-WRITTEN = 1e-13  # of a point's size, what rounding of its numbers may have moved it; a tenth is what products of norms round
+WRITTEN = (
+    1e-13  # of a point's size, what rounding of its numbers may have moved it; a tenth is what products of norms round
+)
 PARALLEL = 1e-12  # of unit vectors: rows that differ by less are opposite ones
 SPARE = 20  # bits of the working precision by which a point that is to be in a set is drawn inwards
 

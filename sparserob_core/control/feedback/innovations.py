@@ -79,7 +79,8 @@ def unfelt(
         if first:
             nodes[:, own[piece]] += pushes[piece]
         most = np.maximum(most, np.abs(rows @ nodes).max(axis=0, initial=0.0))
-    return most <= least
+    felt: np.ndarray = most > least
+    return ~felt
 
 
 def _measurable(response: Response, control: Dictionary, pieces: MeasurablePieces) -> Array:
