@@ -82,3 +82,16 @@ def test_a_proof_names_deviations_within_the_span_and_those_of_other_sets_as_the
     assert spread.named(w)[:2] == pytest.approx(G, rel=1e-15) and spread.named(w)[2:].tolist() == [0.5, 0.0]
     plain = Spread(((1, sr.Zonotope(np.zeros(2), np.array([[0.5, 0.25], [-0.25, 1.0]]))),))
     assert plain.named(np.array([0.3, 0.7])).tolist() == [0.3, 0.7]
+
+
+def test_what_is_lost_of_a_point_is_its_rounding_beside_how_far_it_deviates() -> None:
+    """A point 0.5 from 0 that deviates by 2^-30 is written to 2^-54, which is 2^-24 of that; entries that are still, or
+    do not deviate, are not named."""
+    box = sr.Box([0.5 - 2.0**-30, -1.0, 3.0], [0.5 + 2.0**-30, 1.0, 3.0])
+    assert Spread(((1, box),)).lost == pytest.approx(2.0**-52 * 2.0**29, rel=1e-6)
+    assert Spread(((1, box),), 1e-3).lost == pytest.approx(1e-3 + 2.0**-23, rel=1e-9)
+    assert Spread(((1, box),), still=np.array([True, False, False])).lost == 2.0**-52
+    assert Spread(()).lost == 2.0**-52
+    point, deviation = box.upper[0], 2.0**-30 * (1 - 2.0**-20)
+    missed = abs((0.5 + deviation * (1 + 2.0**-25)) - 0.5 - deviation * (1 + 2.0**-25))
+    assert point == 0.5 + 2.0**-30 and 0.0 < missed <= Spread(((1, box),)).lost * deviation

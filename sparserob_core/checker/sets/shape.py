@@ -63,8 +63,8 @@ class Shape(ABC):
 
     def member(self, point: Sequence[float] | Array, near: float = NEAR) -> list[arb] | None:
         """The point of the set that an exact one stands for: itself, or one of the set next to it, since floats are
-        seldom in a thin one; of a set without an interior one along its `segments`. ``None`` where there is none as ``near``, in parts of the
-        size of both."""
+        seldom in a thin one; of a set without an interior one along its `segments`. ``None`` where there is none as
+        ``near``, in parts of the size of both."""
         if self.segments is None and self.holds(balls(point)):
             return balls(point)
         found = self.nearest(np.asarray(point, dtype=float))

@@ -36,7 +36,7 @@ from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import Formulation
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
-# Of the size of a row, what an entry of a deviation does to it at most that nothing answers. With a tenth of it, initial
+# Of the size of a row, what an entry of a deviation does to it at most that nothing answers. With a tenth, initial
 # states that deviate by 1e-10 are answered by gains of 1e10, and their programs fail; with ten times as much, costs are
 # off by more than decision 0088 excuses.
 STILL = 1e-9

@@ -169,8 +169,8 @@ def rows_in_sizes(constraints: Sequence[StateConstraint], d: int) -> Array:
 def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array | float = np.inf) -> Array:
     """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
     those of them that are not 0, nor `THIN` beside the sums ``added (r,)``, or beside what these are without growth,
-    ``driven (r,)``; of a row whose width is, ``reach`` alone, since nothing is left to keep away from it. No less than what double precision resolves of these. A power of two,
-    1.2 to 2.5 times below that."""
+    ``driven (r,)``; of a row whose width is, ``reach`` alone, since nothing is left to keep away from it. No less than
+    what double precision resolves of these. A power of two, 1.2 to 2.5 times below that."""
     across, thin = widths(H, h), np.where(np.isfinite(added), THIN * np.minimum(added, driven), 0.0)
     near = np.where(across > thin, np.stack([np.abs(h), across]), 0.0)
     reach = np.where(across > thin, 1.0, POINT) * reach

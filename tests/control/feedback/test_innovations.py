@@ -98,7 +98,7 @@ def test_gains_have_effects_on_all_that_is_seen_though_they_answer_less() -> Non
 
 
 def test_what_a_deviation_does_to_no_row_by_any_breakpoint_is_unfelt() -> None:
-    """``x' = 3 x + w``: what acts early grows; a second entry acts on a state that forgets, and so does the beginning."""
+    """``x' = 3 x + w``: what acts early grows; a second entry acts on a state that forgets."""
     problem = sr.OptimalControlProblem(
         system=LinearSystem(np.diag([3.0, -3.0]), np.ones((2, 1))),
         horizon=2.0,
@@ -117,7 +117,7 @@ def test_what_a_deviation_does_to_no_row_by_any_breakpoint_is_unfelt() -> None:
         found = unfelt(response, model, np.ones(2), np.array([0.1, 0.2]), rows, least)
         effects = [[0.5 * one, 2.0 * forgot] for one in pushed.tolist()]
         assert found[:8].reshape(4, 2).tolist() == [[one <= least for one in pair] for pair in effects]
-        assert found[8:].tolist() == [0.05 * np.exp(6.0) <= least, 0.4 <= least]
+        assert found[8:].tolist() == [least >= 0.05 * np.exp(6.0), least >= 0.4]
         assert unfelt(response, None, np.zeros(0), np.array([0.1, 0.2]), rows, least).tolist() == found[8:].tolist()
     found = unfelt(response, model, np.array([0.0, 1.0]), np.zeros(0), np.eye(2), 1e-12)
     assert found.tolist() == [True, False] * 4

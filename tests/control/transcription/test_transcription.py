@@ -253,6 +253,14 @@ def test_a_control_that_answers_has_the_nominal_entries_and_the_units_of_one_tha
         assert literal.index_units.min() < 1.0 < literal.index_units.max()
 
 
+def test_a_slab_that_is_thin_beside_what_a_plant_amplifies_is_one_like_others() -> None:
+    """Sums of 1e13 from states of 1: the slab is 2 wide, and its unit what doubles resolve of the sums."""
+    H, h, sums = np.array([[1.0], [-1.0]]), np.ones(2), np.full(2, 1e13)
+    for driven, unit in ((1.0, 2.0**-18 * 1e13), (np.inf, 2.0**-4 * 1e13)):
+        units = units_of_sides(H, h, sums, sums, np.full(2, driven))
+        assert (1.2 * units <= unit).all() and (unit <= 2.5 * units).all()
+
+
 def test_the_unit_of_a_slab_that_doubles_do_not_resolve_is_how_far_its_row_reaches() -> None:
     """2^-37 of the sums, less than what the checker calls thin; a sixteenth of the reach, since a claim may excuse no
     more than what the row does. A unit is 1.2 to 2.5 times below that."""
