@@ -325,6 +325,13 @@ def test_a_share_has_the_whole_of_its_range_upwards() -> None:
     assert low < 0.0 and high > 1.0 and len(shares) == 2
 
 
+def test_the_headings_of_narrow_climbs_are_short() -> None:
+    from sparserob_rerun.search.views import climb
+
+    plots = climb(rrb, [(0, 0.1), (1500, 1e-3), (3000, 2.5e-4), (4500, 1e-6)], 1500).contents
+    assert [one.name for one in plots] == ["ε 0.1", "ε 1e-3", "ε 2.5e-4", "ε 1e-6"]
+
+
 WIDE, HIGH = 5.8, 25.0  # pixels of a letter, and of a line of words, on a screen of 1600 by 1000
 PADDING = 12.0
 

@@ -152,7 +152,7 @@ class Rounds:
         shared, (place, last) = problem is not None, where
         limits = (-reach, max(0.35 * reach, 1.15 * float(worst.max())))
         axes = Axes(LEFT, place * _below(shared), WIDTH, HEIGHT, ends, limits)
-        unit = "" if problem is None or not problem.names.time else f" [{problem.names.time}]"
+        unit = "" if problem is None or not problem.names.time else f" in {problem.names.time}"
         drawing.frame(axes, words, f"t{unit}" if shared else "index", last or not shared, room=ROOM)
         drawing.hatched("hatch", axes, axes.x, (0.0, axes.y[1]), ink.HATCH)
         if across.size > 1:

@@ -54,9 +54,15 @@ def climb(rrb: Any, stages: Sequence[tuple[int, float]], budget: int) -> Any:
     place = rrb.TimeRangeBoundary.absolute
     ends = [place(seq=base) for base, _ in shown[1:]] + [rrb.TimeRangeBoundary.infinite()]
     for (base, epsilon), end in zip(shown, ends, strict=True):
-        name = f"ε {epsilon:.3g}" if np.isfinite(epsilon) and epsilon > 0.0 else "g over the evaluations"
+        name = f"ε {_short(epsilon)}" if np.isfinite(epsilon) and epsilon > 0.0 else "g over the evaluations"
         plots.append(series(rrb, "/search/g", name, contents, evaluations=(place(seq=base + 1), end)))
     return rrb.Horizontal(*plots)
+
+
+def _short(number: float) -> str:
+    """Three digits in as few characters as they need: the heading of a narrow plot."""
+    digits, power = f"{number:.2e}".split("e")
+    return min(f"{number:.3g}", f"{float(digits):g}e{int(power)}", key=len)
 
 
 def series(
