@@ -52,6 +52,23 @@ def test_a_run_with_thin_sets_ends_as_check_and_an_independent_program_say(seed:
     assert not is_covered(problem, outcome, 0, off=0.1)
 
 
+@pytest.mark.parametrize("seed", [65, 85])
+@pytest.mark.parametrize("thick", [1e-10, pytest.param(1e-9, marks=pytest.mark.slow), 1e-8, 1e-7])
+def test_between_a_point_and_a_set_nothing_is_lost(seed: int, thick: float, tmp_path: Path) -> None:
+    """Of disturbances (65) and initial states (85): effects were numbers of 1e8, and named points rounded."""
+    config = draw(seed).config
+    if seed == 85:
+        config["problem"]["initial_state"]["box"] = {"lower": [-thick] * 2, "upper": [thick] * 2}
+    else:
+        box = config["problem"]["disturbance"]["box"]
+        box["upper"][0] = box["lower"][0] + 2.0 * thick
+    outcome = sr.run(config, out=tmp_path / "run", quiet=True, figures=False)
+    assert outcome.status in ("certified", "verified")
+    assert outcome.summary["cost"] == pytest.approx({65: 2.5114338, 85: 1.2992414}[seed], rel=1e-6)
+    assert outcome.summary["cost"] - outcome.summary["lower_bound"] <= 1e-5
+    assert {claim.verdict for claim in sr.check(outcome).claims} == {"holds"}
+
+
 def test_the_draws_hold_every_kind_of_set_thickness_place_and_policy() -> None:
     every = [draw(seed) for seed in range(240)]
     assert len({(one.kind, one.thick, one.place, one.policy) for one in every}) == 5 * 3 * 4 * 2

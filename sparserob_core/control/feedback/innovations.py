@@ -9,7 +9,7 @@ the gains that have these effects are ``M_k = F_k D^+``.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
@@ -100,7 +100,7 @@ def _measurable(response: Response, control: Dictionary, pieces: MeasurablePiece
 @dataclass(frozen=True, eq=False)
 class Answers:
     """The variables of the gains: ``variables`` numbers, each the effect on channel ``channel`` of the control on piece
-    ``piece`` of the entry ``entry`` of the deviations, ``(n,)`` each.
+    ``piece`` of so much, ``share``, of the entry ``entry`` of the deviations, ``(n,)`` each.
 
     Effects ``F (K, m, Q)`` and gains ``M (K, K, m, d)`` are sparse linear functions of them: ``effect`` and ``gain``
     list flat positions, variables and values.
@@ -110,6 +110,7 @@ class Answers:
     piece: np.ndarray
     channel: np.ndarray
     entry: np.ndarray
+    share: Array
     effect: tuple[np.ndarray, np.ndarray, Array]
     gain: tuple[np.ndarray, np.ndarray, Array]
 
@@ -131,6 +132,14 @@ class Answers:
         at, which, value = self.gain
         found: Array = np.bincount(at, value * numbers[which], K * K * m * d).astype(float).reshape(K, K, m, d)
         return found
+
+    def on(self, sizes: Array) -> Answers:
+        """The same with variables that are effects on so much of every entry of the deviations, ``sizes (Q,)``."""
+        share = sizes[self.entry]
+        if (share == 1.0).all():
+            return self
+        effect, gain = ((at, which, value / share[which]) for at, which, value in (self.effect, self.gain))
+        return replace(self, share=share * self.share, effect=effect, gain=gain)
 
     @cached_property
     def single(self) -> bool:
@@ -163,7 +172,7 @@ def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None
         rows, cols = np.nonzero(one.G)
         at = ((k * K + one.seen[cols // d]) * channels + i) * d + cols % d
         gain.append(_listed(at, names[..., rows], one.G[rows, cols]))
-    return Answers((K, channels, Q, d), piece, channel, entry, _joined(effect), _joined(gain))
+    return Answers((K, channels, Q, d), piece, channel, entry, np.ones(entry.size), _joined(effect), _joined(gain))
 
 
 @final

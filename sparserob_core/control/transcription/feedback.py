@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import final
@@ -14,6 +14,7 @@ from sparserob_core.control.constraints.effort import FeedbackEffort
 from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
 from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
 from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen, unfelt
 from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
@@ -24,7 +25,8 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.measurable import MISSED
-from sparserob_core.control.transcription.own_units import added_up, fixed, rows_in_sizes, units_of_steps
+from sparserob_core.control.reach.sizes import widths
+from sparserob_core.control.transcription.own_units import added_up, constraint_sides, extent, fixed, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
@@ -36,10 +38,12 @@ from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import Formulation
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
-# Of the size of a row, what an entry of a deviation does to it at most that nothing answers. With a tenth, initial
-# states that deviate by 1e-10 are answered by gains of 1e10, and their programs fail; with ten times as much, costs are
-# off by more than decision 0088 excuses.
+# Of the size of a row, what an entry of a deviation does to it at most that nothing answers. With a thousandth,
+# programs with sets of 1e-12 fail; with ten times as much, costs are off by more than decision 0088 excuses.
 STILL = 1e-9
+# Of its unit, how far an entry deviates at least whose effects are variables as they are: those on less are numbers of
+# 1e8 beside others of 1. With a millionth of it programs of initial states that deviate by 1e-8 fail.
+SMALL = 2.0**-10
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
@@ -161,7 +165,7 @@ class Answering(Acting):
                 H, h = H / seen.steps[:, None], h / seen.steps
             families.append(FeedbackControl(name, loop, places, H, h).family())
         axes, (low, high) = np.eye(problem.system.controls), ranges(problem.control)
-        most = (high - low)[gains.channel] / loop.spread.chords[gains.entry]
+        most = gains.share * (high - low)[gains.channel] / loop.spread.chords[gains.entry]
         far = np.repeat(np.maximum(np.abs(low), np.abs(high)), pieces)
         lower, upper, weights, largest = -most, most, None, None
         prices, peak = problem.prices(breakpoints).ravel(), replace(self, charge=replace(charge, cost="peak"))
@@ -234,8 +238,10 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
     deviations = np.concatenate([deviations, begun, *[begun] * anew])
     seen = innovations_of(seen, begun.size, observer, anew) * (spread.radii > 0.0)
     coordinates, (H, h) = answers(spread.within(seen), mask, problem.system.controls, seen), fixed(problem)
-    small = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
-    ends = _equal(H / small[:, None], h / small)
+    small = (spread.radii > 0.0) & (spread.radii < SMALL)
+    coordinates = coordinates.on(power_of_two(np.where(small, spread.radii, 1.0)))
+    finer = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
+    ends = _equal(H / finer[:, None], h / finer)
     return Seen(coordinates, pieces, observer, ends, still, deviations, _step_units(problem)), outputs
 
 
@@ -334,28 +340,49 @@ def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | N
 
 def _still(own: Posed, spread: Spread) -> np.ndarray:
     """Which entries ``(Q,)`` of the disturbance, and of the initial state, do no more to any row than doubles resolve
-    of what the row keeps (decision 0088): gains on these would be without measure. All of a set, or of a box those
-    entries. None beside fixed final states, which hold at every deviation."""
+    of what the row keeps (decision 0088): gains on these would be without measure. All of a set, or of a box a
+    coordinate, at all times: beside one that is answered others like it count. None beside fixed final states, which
+    hold at every deviation."""
     found, model = np.zeros(spread.size, dtype=bool), own.functionals.disturbance
     if fixed(own.problem)[1].size:
         return found
     held = None if model is None or model.kind != "piecewise_constant" else own.problem.disturbance
     sets = [held, own.problem.initial_set]
     far, begun = (np.zeros(0) if one is None else one.width(np.eye(one.dimension)) for one in sets)
-    rows = rows_in_sizes(own.constraints, own.problem.system.states)
+    rows = _rows_in_sizes(own.constraints, own.problem.system.states)
     still = unfelt(own.response, None if held is None else model, far, begun, rows, STILL)
-    begins = [still[still.size - begun.size :]] * (1 + _begins_anew(own))
-    blocks = still[: still.size - begun.size].reshape(-1, max(far.size, 1))
-    if held is not None:
-        found[: blocks.size] = _of_all(held, blocks).ravel()
+    if held is not None and model is not None:
+        entries = _at_all_times(held, still[: still.size - begun.size])
+        found[: still.size - begun.size] = np.tile(entries, model.block_count)
     if own.problem.initial_set is not None:
-        found[spread.size - begun.size * len(begins) :] = _of_all(own.problem.initial_set, np.array(begins)).ravel()
+        periods = 1 + _begins_anew(own)
+        entries = _at_all_times(own.problem.initial_set, still[still.size - begun.size :])
+        found[spread.size - begun.size * periods :] = np.tile(entries, periods)
     return found
 
 
-def _of_all(convex: ConvexSet, still: np.ndarray) -> np.ndarray:
-    """The entries ``(k, q)`` of points of a set that are still; of one that is no box all of a point, or none."""
-    return still if convex.is_box else np.repeat(still.all(axis=1, keepdims=True), convex.dimension, axis=1)
+def _at_all_times(convex: ConvexSet, still: np.ndarray) -> np.ndarray:
+    """Which coordinates ``(q,)`` of points of a set are still where their entries are, one point after another; of a
+    set that is no box all of them or none."""
+    entries = np.asarray(still.reshape(-1, convex.dimension).all(axis=0))
+    return entries if convex.is_box else np.full(convex.dimension, entries.all())
+
+
+def _rows_in_sizes(constraints: Sequence[StateConstraint], d: int) -> Array:
+    """Rows ``(k, d)`` on the state, in multiples of what a user reads of them: the larger of bound and width, of a
+    curved set those along the axes. Whose size is 0 alone stands in its unit."""
+    found = [np.zeros((0, d))]
+    for one in constraints:
+        if one.sides is not None:
+            normals, (H, h) = one.sides[0], constraint_sides(one)
+            width = widths(H, h)
+            sizes = np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))
+        else:
+            assert one.shape is not None
+            normals = np.eye(one.shape.dimension)
+            sizes = np.maximum(extent(one.shape), one.shape.width(normals))
+        found.append(normals / np.where(sizes > 0.0, sizes, 1.0)[:, None])
+    return np.vstack(found)
 
 
 def _begins_anew(posed: Posed) -> bool:

@@ -149,23 +149,6 @@ def constraint_sides(constraint: StateConstraint) -> tuple[Array, Array]:
     return (H if constraint.gains is None else np.hstack([H, constraint.gains])), h
 
 
-def rows_in_sizes(constraints: Sequence[StateConstraint], d: int) -> Array:
-    """Rows ``(k, d)`` on the state, in multiples of what a user reads of them: the larger of bound and width, of a
-    curved set those along the axes. Whose size is 0 alone stands in its unit."""
-    found = [np.zeros((0, d))]
-    for one in constraints:
-        if one.sides is not None:
-            normals, (H, h) = one.sides[0], constraint_sides(one)
-            width = widths(H, h)
-            sizes = np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))
-        else:
-            assert one.shape is not None
-            normals = np.eye(one.shape.dimension)
-            sizes = np.maximum(extent(one.shape), one.shape.width(normals))
-        found.append(normals / np.where(sizes > 0.0, sizes, 1.0)[:, None])
-    return np.vstack(found)
-
-
 def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array | float = np.inf) -> Array:
     """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
     those of them that are not 0, nor `THIN` beside the sums ``added (r,)``, or beside what these are without growth,

@@ -122,3 +122,14 @@ def test_what_a_deviation_does_to_no_row_by_any_breakpoint_is_unfelt() -> None:
     found = unfelt(response, model, np.array([0.0, 1.0]), np.zeros(0), np.eye(2), 1e-12)
     assert found.tolist() == [True, False] * 4
     assert unfelt(response, model, np.ones(2), np.ones(2), np.zeros((0, 2)), 0.0).all()
+
+
+def test_variables_on_less_of_an_entry_are_as_many_times_smaller() -> None:
+    rng = np.random.default_rng(2)
+    D = rng.normal(size=(3, 2, 4))
+    known, sizes = answers(D, np.tril(np.ones((3, 3), dtype=bool)), 1), np.array([1.0, 2.0**-20, 1.0, 2.0**-3])
+    fine, numbers = known.on(sizes), rng.normal(size=known.variables)
+    assert fine.effects(numbers * sizes[known.entry]).tolist() == known.effects(numbers).tolist()
+    assert fine.gains(numbers * sizes[known.entry]).tolist() == known.gains(numbers).tolist()
+    assert fine.share.tolist() == sizes[known.entry].tolist() and known.share.tolist() == [1.0] * known.variables
+    assert known.on(np.ones(4)) is known and fine.variables == known.variables
