@@ -10,6 +10,7 @@ The walk of `solve_finite`, each step only where the ones before gave no answer 
    every claim is polished, measured (`duality.measure`) and judged. Where the first is not believed, or not sharp
    enough, the solver is asked for more digits of it (`more_digits`). Where the solver says infeasible, or nothing is
    believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
+   `_through` again where it is the curvature that is hard (`in_round_coordinates`).
 5. `_failed`: the best of what was not believed, and what was wrong with it. Where a solver was named, the walk begins
    anew without it (`solver.Asked.instead`).
 """
@@ -32,7 +33,8 @@ from sparserob_core.sip.finite import (
     FiniteProgram,
     FiniteSolution,
 )
-from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
+from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables, in_round_coordinates
+from sparserob_core.sip.inner.curved import with_curvature
 from sparserob_core.sip.inner.dual_newton import from_nothing, polish
 from sparserob_core.sip.inner.duality import farkas_proof, measure, minimisers, nearest_multipliers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
@@ -92,6 +94,8 @@ class _Case:
     def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
         """The solution, which is ``by`` somebody, as ``optimal`` if believed and sharp; otherwise keep it, or note why
         it is not believed."""
+        if solution.residual <= self.tolerance and not self.believes(solution):
+            solution = with_curvature(self.program, solution)
         if self.believes(solution):
             said, attempts = f"{name}: {solution.message}", tuple(self.attempts)
             found = replace(solution, status="optimal", attempts=attempts, message=said, by=by or solution.by)
@@ -156,7 +160,11 @@ def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
     answer = None if easier is None else _through(case, easier, guess)
     if answer is None and program.blocks is not None:
         return _by_directions(case, program.blocks, guess)
-    return _tried(case) if answer is None else answer
+    if answer is not None:
+        return answer
+    answer = _tried(case)
+    rounder = in_round_coordinates(program) if answer.status == "failed" else None
+    return answer if rounder is None else _through(case, rounder, guess) or _failed(case)
 
 
 def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:
