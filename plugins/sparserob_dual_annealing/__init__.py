@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -23,6 +23,8 @@ class DualAnnealing(sr.Maximiser, sr.Options):
     selection rule the method was given. In a space of tuples every other step changes every block. It proves no upper
     bound.
     """
+
+    scaled: ClassVar[bool] = True
 
     initial_temp: float = Field(default=5230.0, gt=0.01, le=5e4)
     """First temperature of the visiting distribution, in scipy's units: higher is wider."""
