@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +21,8 @@ class Direct(sr.Maximiser, sr.Options):
 
     Deterministic: the generator is not used. It proves no upper bound.
     """
+
+    scaled: ClassVar[bool] = True
 
     eps: float = Field(default=1e-8, ge=0.0, le=1.0)
     """Least improvement, relative to the best value, that a rectangle must promise: small is local and accurate."""

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 import sparserob_core as sr
+
+# Times a side of the box, and times a value, both of about 1: scipy's visits, the steps of its differences and the gain
+# at which its local searches stop are numbers. On a side of 1 differences find fewer digits; with values of 1 a local
+# search stops at a gain of 2e-9 of the first one.
+SPAN, HEIGHT = 16.0, 1024.0
 
 
 class DualAnnealing(sr.Maximiser, sr.Options):
@@ -23,6 +28,8 @@ class DualAnnealing(sr.Maximiser, sr.Options):
     selection rule the method was given. In a space of tuples every other step changes every block. It proves no upper
     bound.
     """
+
+    scaled: ClassVar[bool] = True
 
     initial_temp: float = Field(default=5230.0, gt=0.01, le=5e4)
     """First temperature of the visiting distribution, in scipy's units: higher is wider."""
@@ -43,8 +50,8 @@ class DualAnnealing(sr.Maximiser, sr.Options):
         """See `sparserob_core.Maximiser`."""
         from scipy.optimize import dual_annealing
 
-        lower, upper = objective.domain.lower, objective.domain.upper
-        start = objective.best_point if objective.evaluations else None
+        lower, upper = SPAN * objective.domain.lower, SPAN * objective.domain.upper
+        start = SPAN * objective.best_point if objective.evaluations else None
         # scipy renamed the argument (1.15), and knows no end but a count of its iterations: the objective ends the
         # search.
         seeded: dict[str, Any] = {"rng" if "rng" in inspect.signature(dual_annealing).parameters else "seed": rng}
@@ -75,7 +82,7 @@ class _Found:
     def found(self, point: np.ndarray, energy: float, context: int) -> None:
         """See scipy's ``callback``: no answer, so that the search goes on."""
         domain = self.objective.domain
-        self.points.append(np.clip(point, domain.lower, domain.upper))
+        self.points.append(np.clip(point / SPAN, domain.lower, domain.upper))
         self.objective.sketch("the best in turn", np.array(self.points[-60:]))
 
 
@@ -88,7 +95,9 @@ class _Energy:
 
     def __call__(self, point: np.ndarray) -> float:
         domain = self.objective.domain
-        value = -float(self.objective.evaluate(np.clip(point, domain.lower, domain.upper)[np.newaxis])[0])
+        value = -HEIGHT * float(
+            self.objective.evaluate(np.clip(point / SPAN, domain.lower, domain.upper)[np.newaxis])[0]
+        )
         if np.isinf(value):
             return self.worst if np.isfinite(self.worst) else 0.0
         self.worst = max(self.worst, value)

@@ -4,6 +4,7 @@ of indices."""
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -30,6 +31,9 @@ class GradientAscent(sr.Maximiser, sr.Options):
     Notes ``ascent`` (its number, from 1) and ``slope`` (the largest entry of the gradient, per width of the box) at
     every step.
     """
+
+    scaled: ClassVar[bool] = True
+    whole: ClassVar[bool] = False
 
     redraw: float = Field(default=0.5, ge=0.0, le=1.0)
     """Share of the restarts that keep the blocks of the best point with a gradient, and draw the others anew."""

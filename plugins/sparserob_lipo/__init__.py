@@ -61,9 +61,10 @@ class AdaLipo(sr.Maximiser, sr.Options):
     """AdaLIPO (Malherbe and Vayatis, ICML 2017): LIPO with an estimate of the Lipschitz constant.
 
     With probability ``exploration`` the next point is uniform; otherwise it is a candidate that `Lipo`'s test admits
-    with the estimate: the smallest ``(1 + growth)^i``, ``i`` an integer, that is no smaller than the steepest slope
-    between any two evaluated points. Distances are taken in the unit cube that the box is scaled to, so units of the
-    coordinates and of the value do not matter; on a cube this is the paper's rule.
+    with the estimate: the smallest ``unit (1 + growth)^i``, ``i`` an integer, that is no smaller than the steepest
+    slope between any two evaluated points; ``unit`` is the power of two below the first such slope. Distances are taken
+    in the unit cube that the box is scaled to, so units of the coordinates and of the value do not matter; on a cube
+    this is the paper's rule.
 
     Consistent for every Lipschitz function because ``exploration > 0`` (proven there), however the other candidates are
     drawn: as in `Lipo` in turn from the whole box and from ever smaller boxes around the best point, 1024 at most, then
@@ -87,14 +88,21 @@ class AdaLipo(sr.Maximiser, sr.Options):
         """See `sparserob_core.Maximiser`."""
         walk = Walk(objective, rng, uniform_scale=False)
         ratio = math.log1p(self.growth or 0.01 / walk.dimension)
+        unit = 0.0
         while objective.remaining:
-            constant = _on_grid(walk.evaluated.slope, ratio)
+            unit = unit or _power_of_two(walk.evaluated.slope)
+            constant = unit * _on_grid(walk.evaluated.slope / (unit or 1.0), ratio)
             if rng.random() < self.exploration:
                 walk.explore()
             else:
                 walk.exploit(constant)
             walk.note(constant)
         return math.inf
+
+
+def _power_of_two(slope: float) -> float:
+    """The power of two next below a slope, which is the unit of its grid; 0 for a slope of 0 or beyond all numbers."""
+    return math.ldexp(1.0, math.frexp(slope)[1] - 1) if 0.0 < slope < math.inf else 0.0
 
 
 def _on_grid(slope: float, ratio: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -35,6 +35,8 @@ class Nevergrad(sr.Maximiser, sr.Options):
     here: half of it keeps the account of the search. Importing it takes seconds. Notes ``spread``: the distance, root
     mean square over the coordinates and in widths of the box, of each evaluated point from the best one.
     """
+
+    scaled: ClassVar[bool] = True
 
     optimiser: str = Field(default="TwoPointsDE", min_length=1)
     """A name in nevergrad's registry: CMA, DE, NGOpt, OnePlusOne, PSO, TBPSA, TwoPointsDE, ..."""

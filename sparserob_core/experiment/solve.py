@@ -44,6 +44,9 @@ def maximise(
     start: Array | None = None,
     seconds: float | None = None,
     callback: Callable[[Array, Array], object] | None = None,
+    target: float | None = None,
+    patience: int | None = None,
+    known: tuple[Array, Array] | None = None,
     **options: object,
 ) -> Report:
     """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that
@@ -55,7 +58,10 @@ def maximise(
     points that are evaluated first; maximisers that walk begin at the best of them. ``seconds``: no evaluation begins
     after that time. ``callback(points, values)`` is called after every batch of evaluations, ``notify`` with
     `EvaluationsFinished` at least after every twentieth of the budget; what one of them raises is told in a warning,
-    and it is not called again. Further keywords are the maximiser's options.
+    and it is not called again. The search ends, without a polish, where ``callback`` returns ``True``, at a value of at
+    least ``target``, and after ``patience`` evaluations in a row that gained nothing. ``known``: points ``(k, d)`` and
+    values ``(k,)`` from before; they are not evaluated again, and the search goes on from the best of them. Further
+    keywords are the maximiser's options.
     Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails, returns
     complex numbers, or nothing but NaN.
     """
@@ -63,15 +69,17 @@ def maximise(
     from sparserob_core.sip.search.search import maximise as search
 
     chosen, share = _chosen(box, name, options, polish)
-    limit = as_seconds(seconds)
+    limit, told = as_seconds(seconds), _Told(f, callback)
+    rules = Rules(polish=share, seconds=np.inf if limit is None else limit, halt=told.halted, **_ends(target, patience))
     report = search(
-        Target(f if callback is None else _told(f, careful("callback", callback)), box, gradient),
+        Target(f if callback is None else told, box, gradient),
         chosen,
         whole("budget", budget, 1),
         np.random.default_rng(whole("seed", seed, 0)),
-        Rules(polish=share, seconds=np.inf if limit is None else limit),
-        notify if notify is ignore else careful("notify", notify),
+        rules,
+        _heard(notify),
         _placed(start, box),
+        _known(known, box),
     )
     if report.missing and report.missing == report.evaluations and not report.interrupted:
         from sparserob_core.sip.maximiser import EvaluationError
@@ -96,14 +104,19 @@ def ask_tell(
     minimise: bool = False,
     integer: Sequence[int] = (),
     logarithmic: Sequence[int] = (),
+    target: float | None = None,
+    patience: int | None = None,
+    known: tuple[Array, Array] | None = None,
     **options: object,
 ) -> AskTell:
     """A search for the maximum of a function that somebody else evaluates: a simulator, a queue, a laboratory.
 
     The arguments are those of `maximise`, but for the function. ``minimise``: for its minimum. ``integer``: the
     coordinates that are whole numbers; a point that has a value is then not asked for again. ``logarithmic``: those
-    that are searched by their logarithms. ``state``: what `AskTell.state` gave, with the same arguments, or with a
-    larger budget; what was told is told again, and the search goes on with the points that it would have asked for.
+    that are searched by their logarithms. ``target``, with ``minimise`` a value of at most it, ``patience`` and
+    ``known`` are those of `maximise`. ``state``: what `AskTell.state` gave, with the same arguments, or with a
+    larger budget; what was told is told again, and the search goes on with the points that it would have asked for;
+    points that are out may be told there too.
     With a larger budget it is the search that had this budget from its beginning: values that it does not ask for are
     kept beside it. Raises `InputError` when an argument is at fault.
     """
@@ -113,12 +126,20 @@ def ask_tell(
     from sparserob_core.sip.search.search import maximise as search
 
     chosen, share = _chosen(box, name, options, polish)
-    first, rules = _placed(start, box), Rules(polish=share)
+    first, earlier, ends = _placed(start, box), _known(known, box), _ends(target, patience)
     number, calls = whole("seed", seed, 0), whole("budget", budget, 1)
     Target(lambda points: points, box)  # a box without bounds is refused here
     if not isinstance(minimise, bool):
         raise InputError(f"minimise: expected true or false, got {minimise!r}")
-    ranges = Ranges(box, integer, logarithmic)
+    ranges, sign = Ranges(box, integer, logarithmic), -1.0 if minimise else 1.0
+    if ranges.integer and not chosen.whole:
+        raise InputError(
+            path="integer",
+            expected="none, or a maximiser that compares values, such as simulated_annealing: this one follows slopes,"
+            " which are 0 between whole numbers",
+            got=repr(list(integer)),
+        )
+    rules = Rules(polish=share, **{**ends, **({"target": sign * ends["target"]} if "target" in ends else {})})
     entry: object = {"name": name, **options} if isinstance(name, str) else name
     about = {
         "maximiser": dict(entry) if isinstance(entry, Mapping) else type(entry).__name__,
@@ -131,12 +152,21 @@ def ask_tell(
         "minimise": minimise,
         "integer": list(ranges.integer),
         "logarithmic": list(ranges.logarithmic),
+        "target": ends.get("target"),
+        "patience": ends.get("patience"),
+        "known": None if earlier is None else [earlier[0].tolist(), earlier[1].tolist()],
     }
     begin = None if first is None else ranges.hidden(first)
 
     def run(function: Callable[[Array], Array]) -> Report:
         return search(
-            Target(function, ranges.searched), chosen, calls, np.random.default_rng(number), rules, start=begin
+            Target(function, ranges.searched),
+            chosen,
+            calls,
+            np.random.default_rng(number),
+            rules,
+            start=begin,
+            known=None if earlier is None else (ranges.hidden(earlier[0]), sign * earlier[1]),
         )
 
     keywords: dict[str, Any] = dict(options)
@@ -151,6 +181,9 @@ def ask_tell(
         minimise=minimise,
         integer=integer,
         logarithmic=logarithmic,
+        target=target,
+        patience=patience,
+        known=known,
         **keywords,
     )
     return AskTell(ranges, run, about, state, again)
@@ -169,46 +202,96 @@ def _chosen(
     return chosen, chosen.polished if polish is None else share("polish", polish)
 
 
-def _placed(start: object, box: Box) -> Array | None:
-    """Points ``(k, d)`` of the box to begin with."""
+def _placed(start: object, box: Box, name: str = "start") -> Array | None:
+    """Points ``(k, d)`` of the box to begin with; ``name``: what messages call them."""
     if start is None:
         return None
     try:
         points = np.atleast_2d(np.array(start, dtype=float))
     except (TypeError, ValueError):
-        raise InputError(f"start: expected points of numbers, got {start!r}") from None
+        raise InputError(f"{name}: expected points of numbers, got {start!r}") from None
     if points.ndim != 2 or points.shape[1] != box.dimension or not len(points):
-        raise InputError(f"start: expected shape ({box.dimension},) or (k, {box.dimension}), got {start!r}")
+        raise InputError(f"{name}: expected shape ({box.dimension},) or (k, {box.dimension}), got {start!r}")
     if not ((points >= box.lower) & (points <= box.upper)).all():
         raise InputError(
-            f"start: expected points of the box, lower {box.lower.tolist()}, upper {box.upper.tolist()}, got "
+            f"{name}: expected points of the box, lower {box.lower.tolist()}, upper {box.upper.tolist()}, got "
             f"{points[~((points >= box.lower) & (points <= box.upper)).all(axis=1)][0].tolist()}"
         )
     return points
 
 
-def _told(f: Callable[[Array], object], callback: Callable[..., None]) -> Callable[[Array], object]:
-    def watched(points: Array) -> object:
-        values = f(points)
-        callback(points.copy(), np.array(values, dtype=float))
+def _known(known: Any, box: Box) -> tuple[Array, Array] | None:
+    """Points ``(k, d)`` of the box and their values ``(k,)``, from before."""
+    if known is None:
+        return None
+    try:
+        points, values = known
+        numbers: Array = np.array(values, dtype=float, ndmin=1)
+    except (TypeError, ValueError):
+        raise InputError(f"known: expected points and their values, got {known!r}") from None
+    placed = _placed(points, box, "known")
+    if placed is None or numbers.shape != (len(placed),):
+        raise InputError(f"known: expected a value for each point, got shapes {np.shape(points)} and {numbers.shape}")
+    return placed, numbers
+
+
+def _ends(target: object, patience: object) -> dict[str, Any]:
+    """The rules that end a search before its budget."""
+    ends: dict[str, Any] = {}
+    if target is not None:
+        if isinstance(target, bool | str) or not hasattr(target, "__float__") or np.isnan(float(target)):
+            raise InputError(f"target: expected a number, got {target!r}")
+        ends["target"] = float(target)
+    if patience is not None:
+        ends["patience"] = whole("patience", patience, 1)  # type: ignore[arg-type]
+    return ends
+
+
+class _Told:
+    """A function whose values a callback is told, which may ask for the end."""
+
+    def __init__(self, f: Callable[[Array], object], callback: Callable[[Array, Array], object] | None) -> None:
+        self.f, self.callback = f, None if callback is None else careful("callback", callback)
+        self.asked = False
+
+    def __call__(self, points: Array) -> object:
+        """The values, which the callback is told."""
+        values = self.f(points)
+        if self.callback is not None:
+            answer = self.callback(points.copy(), np.array(values, dtype=float))
+            self.asked |= isinstance(answer, bool | np.bool_) and bool(answer)
         return values
 
-    return watched
+    def halted(self) -> bool:
+        """Whether the callback has asked for the end."""
+        return self.asked
 
 
-def careful(name: str, listener: Callable[..., object]) -> Callable[..., None]:
+def _heard(notify: Notify) -> Notify:
+    if notify is ignore:
+        return ignore
+    heard = careful("notify", notify)
+
+    def pass_on(event: Any) -> None:
+        heard(event)
+
+    return pass_on
+
+
+def careful(name: str, listener: Callable[..., object]) -> Callable[..., object]:
     """The listener until it raises for the first time, which is told in a warning; a search outlives it."""
     deaf = False
 
-    def heard(*arguments: object) -> None:
+    def heard(*arguments: object) -> object:
         nonlocal deaf
         if deaf:
-            return
+            return None
         try:
-            listener(*arguments)
+            return listener(*arguments)
         except Exception as error:  # noqa: BLE001  somebody else's function
             deaf = True
             warnings.warn(f"{name} raised {named(error)}; it is not called again", stacklevel=2)
+            return None
 
     return heard
 

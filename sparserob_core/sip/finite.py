@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 
 NAN = "finite program: a bound or right-hand side is NaN"
+# Times its value: where more is added up to a square, double precision leaves fewer than ten digits of it. With a
+# thousand times as much the last digits of a gap are rounding; with a thousandth ordinary costs are summed twice.
+CANCELS = 1e6
 SIGNS = "finite program: expected weights >= 0 and right-hand sides above -inf"
 
 
@@ -169,8 +172,21 @@ class FiniteProgram:
     @shaped
     def objective(self, x: Float[Array, " n"]) -> float:
         """The cost at ``x``; of squares that cancel rounding may leave less than 0, and they are never less."""
-        quadratic = 0.0 if self.P is None else max(0.0, 0.5 * float(x @ self._bent(x)))
+        quadratic = 0.0 if self.P is None else max(0.0, self._square(x)[0])
         return float(self.weights @ self._lengths(x) + self.q @ x) + quadratic + self.constant
+
+    def _square(self, x: Array) -> tuple[float, float]:
+        """``1/2 x'P x``, and what its rounding is relative to: summed with more digits where most of it cancels."""
+        square = 0.5 * float(x @ self._bent(x))
+        if self.P is None or self.curvature is not None:
+            return square, abs(square)
+        size = np.abs(x)
+        added = 0.5 * float(size @ (abs(self.P) @ size))
+        if added <= CANCELS * abs(square):
+            return square, added
+        wide = x.astype(np.longdouble)
+        square = 0.5 * float(wide @ (self.P.astype(np.longdouble) @ wide))
+        return square, abs(square) + added * float(np.finfo(np.longdouble).eps / np.finfo(float).eps)
 
     @shaped
     def _lengths(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
@@ -196,13 +212,13 @@ class FiniteProgram:
     def magnitude(self, x: Float[Array, " n"]) -> float:
         """The sum of the absolute values of the terms of the cost at ``x``: what its rounding is relative to."""
         size = np.abs(x)
-        quadratic = 0.0 if self.P is None else 0.5 * float(size @ (abs(self.P) @ size))
+        quadratic = 0.0 if self.P is None else self._square(x)[1]
         return float(self.weights @ self._lengths(x) + np.abs(self.q) @ size) + quadratic + abs(self.constant)
 
     @shaped
     def added(self, x: Float[Array, " n"]) -> float:
         """The absolute values of the four terms of the cost at ``x``, added up."""
-        quadratic = 0.0 if self.P is None else 0.5 * float(x @ self._bent(x))
+        quadratic = 0.0 if self.P is None else self._square(x)[0]
         return float(self.weights @ self._lengths(x)) + abs(float(self.q @ x)) + abs(quadratic) + abs(self.constant)
 
     @shaped

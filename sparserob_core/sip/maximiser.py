@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -67,6 +67,10 @@ class Objective(Protocol):
     def best_value(self) -> float:
         """The best value so far; ``-inf`` while ``evaluations`` is 0."""
 
+    def known(self) -> tuple[Array, Array]:
+        """Points ``(k, d)`` that were evaluated before the maximiser was asked, and their values ``(k,)``: its start,
+        and those that are known from elsewhere. ``best_point`` is the best of them then."""
+
     @property
     def differentiable(self) -> bool:
         """Whether `value_and_gradient` is offered."""
@@ -122,7 +126,16 @@ class Objective(Protocol):
 
 
 class Maximiser(ABC):
-    """A global maximiser over a box."""
+    """A global maximiser over a box.
+
+    ``scaled``: it is shown a box whose sides have a length of about 1, and values of about 1, in units that are powers
+    of two: the units of the user then change nothing, whatever numbers of its own it compares with. One that only
+    compares values, or has a constant of the user's, as a Lipschitz constant or a temperature, does without.
+    ``whole``: it makes sense of a function that is constant between whole numbers; one that follows slopes does not.
+    """
+
+    scaled: ClassVar[bool] = False
+    whole: ClassVar[bool] = True
 
     @property
     def polished(self) -> float:

@@ -3,6 +3,7 @@ finite programs of a run: whoever is quickest (`Auto`), or the solver that was n
 
 from __future__ import annotations
 
+import logging
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 # Of the numbers that are added up in a residual: 64 units of rounding (Higham 2002, section 3.1). Ten times less, and
 # an optimum to the last bit of numbers of a million is none; ten times more, and a digit that there is is given away.
 ROUNDING = 2.0**-46
+logger = logging.getLogger("sparserob")
 AUTO = "auto"  # the name of `Auto`
 # Multiplications in a factorisation, about, from which a program is solved in a process of its own where time is
 # limited: a tenth of a second for all iterations. Ten times as many take as long as a limit may be missed by on a busy
@@ -253,22 +255,33 @@ class Auto(Solver, Options):
 @final
 class Failures:
     """What the solver that was named did not answer, of how many ``calls`` in all: reasons that differ in their numbers
-    alone are one."""
+    alone are one. ``name``: the solver's; the first program of each kind that another one answers is then logged as it
+    happens, so that no command and no function of Python has to remember to tell it."""
 
-    def __init__(self) -> None:
-        self.calls = 0
+    def __init__(self, name: str = "") -> None:
+        self.calls, self.name = 0, name
         self._known: dict[tuple[str, str, str], Unanswered] = {}
+        self._logged = set[tuple[str, str]]()
 
     def add(self, kind: str, reason: str, by: str, count: int = 1) -> None:
         """Note that programs of a ``kind`` were answered by somebody else."""
         key = (kind, NUMBERS.sub("#", reason), by)
         known = self._known.get(key, Unanswered(kind, 0, reason, by))
         self._known[key] = replace(known, count=known.count + count)
+        if self.name and (kind, by) not in self._logged:
+            self._logged.add((kind, by))
+            logger.warning("solver %s did not answer a %s program, %s did: %s", self.name, kind, by, reason)
+
+    def without_log(self) -> Failures:
+        """Itself, which logs nothing any more: in a worker, whose account whoever has sent it work goes on with."""
+        self.name = ""
+        return self
 
     def resume(self, calls: int, missed: Iterable[Unanswered]) -> None:
-        """Go on from an account that was kept before."""
+        """Go on from an account that was kept before, and was told then."""
         self.calls += calls
         for one in missed:
+            self._logged.add((one.kind, one.by))
             self.add(one.kind, one.reason, one.by, one.count)
 
     def __iter__(self) -> Iterator[Unanswered]:
@@ -284,10 +297,10 @@ class Failures:
 @final
 class Named(Solver):
     """A solver that was named: it answers every finite program. Where no answer of it is believed, ``instead`` is
-    asked, and ``failures`` says so."""
+    asked, and ``failures`` says so, in the log too."""
 
     def __init__(self, solver: Solver, name: str, instead: Solver) -> None:
-        self.solver, self.name, self.instead, self.failures = solver, name, instead, Failures()
+        self.solver, self.name, self.instead, self.failures = solver, name, instead, Failures(name)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """See `Solver.solve`."""

@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.sip.inner.simplex.counterpart import Growing
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.solver import Asked, Auto, Failures, Named
+from sparserob_core.sip.solver import Asked, Auto, Failures, Named, Unanswered
 from sparserob_core.testing.solvers import regularised, robust_terminal
 
 REGISTRY = sr.load_registry()
@@ -133,6 +133,45 @@ def test_auto_does_not_ask_itself(inner):
         REGISTRY.build("solver", "auto", {"general": inner})
     with pytest.raises(sr.InputError, match="answers by itself"):
         Auto(general=AUTO)
+
+
+def test_a_named_solver_that_goes_on_losing_is_asked_a_few_times_and_no_more():
+    """A first-order method takes long for each answer that nobody believes; norms and more digits asked it hundreds."""
+    lost = Spied(lambda claim: replace(off(claim), status="failed"))
+    for norms in ({}, {"group": "all"}):
+        spied = Spied(lost.changed)
+        cost = sr.Cost(**norms) if norms else None
+        plane = sr.OptimalControlProblem(
+            system=sr.LinearSystem(A=np.zeros((2, 2)), B=np.eye(2)),
+            horizon=2.0,
+            initial_state=[1.0, 0.7],
+            control=sr.Box([-1, -1], [1, 1]),
+            disturbance=sr.Box([-0.02, -0.02], [0.02, 0.02]),
+            terminal=[sr.Box([-0.2, -0.2], [0.2, 0.2])],
+            **({} if cost is None else {"cost": cost}),
+        )
+        result = sr.solve(plane, control={"name": "haar", "pieces": 8}, solver=spied)
+        assert result.status == "certified"
+        assert sum(one.count for one in result.unanswered) > 0
+        assert spied.calls <= 6 * result.counts["relaxed_programs"]
+
+
+@pytest.mark.parametrize("policy", ["open_loop", "affine"])
+def test_whoever_answers_in_its_place_is_logged_as_it_happens(policy, caplog):
+    result = solved(Spied(given_up), policy=policy)
+    told = [record.getMessage() for record in caplog.records if record.name == "sparserob"]
+    assert len(told) == len({(one.kind, one.by) for one in result.unanswered}), "once for each kind"
+    for one in result.unanswered:
+        assert any(f"solver Spied did not answer a {one.kind} program, {one.by} did:" in text for text in told)
+
+
+def test_an_account_that_is_resumed_or_a_worker_s_is_not_logged_again(caplog):
+    known = Failures("mine")
+    known.resume(3, [Unanswered("relaxed", 2, "no digits", "piqp")])
+    known.add("relaxed", "no digits", "piqp")
+    known.without_log().add("feedback", "no digits", "highs")
+    assert not caplog.records
+    assert sum(one.count for one in known) == 4
 
 
 def test_reasons_that_differ_in_numbers_alone_are_one_and_what_is_new_can_be_told():

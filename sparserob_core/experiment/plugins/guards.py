@@ -185,6 +185,14 @@ class _Solver(Solver):
 class _Maximiser(Maximiser):
     """`sparserob_core.sip.search.search.maximise` checks what it returns, and calls it by its ``origin``."""
 
+    @property
+    def scaled(self) -> bool:  # type: ignore[override]
+        return asked(self.origin, "scaled", lambda: self._maximiser.scaled, bool)
+
+    @property
+    def whole(self) -> bool:  # type: ignore[override]
+        return asked(self.origin, "whole", lambda: self._maximiser.whole, bool)
+
     def __init__(self, maximiser: Maximiser, origin: str) -> None:
         self._maximiser, self.origin = maximiser, origin
 

@@ -63,7 +63,7 @@ class MaximiserPlugin(
     component="sparserob_core.sip.maximiser:Maximiser",
     reserved=(
         *("budget", "polish"),  # a config's keys of every maximiser; the arguments of `maximise` and `ask_tell` follow
-        *("f", "box", "seed", "gradient", "notify", "start", "seconds", "callback"),
+        *("f", "box", "seed", "gradient", "notify", "start", "seconds", "callback", "target", "patience", "known"),
         *("state", "minimise", "integer", "logarithmic"),
         "origin",  # what messages call it
     ),

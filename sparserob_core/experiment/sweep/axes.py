@@ -51,13 +51,20 @@ class Span:
 @dataclass(frozen=True)
 class Axis:
     """A key of the config and its ``values``, or the ``span`` that they are drawn from. ``log``: they are spread evenly
-    in the logarithm. ``written`` is what stands in ``sweep.yaml``."""
+    in the logarithm. ``written`` is what stands in ``sweep.yaml``. ``paired``: the keys, itself among them, whose
+    values are taken together with its own, the first of each, then the second; none where it stands for itself."""
 
     key: str
     values: tuple[Any, ...]
     written: object
     span: Span | None = None
     log: bool = False
+    paired: tuple[str, ...] = ()
+
+    @property
+    def follows(self) -> bool:
+        """Whether its value is known where that of another one is, with which it is paired."""
+        return bool(self.paired) and self.paired[0] != self.key
 
     @property
     def path(self) -> Path:
@@ -84,6 +91,7 @@ def path_of(key: str) -> Path:
 
 def parse_axes(given: Mapping[str, object] | Sequence[str] | None) -> list[Axis]:
     """Axes from texts ``key=values``, or from a mapping of keys to texts, to lists of values, or to single values.
+    Several keys with commas between them are paired: each of their values is a list with one entry for each key.
 
     Raises `InputError` that names the key, also for a key that is there twice.
     """
@@ -98,11 +106,47 @@ def parse_axes(given: Mapping[str, object] | Sequence[str] | None) -> list[Axis]
             pairs.append((key.strip(), text))
         else:
             pairs.append((str(one[0]), one[1]))
-    axes = [_axis(key, value) for key, value in pairs]
+    axes = [axis for key, value in pairs for axis in _axes(key, value)]
     for position, axis in enumerate(axes):
         if axis.path in (other.path for other in axes[:position]):
             raise InputError(path=axis.key, expected="every key once", got="it twice")
     return axes
+
+
+def _axes(key: str, value: Any) -> list[Axis]:
+    """The axis of a key, or those of several keys that are paired."""
+    keys = [one.strip() for one in key.split(",")]
+    if len(keys) == 1:
+        return [_axis(key, value)]
+    whole = _rows(key, value) if isinstance(value, str) else value
+    rows = [_plain(row) for row in whole] if isinstance(whole, list | tuple) or hasattr(whole, "tolist") else []
+    if not rows or not all(isinstance(row, list) and len(row) == len(keys) for row in rows):
+        raise InputError(
+            path=key,
+            expected=f"lists of {len(keys)} values, one for each key, such as [1, 2], [3, 4]",
+            got=shown(value),
+        )
+    _counted(key, tuple(rows))
+    axes = []
+    for one, column in zip(keys, zip(*rows, strict=True), strict=True):
+        if path_of(one)[0] in FIXED:
+            raise InputError(path=one, expected="a key that decides a result, where keys are paired", got="this one")
+        paired = tuple(keys) if len(rows) > 1 else ()
+        axes.append(Axis(one, column, list(column), log=_geometric(column), paired=paired))
+    return axes
+
+
+def require_whole(axes: Sequence[Axis]) -> None:
+    """Raise `InputError` where one of several keys that are paired was changed, and the others were not."""
+    groups = {axis.key: axis.paired for axis in axes}
+    for axis in axes:
+        for other in axis.paired:
+            if groups.get(other) != axis.paired:
+                raise InputError(
+                    path=other,
+                    expected=f"values for {','.join(axis.paired)} together, since these keys are paired",
+                    got="values for this one alone",
+                )
 
 
 def _axis(key: str, value: object) -> Axis:
@@ -117,6 +161,14 @@ def _axis(key: str, value: object) -> Axis:
         values = tuple(_plain(one) for one in value)
         return Axis(key, _counted(key, values), list(values), log=_geometric(values))
     return Axis(key, (_plain(value),), _plain(value))
+
+
+def _rows(key: str, text: str) -> list[Any]:
+    """The values of keys that are paired, from one line of text."""
+    parts = list(split(text))
+    rows = [_value(key.partition(",")[0], part, len(parts)) for part in parts]
+    within = rows[0] if len(rows) == 1 and isinstance(rows[0], list) else []
+    return within if within and all(isinstance(row, list) for row in within) else rows
 
 
 def _written(key: str, text: str) -> Axis:

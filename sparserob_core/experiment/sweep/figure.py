@@ -53,8 +53,9 @@ def draw_study(study: Study) -> Figure:
     """The figure; seeds are no axis of it but samples, of which the median and the quartiles are shown."""
     if not any(row.get("cost") is not None for row in study.table):
         raise InputError("no figure of the study: no point has a cost")
-    numeric = [axis for axis in study.axes if axis.numeric and not _is_seed(axis)]
-    others = [axis for axis in study.axes if not axis.numeric]
+    leading = [axis for axis in study.axes if not axis.follows]
+    numeric = [axis for axis in leading if axis.numeric and not _is_seed(axis)]
+    others = [axis for axis in leading if not axis.numeric]
     if study.arrangement == "zip":  # one line through the values, told by its first axis
         numeric, others = numeric[:1], others[:1] if not numeric else []
     drawn = study.arrangement in ("random", "sobol")

@@ -22,7 +22,7 @@ from sparserob_core.experiment.config.reading.overrides import parse_overrides
 from sparserob_core.experiment.config.reading.reader import Source, read_source, read_value, write_yaml
 from sparserob_core.experiment.plugins.messages import nearest, shown
 from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.experiment.sweep.axes import FIXED, MOST, Axis, parse_axes
+from sparserob_core.experiment.sweep.axes import FIXED, MOST, Axis, parse_axes, require_whole
 from sparserob_core.sip.events import Notify, ignore
 
 FILE = "sweep.yaml"
@@ -101,13 +101,26 @@ class Plan:
                 said = ", ".join(f"{count} of {key}" for key, count in counts.items())
                 raise InputError(path="zip", expected="axes with equally many values", got=said)
             return list(zip(*(axis.values for axis in self.axes), strict=True)) if self.axes else [()]
-        count = int(np.prod([len(axis.values) for axis in self.axes], dtype=float))
-        if count > MOST:
+        places = list(product(*(range(len(axis.values)) for axis in self._leading(MOST))))
+        return [self._values_at(row) for row in places]
+
+    def _leading(self, most: float = np.inf) -> list[Axis]:
+        """The axes but for those whose values go with those of another one; raises `InputError` where they have more
+        than ``most`` combinations."""
+        leading = [axis for axis in self.axes if not axis.follows]
+        count = int(np.prod([len(axis.values) for axis in leading], dtype=float))
+        if count > most:
             raise InputError(path="axes", expected=f"at most {MOST} points", got=str(count))
-        return list(product(*(axis.values for axis in self.axes)))
+        return leading
+
+    def _values_at(self, places: Sequence[int]) -> tuple[Any, ...]:
+        """The values of all axes where those of the leading ones are at these ``places``."""
+        known = dict(zip((axis.key for axis in self._leading()), places, strict=True))
+        return tuple(axis.values[known[axis.paired[0] if axis.paired else axis.key]] for axis in self.axes)
 
     def _drawn(self) -> list[tuple[Any, ...]]:
-        count, dimension = int(self.number or 0), len(self.axes)
+        leading = self._leading()
+        count, dimension = int(self.number or 0), len(leading)
         if not any(axis.span for axis in self.axes):
             expected = "at least one range to draw from, such as key=0.01:0.06"
             raise InputError(
@@ -118,13 +131,12 @@ class Plan:
             shares = rng.random((count, dimension))
         else:
             shares = _sobol(dimension, count, rng)
-        return [
-            tuple(
-                axis.span.at(share) if axis.span else axis.values[int(share * len(axis.values))]
-                for axis, share in zip(self.axes, row, strict=True)
-            )
-            for row in shares.tolist()
-        ]
+        columns = {axis.key: column for axis, column in zip(leading, shares.T.tolist(), strict=True)}
+        drawn = []
+        for axis in self.axes:
+            column = columns[axis.paired[0] if axis.paired else axis.key]
+            drawn.append([axis.span.at(s) if axis.span else axis.values[int(s * len(axis.values))] for s in column])
+        return list(zip(*drawn, strict=True))
 
     def checked(self, notify: Notify = ignore) -> list[Point]:
         """Every point with its checked config; raises `ConfigError` for the first one that is at fault. ``notify``
@@ -144,7 +156,13 @@ class Plan:
 
     def written(self) -> str:
         """The contents of ``sweep.yaml``."""
-        axes = {axis.key: _listed(axis) for axis in self.changes}
+        axes: dict[str, Any] = {}
+        for axis in self.changes:
+            if not axis.paired:
+                axes[axis.key] = _listed(axis)
+            elif not axis.follows:
+                group = [next(one for one in self.changes if one.key == key) for key in axis.paired]
+                axes[",".join(axis.paired)] = [list(row) for row in zip(*(one.values for one in group), strict=True)]
         data: dict[str, Any] = {"base": self.base.data, "axes": axes, "points": self.points}
         if self.number is not None:
             data |= {"number": self.number, "seed": self.seed}
@@ -183,6 +201,7 @@ def make_plan(
         kept[place : place + 1] = [axis]
     for change in reversed(changes):
         kept = [change, *(other for other in kept if other.path != change.path)]
+    require_whole(kept)
     plan = replace(
         plan,
         changes=tuple(map(_absolute, kept)),

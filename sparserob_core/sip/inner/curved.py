@@ -1,22 +1,33 @@
-"""Lower bounds of programs with a quadratic cost and entries without bounds.
+"""Lower bounds of programs with a quadratic cost whose matrix is positive definite.
 
-A tangent of the cost bounds an entry without bounds only where its slope is exactly 0, which numbers seldom are. The
-cost itself bounds it: with ``P >= diag(c)`` for some ``c > 0``, ``1/2 x'P x`` is at least its tangent at any point plus
-``1/2 (x - at)'diag(c)(x - at)``, so that residual slopes ``r`` cost no more than ``sum_k r_k^2 / (2 c_k)``.
+A tangent of the cost bounds an entry without bounds only where its slope is exactly 0, which numbers seldom are, and an
+entry between distant bounds poorly. The cost itself does better: with ``P >= diag(c)`` for some ``c > 0``,
+``1/2 x'P x`` is at least its tangent at any point plus ``1/2 (x - at)'diag(c)(x - at)``, so that residual slopes ``r``
+cost no more than ``sum_k r_k^2 / (2 c_k)``. All of it is evaluated in extended precision: with a matrix of condition
+1e12, double precision has no digits left for the slopes.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.inner.duality import minimisers
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.inner.duality import bent_minimisers
+from sparserob_core.sip.inner.extended import UNIT, WIDE
+from sparserob_core.sip.inner.image import Memory
 
 # Of the least eigenvalue that is estimated, what is tried to be proven. With all of it rounding decides; a hundredth of
 # it is as good, for what residual slopes cost is mostly far below the tolerated gap.
 PROVEN = 0.5
 ROUNDING = 2.0**-52
+# Entries up to which a matrix is looked at. Ten times as many take minutes, a tenth leaves fits of a hundred terms out.
+LARGE = 600
+REFINEMENTS = 4  # each gains four digits at a condition of 1e12; a fifth is lost in rounding
+NEAR = 1e-9  # of its bounds' distance: an entry so near to a bound is held there
+_curvatures = Memory(4)
 
 
 def least_curvature(P: Array) -> Array | None:
@@ -25,22 +36,57 @@ def least_curvature(P: Array) -> Array | None:
 
     ``P (n, n)`` is scaled to a diagonal of about 1 by powers of two, so that units do not matter, and shifted by a part
     of its least eigenvalue. Where the Cholesky factorisation then ends, what it proves is off by no more than
-    ``(n + 2) eps`` of the trace (Rump 2006, "Verification of positive definiteness", BIT 46, theorem 2.3).
+    ``(n + 2) eps`` of the trace (Rump 2006, "Verification of positive definiteness", BIT 46, theorem 2.3), and by no
+    more than what the product of the factors is off by, which is computed where the former is too much.
     """
     n, diagonal = len(P), P.diagonal()
-    if not (diagonal > 0.0).all():
+    if not (diagonal > 0.0).all() or not np.isfinite(P).all():
         return None
     unit = np.exp2(-np.round(0.5 * np.log2(diagonal)))
     scaled = P * unit * unit[:, np.newaxis]
     share = PROVEN * float(np.linalg.eigvalsh(scaled)[0])
-    lost = 2.0 * (n + 2) * ROUNDING * float(scaled.trace())
-    if not share > lost:
+    if not share > 0.0:
         return None
     try:
-        np.linalg.cholesky(scaled - share * np.eye(n))
+        factor = np.linalg.cholesky(scaled - share * np.eye(n))
     except np.linalg.LinAlgError:
         return None
+    lost = 2.0 * (n + 2) * ROUNDING * float(scaled.trace())
+    if not share > lost:
+        lost = _missed(scaled, share, factor)
+    if not share > lost:
+        return None
     return np.asarray((share - lost) / unit**2 * (1.0 - 4.0 * ROUNDING), dtype=float)
+
+
+def _missed(scaled: Array, share: float, factor: np.ndarray) -> float:
+    """A bound of the norm of ``scaled - share I - factor factor'``, by the sums of its rows; every entry is a sum of
+    ``n + 2`` terms, and off by at most so many roundings of their absolute values (Higham 2002, section 3.1)."""
+    wide, size = factor.astype(WIDE), np.abs(factor)
+    shift = share * np.eye(len(scaled))
+    off = np.abs(scaled.astype(WIDE) - shift - wide @ wide.T)
+    off += (len(scaled) + 4) * UNIT * (np.abs(scaled) + shift + 2.0 * size @ size.T)
+    return float(off.sum(axis=1).max()) * (1.0 + 1e-9)
+
+
+def curvature_of(program: FiniteProgram) -> Array | None:
+    """What of a quadratic cost every entry has for itself ``(n,)``, remembered; ``None`` where nothing is proven, or a
+    tangent does as well."""
+    P = program.P
+    if P is None or program.S is not None or program.blocks is not None or program.separable or program.n > LARGE:
+        return None
+    return _curvatures.recall((P,), None, lambda: least_curvature(P.toarray()))
+
+
+def with_curvature(program: FiniteProgram, solution: FiniteSolution) -> FiniteSolution:
+    """The solution with the lower bound that the curvature of its cost proves, where that is a better one."""
+    bend = curvature_of(program)
+    if bend is None or not np.isfinite(solution.x).all():
+        return solution
+    bound, _ = curved_bound(program, bend, solution.y, solution.mu, solution.x)
+    if not bound > solution.lower_bound:
+        return solution
+    return replace(solution, lower_bound=bound, gap=solution.value - bound)
 
 
 def curved_bound(program: FiniteProgram, bend: Array, y: Array, mu: Array, at: Array) -> tuple[float, Array]:
@@ -51,35 +97,62 @@ def curved_bound(program: FiniteProgram, bend: Array, y: Array, mu: Array, at: A
     2002, section 3.1).
     """
     assert program.P is not None
-    used = y > 0.0
-    h, b = np.where(used, program.h, 0.0), program.b
-    pull = program.q + y @ program.G + mu @ program.A
-    with np.errstate(all="ignore"):
-        step = np.linalg.lstsq(program.P.toarray(), -(program.P @ at + pull), rcond=None)[0]
-    offers = [at, at + step] if np.isfinite(step).all() else [at]
-    bounds = [_bound_at(program, bend, (y, mu, h, b, pull), one) for one in offers]
+    wide, here = program.P.toarray().astype(WIDE), at.astype(WIDE)
+    rows, equalities = y.astype(WIDE), mu.astype(WIDE)
+    h = np.where(y > 0.0, program.h, 0.0)
+    pull = program.q + rows @ program.G + equalities @ program.A
+    offers: list[np.ndarray] = [here, _stationary(program, wide, pull, here)]
+    bounds = [_bound_at(program, wide, bend, (rows, equalities, h, pull), one) for one in offers]
     best = int(np.argmax(bounds))
-    return bounds[best], offers[best]
+    return bounds[best], offers[best].astype(float)
 
 
-def _bound_at(program: FiniteProgram, bend: Array, given: tuple[Array, Array, Array, Array, Array], at: Array) -> float:
+def _stationary(program: FiniteProgram, wide: np.ndarray, pull: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """The point near ``at`` where the slope of every entry is 0 that no bound and no kink holds."""
+    low, high, weights = program.lower, program.upper, program.weights
+    width = np.where(np.isfinite(high - low), high - low, 1.0)
+    held = (at - low <= NEAR * width) | (high - at <= NEAR * width) | (weights > 0.0) & (at == 0.0)
+    moved = np.where(at - low <= NEAR * width, low, np.where(high - at <= NEAR * width, high, at))
+    free = np.flatnonzero(~held)
+    if not free.size:
+        return moved
+    inside = wide[np.ix_(free, free)].astype(float)
+    unit = np.exp2(-np.round(0.5 * np.log2(inside.diagonal())))
+    scaled = inside * unit * unit[:, np.newaxis]
+    for _ in range(REFINEMENTS):
+        slope = wide @ moved + pull + weights * np.sign(at)
+        try:
+            step = np.linalg.solve(scaled, -(slope[free].astype(float) * unit)) * unit
+        except np.linalg.LinAlgError:
+            return at
+        if not np.isfinite(step).all():
+            return at
+        moved[free] += step
+    return np.asarray(np.minimum(np.maximum(moved, low), high))
+
+
+def _bound_at(
+    program: FiniteProgram, wide: np.ndarray, bend: Array, given: tuple[np.ndarray, ...], at: np.ndarray
+) -> float:
     """The bound with the tangent at one point."""
-    assert program.P is not None
-    y, mu, h, b, pull = given
+    y, mu, h, pull = given
     terms = program.n + y.size + mu.size + 4
-    size = abs(program.P) @ np.abs(at)
-    slope = program.P @ at + pull
+    size = np.abs(wide) @ np.abs(at)
+    bent = wide @ at
+    slope = bent + pull
     sizes = np.abs(program.q) + y @ np.abs(program.G) + np.abs(mu) @ np.abs(program.A) + size
-    away = minimisers(program.weights, bend, slope - bend * at, program.lower, program.upper)
+    with np.errstate(all="ignore"):
+        away = bent_minimisers(program.weights, bend, slope - bend * at, program.lower, program.upper)
     moved = away - at
     values = program.weights * np.abs(away) + slope * moved + 0.5 * bend * moved**2
     # at the point itself: 1/2 at'P at + pull'at, and what the slopes allow beyond it
-    constant = program.constant - float(y @ h) - float(mu @ b)
-    value = constant + 0.5 * float(at @ (program.P @ at)) + float(pull @ at) + float(values.sum())
-    magnitude = abs(program.constant) + float(y @ np.abs(h)) + float(np.abs(mu) @ np.abs(b))
-    magnitude += float(sizes @ (2.0 * np.abs(at) + np.abs(moved))) + float(np.abs(values).sum())
-    magnitude += float(program.weights @ np.abs(away))
+    constant = program.constant - y @ h - mu @ program.b
+    value = constant + 0.5 * (at @ bent) + pull @ at + values.sum()
+    magnitude = abs(program.constant) + y @ np.abs(h) + np.abs(mu) @ np.abs(program.b)
+    magnitude += sizes @ (2.0 * np.abs(at) + np.abs(moved)) + np.abs(values).sum()
+    magnitude += program.weights @ np.abs(away)
     # a slope that is off by e moves the minimum over one entry by e |moved|, and by e^2 / (2 c) where it is free
-    error = terms * ROUNDING * sizes
-    bound = value - terms * ROUNDING * magnitude - float(error @ np.abs(moved)) - float((error**2 / bend).sum())
-    return bound if np.isfinite(bound) else -np.inf
+    error = terms * UNIT * sizes
+    bound = value - terms * UNIT * magnitude - error @ np.abs(moved) - (error**2 / bend).sum()
+    lowered = float(np.nextafter(float(bound), -np.inf))
+    return lowered if np.isfinite(lowered) else -np.inf

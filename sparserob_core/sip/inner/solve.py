@@ -10,6 +10,7 @@ The walk of `solve_finite`, each step only where the ones before gave no answer 
    every claim is polished, measured (`duality.measure`) and judged. Where the first is not believed, or not sharp
    enough, the solver is asked for more digits of it (`more_digits`). Where the solver says infeasible, or nothing is
    believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
+   `_through` again where it is the curvature that is hard (`in_round_coordinates`).
 5. `_failed`: the best of what was not believed, and what was wrong with it. Where a solver was named, the walk begins
    anew without it (`solver.Asked.instead`).
 """
@@ -32,7 +33,8 @@ from sparserob_core.sip.finite import (
     FiniteProgram,
     FiniteSolution,
 )
-from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
+from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables, in_round_coordinates
+from sparserob_core.sip.inner.curved import with_curvature
 from sparserob_core.sip.inner.dual_newton import from_nothing, polish
 from sparserob_core.sip.inner.duality import farkas_proof, measure, minimisers, nearest_multipliers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
@@ -59,6 +61,10 @@ TURNS = 10
 # nearly all active, half as long with 300 and 3000, as long with 120 and 1000, and with 300 and 400 ten times as long.
 CROWDED, WIDE = 100, 2000
 POINTS = 40  # proximal points then: 37 were needed at most; with four only easy programs are solved
+# Answers in a row that a solver that was named does not call solved, and nobody believes, until another one is asked.
+# With one, programs are left that the second form solves; with ten, a first-order method takes a minute for a run that
+# others end in two seconds.
+LOST = 3
 CRUDE = 1e-6  # a residual of an answer whose gap says something
 
 ADVICE = "try another solver, or state the problem in units in which its numbers are of one size"
@@ -68,7 +74,7 @@ ADVICE = "try another solver, or state the problem in units in which its numbers
 class _Case:
     """One call of `solve_finite`: what was asked, the best unbelieved answer so far, why each was not believed, and the
     best believed one that is not ``sharp``. ``crude``: what was wrong with the solver's own answer, where Newton's
-    method made it one that holds."""
+    method made it one that holds. ``lost``: how often in a row the solver has not solved what it was asked."""
 
     program: FiniteProgram
     solver: Asked
@@ -79,6 +85,17 @@ class _Case:
     blunt: FiniteSolution | None = None
     elastic: bool = False
     crude: str = ""
+    lost: int = 0
+
+    def heard(self, claim: Claim | None) -> None:
+        """Count claims in a row that are not ``solved`` nor ``infeasible``; ``None``: the solver raised."""
+        if not self.given_up:
+            self.lost = self.lost + 1 if claim is None or claim.status == "failed" else 0
+
+    @property
+    def given_up(self) -> bool:
+        """Whether the solver that was named has lost so often that another one is asked."""
+        return self.solver.instead is not None and self.lost >= LOST
 
     def believes(self, solution: FiniteSolution) -> bool:
         return solution.residual <= self.tolerance and solution.gap <= 10 * self.tolerance * cost_scale(
@@ -92,6 +109,8 @@ class _Case:
     def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
         """The solution, which is ``by`` somebody, as ``optimal`` if believed and sharp; otherwise keep it, or note why
         it is not believed."""
+        if solution.residual <= self.tolerance and not self.believes(solution):
+            solution = with_curvature(self.program, solution)
         if self.believes(solution):
             said, attempts = f"{name}: {solution.message}", tuple(self.attempts)
             found = replace(solution, status="optimal", attempts=attempts, message=said, by=by or solution.by)
@@ -132,9 +151,10 @@ def solve_finite(
     found = _answer(case, guess)
     if asked.instead is not None and found.status == "failed":
         other = solve_finite(program, asked.instead, tolerance=tolerance, guess=guess, small=small)
+        why = next(iter(found.attempts), found.message)
         if other.status != "failed":
-            why = next(iter(found.attempts), found.message)
             return replace(other, attempts=(*found.attempts, *other.attempts), unanswered=why)
+        return replace(found, by=NOBODY, unanswered=why)
     if asked.instead is not None and found.by == DUAL_NEWTON != asked.name:
         return replace(found, unanswered=case.crude)
     return found if found.by else replace(found, by=NOBODY if found.status == "failed" else asked.name)
@@ -156,7 +176,11 @@ def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
     answer = None if easier is None else _through(case, easier, guess)
     if answer is None and program.blocks is not None:
         return _by_directions(case, program.blocks, guess)
-    return _tried(case) if answer is None else answer
+    if answer is not None:
+        return answer
+    answer = _tried(case)
+    rounder = in_round_coordinates(program) if answer.status == "failed" else None
+    return answer if rounder is None else _through(case, rounder, guess) or _failed(case)
 
 
 def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:
@@ -183,6 +207,8 @@ def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) ->
             believed = case.blunt or _elastic_proof(case, proof)
         if believed is not None:
             return replace(believed, directions=directions)
+        if case.given_up:
+            break
     return replace(_failed(case), directions=directions)
 
 
@@ -234,7 +260,7 @@ def _kelley(
         closest = min(closest, gap)
         x, y, mu, z = answer
         more = directions.joined(towards(program, blocks, x, y, mu, z))
-        if idle > PATIENCE or more.block.size == directions.block.size:
+        if idle > PATIENCE or more.block.size == directions.block.size or case.given_up:
             break
         directions = more
     return None, None, directions
@@ -266,7 +292,7 @@ def _newton(
     moving = norms > SMALLEST * norms.max(initial=0.0)
     here = answer[0]
     for _ in range(NEWTON):
-        if not moving.any():
+        if not moving.any() or case.given_up:
             break
         step = bent(program, blocks, here, moving)
         rest = None if step.blocks is None else of_the_rest(directions, moving, step.blocks.table.shape[1])
@@ -284,11 +310,9 @@ def _newton(
 
 def _tried(case: _Case) -> FiniteSolution:
     """Form after form, accuracy after accuracy."""
-    program, attempts = case.program, ATTEMPTS
-    if program.P is not None and program.S is None and program.curvature is None:
-        attempts = (ATTEMPTS[1], ATTEMPTS[0], *ATTEMPTS[2:])  # parts would double a dense matrix
+    attempts = _attempts(case.program)
     for form, factor in attempts:
-        claim, answer = _ask(case, program, form, factor * case.tolerance)
+        claim, answer = _ask(case, case.program, form, factor * case.tolerance)
         proof = _proof(case, answer, "the solver's ray") if claim is not None and claim.status == "infeasible" else None
         said = "" if claim is None else claim.message
         for by, solution in _candidates(case, answer, said) if proof is None else ():
@@ -301,11 +325,19 @@ def _tried(case: _Case) -> FiniteSolution:
                 return believed
         if case.blunt is not None:
             return case.blunt
+        if case.given_up and proof is None:
+            break
         if proof is not None or form == attempts[0][0] or (claim is not None and claim.status == "infeasible"):
             proof = _elastic_proof(case, proof)
         if proof is not None:
             return proof
     return _failed(case)
+
+
+def _attempts(program: FiniteProgram) -> tuple[tuple[Form, float], ...]:
+    """The forms and accuracies in the order in which they are tried: parts would double a dense matrix."""
+    dense = program.P is not None and program.S is None and program.curvature is None
+    return (ATTEMPTS[1], ATTEMPTS[0], *ATTEMPTS[2:]) if dense else ATTEMPTS
 
 
 def _sharper(case: _Case, claim: Claim | None, answer: Recovered | None) -> FiniteSolution | None:
@@ -350,6 +382,7 @@ def _more_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
         badness = np.inf
         try:
             for one in refined(qp, case.solver, start, factor * case.tolerance):
+                case.heard(one)
                 candidates = list(_candidates(case, recover(one), one.message))
                 judged = [case.judge(solution, "with more digits", by) for by, solution in candidates]
                 believed = [solution for solution in judged if solution is not None]
@@ -357,7 +390,7 @@ def _more_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
                     return min(believed, key=lambda solution: solution.residual)
                 before = badness
                 badness = min([badness, *(_badness(solution) for _, solution in candidates)])
-                if badness > 0.5 * before:
+                if badness > 0.5 * before or case.given_up:
                     break
         except Exception as error:  # noqa: BLE001  as in `_ask`
             case.attempts.append(f"with more digits: the solver raised {type(error).__name__}: {error}")
@@ -373,6 +406,7 @@ def _through(case: _Case, easier: NewVariables, guess: FiniteSolution | None) ->
     found = _answer(inner, start)
     case.crude = inner.crude
     case.attempts += inner.attempts
+    case.lost = inner.lost
     x = easier.back(found.x)
     if found.status == "infeasible":
         proof = _proof(case, (x, found.y, found.mu, None), "the program in other variables")
@@ -422,7 +456,9 @@ def _ask(
     except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours
         said = str(error) if isinstance(error, PluginError) else f"the solver raised {type(error).__name__}: {error}"
         case.attempts.append(f"{form} form: {said}")
+        case.heard(None)
         return None, None
+    case.heard(claim)
     if not _well_formed(claim, qp):
         shapeless = "; its arrays are not finite, or not of the right size" if claim.status == "solved" else ""
         case.attempts.append(f"{form} form: {claim.status}, {claim.message}{shapeless}")

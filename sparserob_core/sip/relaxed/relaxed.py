@@ -17,7 +17,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.convexity import ControlImage, Regulariser, require_convex
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
-from sparserob_core.sip.inner.curved import curved_bound, least_curvature
+from sparserob_core.sip.inner.curved import curvature_of, curved_bound
 from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
 from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 LAZY = 1e-9  # rows violated by less than this, relative to their norm, are not added
+# Of the value: where the bound by a tangent is further below, the curvature of the cost is asked. A hundred times as
+# much is more than a gap that counts as closed; a hundredth of it is lost in rounding.
+UNCLOSED = 1e-9
 RELAXED = "relaxed"  # what these programs are called where a solver fails on some
 ROUNDS = 200  # lazy additions at most within one evaluation
 # of them, those that also drop the rows without a multiplier; later rows are only added, so that nothing can cycle
@@ -240,17 +243,19 @@ class RelaxedProgram:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
         at = _touched(plain, y, mu, solution.x)
         bound, y, mu, moved = proving(plain.tangent(at), y, mu, z, at=at)
-        if bound == -np.inf and self._bend is not None:
-            bound, at = curved_bound(plain, self._bend, y, mu, at)
+        if solution.value - bound > UNCLOSED * abs(solution.value) and self._bend is not None:
+            better, point = curved_bound(plain, self._bend, y, mu, at)
+            bound, at = (better, point) if better > bound else (bound, at)
         return bound - self.rounding(plain, y, mu, solution.x), y, mu, moved, at
 
     @cached_property
     def _bend(self) -> Array | None:
-        """What of the quadratic cost every entry has for itself ``(n,)``; ``None`` where a tangent does as well."""
+        """What of the quadratic cost every entry has for itself ``(n,)``; ``None`` where a tangent does as well.
+
+        Pieces of a control have bounds, and a certificate about them is judged by tangents alone.
+        """
         base = self.program.finite
-        if base.P is None or base.S is not None or base.blocks is not None or base.separable or base.bounded:
-            return None
-        return least_curvature(base.P.toarray())
+        return None if base.bounded and self.program.lengths is not None else curvature_of(base)
 
     @shaped
     def rounding(

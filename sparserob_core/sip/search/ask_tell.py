@@ -33,7 +33,14 @@ Key: TypeAlias = tuple[float, ...]
 FORMAT = 1
 WORDS = {np.inf: "inf", -np.inf: "-inf"}
 GRACE = 5.0  # seconds that a maximiser may take to end; a tenth may be less than one of its steps in many coordinates
-LATER = {"minimise": False, "integer": [], "logarithmic": []}  # keys that states of version 0.1 do not have
+LATER = {  # keys that older states do not have
+    "minimise": False,
+    "integer": [],
+    "logarithmic": [],
+    "target": None,
+    "patience": None,
+    "known": None,
+}
 
 
 class Closed(Exception):
@@ -134,6 +141,10 @@ class AskTell:
         self._answers: list[float | None] = []
         self._ahead: list[Key] = []  # given to idle workers, before the search wants it
         self._given: Counter[Key] = Counter()  # given to somebody, and not told
+        if state is not None:
+            out, ahead = _out(state, self.domain)
+            self._given.update(out)
+            self._ahead += ahead
         self._end: Report | BaseException | None = None
         self._other = _Other(search)
         self._finalizer = weakref.finalize(self, self._other.close)
@@ -204,6 +215,8 @@ class AskTell:
             )
         keys = _keys(given)
         with self._lock:
+            if self._owed:  # of a state, which the search first asks for again
+                self._waiting()
             for key, count in Counter(keys).items():
                 if count > self._given[key]:
                     raise InputError(
@@ -222,14 +235,26 @@ class AskTell:
         return self._end if self.done and isinstance(self._end, Report) else self._so_far("the search has not ended")
 
     def state(self) -> dict[str, Any]:
-        """Everything told so far, as plain data that JSON can hold; what was asked and not told is asked again.
-        ``aside``: the numbers of the values that the search has not asked for by itself."""
+        """Everything told so far, as plain data that JSON can hold, and which points are out.
+
+        ``aside``: the numbers of the values that the search has not asked for by itself. ``out``: the points that were
+        given and have no value yet, which another process may tell; `ask` gives those of them again that the search
+        waits for, and ``ask(fresh=True)`` none. ``ahead``: the numbers of those that it does not wait for. Where
+        whoever has them will never tell, empty lists let them go.
+        """
         with self._lock:
             numbers = [WORDS.get(value, None if np.isnan(value) else value) for value in self._values]
             rows = {"points": [point.tolist() for point in self._points], "values": numbers}
             owed = set(self._owed)
             aside = [number for number in self._known.unused if number not in owed]
-            return {"format": FORMAT, **self._about, **rows, **({"aside": aside} if aside else {})}
+            out, waited = list(self._given.elements()), Counter(self._ahead)
+            ahead = []
+            for number, key in enumerate(out):
+                if waited[key]:
+                    waited[key] -= 1
+                    ahead.append(number)
+            apart = {"aside": aside, "out": [list(key) for key in out], "ahead": ahead}
+            return {"format": FORMAT, **self._about, **rows, **{name: row for name, row in apart.items() if row}}
 
     def close(self) -> None:
         """End the search, if it has not; what was told can still be read."""
@@ -417,6 +442,23 @@ def _told(state: object, about: Mapping[str, Any], domain: Box) -> tuple[list[tu
         told.append((position, number))
     same = state.get("budget") == about["budget"]
     return told, [number for number in range(len(told)) if number not in set(aside)] if same else []
+
+
+def _out(state: Mapping[str, Any], domain: Box) -> tuple[list[Key], list[Key]]:
+    """The points of a state that are out, and those of them that the search does not wait for; raises `InputError`
+    where they are malformed."""
+    out, ahead = state.get("out", []), state.get("ahead", [])
+    try:
+        points = np.array(out, dtype=float).reshape(len(out), domain.dimension)
+        usable = bool((points >= domain.lower).all() and (points <= domain.upper).all())
+    except (TypeError, ValueError):
+        usable = False
+    if not isinstance(out, list) or not usable:
+        raise InputError(path="state.out", expected="a list of points of the domain", got=_short(out))
+    if not isinstance(ahead, list) or not all(is_whole(number, 0) and number < len(out) for number in ahead):
+        raise InputError(path="state.ahead", expected="numbers of points that are out", got=_short(ahead))
+    keys = _keys(points)
+    return keys, [keys[number] for number in ahead]
 
 
 def _short(value: object) -> str:

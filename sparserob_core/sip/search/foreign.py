@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, final
+from typing import Any, ClassVar, Protocol, final
 
 import numpy as np
 
@@ -28,6 +28,8 @@ class Asked(Protocol):
 class FromAskTell(Maximiser):
     """See `from_ask_tell`."""
 
+    scaled: ClassVar[bool] = True
+
     def __init__(self, create: Callable[[int, int, np.random.Generator], Asked], read: Callable[[Any], Any]) -> None:
         self.create, self.read = create, read
 
@@ -50,6 +52,8 @@ class FromAskTell(Maximiser):
 @final
 class FromMinimiser(Maximiser):
     """See `from_minimiser`."""
+
+    scaled: ClassVar[bool] = True
 
     def __init__(self, minimise: Callable[[Callable[[Any], float], Array], object]) -> None:
         self.minimise = minimise

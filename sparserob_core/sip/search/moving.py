@@ -56,6 +56,11 @@ class Moving:
         """See `Objective`."""
         return self._objective.best_value
 
+    def known(self) -> tuple[Array, Array]:
+        """See `Objective.known`; points ``(k, c)``."""
+        points, values = self._objective.known()
+        return points[:, self._moves], values
+
     @property
     def differentiable(self) -> bool:
         """See `Objective.differentiable`."""

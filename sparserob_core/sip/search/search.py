@@ -18,6 +18,7 @@ from sparserob_core.sip.rules import Metropolis, Progress
 from sparserob_core.sip.search.block_ascent import block_ascent
 from sparserob_core.sip.search.moving import Moving
 from sparserob_core.sip.search.notifier import Notifier, Standing
+from sparserob_core.sip.search.scaled import Scaled
 
 Function: TypeAlias = Callable[[Array], object]
 
@@ -53,7 +54,9 @@ class Target:
 @dataclass(frozen=True, eq=False)
 class Rules:
     """What a search obeys beside its budget: when it stops (``SC2``), what a walk accepts (``SlCr``), the share of its
-    budget that goes to a local method at the end, and the ``seconds`` after which no evaluation begins.
+    budget that goes to a local method at the end, and the ``seconds`` after which no evaluation begins. It ends at a
+    value of at least ``target``, after ``patience`` evaluations in a row that gained nothing, and where ``halt`` says
+    so, which is asked after every batch; its polish ends with it.
 
     ``polish``: ``None`` is what the maximiser says of itself (`Maximiser.polished`) where the blocks of the target are
     linear, for there `block_ascent` finds in ten evaluations what no search finds that only compares values, and 0
@@ -64,6 +67,9 @@ class Rules:
     selection: Callable[[float, float, float, np.random.Generator], bool] = field(default_factory=Metropolis)
     polish: float | None = None
     seconds: float = np.inf
+    target: float = np.inf
+    patience: int | None = None
+    halt: Callable[[], bool] | None = None
 
     def __post_init__(self) -> None:
         if self.polish is not None and not 0.0 <= self.polish < 1.0:
@@ -96,7 +102,15 @@ class CountedObjective:
         self.best_value, self.best_point = -np.inf, np.full(self.domain.dimension, np.nan)
         self.evaluations = 0
         self.missing = 0  # evaluations that gave NaN
+        self.learnt = 0  # points that were known before, which are no evaluations of this search
+        self._gained = 0  # evaluations at the last gain
+        self._known = np.empty((0, self.domain.dimension)), np.empty(0)
+        self._before: dict[tuple[float, ...], float] = {}  # the same by its points
+        self._recalls = 0
+        own = rules or Rules()
+        self._target, self._patience, self._halt = own.target, own.patience, own.halt
         self.searched: int | None = None
+        self.whole_end = False  # nothing is polished either
         self.ended: SearchEnded | EvaluationError | None = None
         self._keeps = self.domain.dimension * self.budget <= KEPT_NUMBERS
         self._points: list[Array] = []
@@ -140,20 +154,74 @@ class CountedObjective:
         if self._notifier is not None and self._notifier.due(self.evaluations, self.budget):
             self.notify_observers()
         asked = self._checked(points)
-        allowed = asked[: self.remaining]
-        values = np.empty(0)
-        if len(allowed):
-            values = self._values_at(allowed)
-            self._record(allowed, values)
+        values = self._recalled(asked)
+        new = np.flatnonzero(np.isnan(values))
+        allowed = new[: self.remaining]
+        while len(allowed):  # in one batch, unless patience would end within it
+            batch = allowed[: self._patient]
+            values[batch] = self._values_at(asked[batch])
+            self._record(asked[batch], values[batch])
+            allowed = allowed[len(batch) :]
+            self._judge()
+        if not len(new):
+            self._judge()
+        if np.isnan(values).any():
+            raise self._end(SearchEnded("the budget is spent"))
+        return values
+
+    def _recalled(self, points: Array) -> Array:
+        """The values ``(k,)`` that are known from before, no more of them than the budget, so that whoever asks for
+        nothing else comes to an end; NaN where there is none."""
+        values = np.full(len(points), np.nan)
+        if self._before and self._recalls < self.budget:
+            values[:] = [self._before.get(tuple(point), np.nan) for point in points.tolist()]
+            self._recalls += int((~np.isnan(values)).sum())
+        return values
+
+    @property
+    def _patient(self) -> int:
+        """How many evaluations may still gain nothing."""
+        return self.budget if self._patience is None else max(1, self._patience - self.evaluations + self._gained)
+
+    def _judge(self) -> None:
+        """End the search where there is a reason."""
         if self.best_value == np.inf:
             raise self._end(SearchEnded("a value of +inf was found, which nothing can exceed"))
+        if self.best_value >= self._target:
+            self.whole_end = True
+            raise self._end(SearchEnded(f"the target {self._target:.9g} is reached"))
+        if self._patience is not None and self.evaluations - self._gained >= self._patience:
+            self.whole_end = True
+            raise self._end(SearchEnded(f"the last {self._patience} evaluations gained nothing"))
+        if self._halt is not None and self._halt():
+            self.whole_end = True
+            raise self._end(SearchEnded("the callback says so"))
         if self._stopped():
             raise self._end(SearchEnded("the stopping rule of the search says so"))
         if self.late:
             raise self._end(SearchEnded("the time limit of the search is reached"))
-        if len(allowed) < len(asked):
-            raise self._end(SearchEnded("the budget is spent"))
-        return values
+
+    def learn(self, points: Float[Array, "k d"], values: Float[Array, " k"]) -> None:
+        """Take points over whose values are known from before: they are no evaluations of this search, and count for
+        its best point. To be called before the first evaluation."""
+        known, self.learnt = np.where(np.isnan(values), -np.inf, values), len(values)
+        self._known = self._checked(points), known
+        self._before = dict(zip(map(tuple, self._known[0].tolist()), known.tolist(), strict=True))
+        self.budget, self.evaluations, self._gained = self.budget + self.learnt, self.learnt, self.learnt
+        top = int(known.argmax())
+        self.best_value, self.best_point = float(known[top]), self._known[0][top].copy()
+        if self._notifier is not None:
+            self._notifier.notified = self.learnt
+        self._judge()
+
+    def begin(self, start: Float[Array, "k d"]) -> None:
+        """Evaluate the points that the search starts from."""
+        self.evaluate(start)
+        self._known = self.seen()
+
+    def known(self) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
+        """See `Objective.known`."""
+        return self._known
 
     @shaped
     def value_and_gradient(self, point: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:
@@ -176,7 +244,7 @@ class CountedObjective:
     def note(self, **scalars: float) -> None:
         """See `Objective.note`."""
         for name, value in scalars.items():
-            self._notes.setdefault(name, []).append((self.evaluations, float(value)))
+            self._notes.setdefault(name, []).append((self.evaluations - self.learnt, float(value)))
         if self._notifier is not None:
             self._notifier.note(scalars)
 
@@ -202,20 +270,20 @@ class CountedObjective:
         many."""
         if not self._keeps:
             return self.best_point[np.newaxis], np.array([self.best_value])
-        return np.concatenate([np.empty((0, self.domain.dimension)), *self._points]), np.concatenate(
-            [np.empty(0), *self._values]
-        )
+        own = slice(0, self.learnt)
+        points, values = self._known[0][own], self._known[1][own]
+        return np.concatenate([points, *self._points]), np.concatenate([values, *self._values])
 
     def report(self, stopped: str, upper_bound: float = np.inf) -> Report:
         """What has been found so far."""
-        points = self.seen()[0] if self._keeps else np.empty((0, self.domain.dimension))
+        points = self.seen()[0][self.learnt :] if self._keeps else np.empty((0, self.domain.dimension))
         values = np.concatenate([np.empty(0), *self._values])
         seconds = np.repeat([moment for _, moment in self._seconds], [count for count, _ in self._seconds])
         notes = {name: np.array(rows) for name, rows in self._notes.items()}
-        trace = Trace(points, values, np.maximum.accumulate(values), seconds, notes, self.searched)
-        return Report(
-            self.best_value, self.best_point, self.evaluations, upper_bound, trace, stopped, missing=self.missing
-        )
+        searched = None if self.searched is None else self.searched - self.learnt
+        trace = Trace(points, values, np.maximum.accumulate(values), seconds, notes, searched)
+        own = self.evaluations - self.learnt
+        return Report(self.best_value, self.best_point, own, upper_bound, trace, stopped, missing=self.missing)
 
     def notify_observers(self) -> None:
         """Send what was evaluated since the last event."""
@@ -297,6 +365,7 @@ class CountedObjective:
         if values[top] > self.best_value or first:
             self.best_value, self.best_point = float(values[top]), points[top].copy()
             self._improvements.append((self.evaluations, self.best_value))
+            self._gained = self.evaluations - len(values) + top + 1
 
 
 def _of_rule(name: str, ask: Callable[[], object]) -> object:
@@ -321,15 +390,18 @@ def maximise(
     rules: Rules | None = None,
     notify: Notify = ignore,
     start: Array | None = None,
+    known: tuple[Array, Array] | None = None,
 ) -> Report:
     """Search for the maximum of a target with ``budget`` evaluations at most; the last share of them polishes what was
     found.
 
     The maximiser sees the coordinates that can move, and is not asked where none can: the value at the only point is
-    then the maximum. ``start (d,)`` or ``(k, d)`` is evaluated before it begins. An interrupt from the keyboard ends
-    the search; the report says so. Raises `EvaluationError` when the function raises or does not return numbers,
-    `InputError` for a wrong budget, `PluginError` for a maximiser that raises, leaves the domain, or claims an upper
-    bound that is no number or that an evaluated value refutes.
+    then the maximum. It sees them in units of about 1 where it asks for these (`Maximiser.scaled`).
+    ``start (d,)`` or ``(k, d)`` is evaluated before it begins; ``known``: points ``(k, d)`` and values ``(k,)`` from
+    before, which are no evaluations. An interrupt from the keyboard ends the search; the report says so. Raises
+    `EvaluationError` when the function raises or does not return numbers, `InputError` for a wrong budget,
+    `PluginError` for a maximiser that raises, leaves the domain, or claims an upper bound that is no number or that an
+    evaluated value refutes.
     """
     rules = rules or Rules()
     name = str(getattr(maximiser, "origin", f"maximiser {type(maximiser).__name__}"))
@@ -340,8 +412,10 @@ def maximise(
     bound, stopped, interrupted = np.inf, "the maximiser found nothing left to gain", False
     try:
         try:
+            if known is not None:
+                objective.learn(*known)
             if start is not None:
-                objective.evaluate(np.atleast_2d(start))
+                objective.begin(np.atleast_2d(start))
             bound = _bound(maximiser, name, shown, rng) if moves.size else _only_value(objective)
             stopped = stopped if objective.remaining else "the budget is spent"
         except SearchEnded as end:
@@ -352,14 +426,16 @@ def maximise(
             and not isinstance(objective.ended, EvaluationError)
             and np.isfinite(objective.best_value)
             and not objective.late
+            and not objective.whole_end
         ):
             objective.polish(reserved)
             stopped = f"{stopped}; then polished"
             from sparserob_core.sip.search.local_search import polish
 
-            if not block_ascent(shown):  # whose end no local method improves that knows less of the blocks
-                points, values = objective.seen()
-                polish(shown, points[:, moves], values)
+            points, values = objective.seen()
+            scaled = Scaled(shown, values)
+            if not block_ascent(scaled):  # whose end no local method improves that knows less of the blocks
+                polish(scaled, *scaled.seen(points[:, moves], values))
     except SearchEnded:
         pass
     except KeyboardInterrupt as pressed:
@@ -377,15 +453,16 @@ def maximise(
 
 def _bound(maximiser: Maximiser, name: str, objective: Objective, rng: np.random.Generator) -> float:
     """The upper bound that a maximiser claims; what it raises, other than an error of this project, is its fault."""
+    scaled = Scaled(objective, objective.known()[1]) if maximiser.scaled else None
     try:
-        claimed: object = maximiser.search(objective, rng)
+        claimed: object = maximiser.search(objective if scaled is None else scaled, rng)
     except (SearchEnded, SparseRobError, KeyboardInterrupt):
         raise
     except BaseException as error:
         raise PluginError(f"{name}: search raised {type(error).__name__}: {error}") from error
     if isinstance(claimed, bool) or not isinstance(claimed, int | float | np.integer | np.floating):
         raise PluginError(f"{name}: search returned {claimed!r}, expected an upper bound, a number or inf")
-    return float(claimed)
+    return float(claimed) * (1.0 if scaled is None else scaled.value or 1.0)
 
 
 def _only_value(objective: CountedObjective) -> float:

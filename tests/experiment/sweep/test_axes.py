@@ -240,3 +240,88 @@ def test_what_decides_no_result_is_not_in_the_hash(config: Path) -> None:
     plain = hashes({})
     assert plain == hashes({"title": "Other", "limits.seconds": 5.0, "observers": [], "executor": "serial"})
     assert not plain & hashes({"problem.horizon": 2.5})
+
+
+SMALL = {
+    "problem": {
+        "name": "linear",
+        "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+        "horizon": 5.0,
+        "initial_state": [4, 0],
+        "control": {"box": 1},
+    }
+}
+PAIRED = "problem.horizon,dictionaries.control.pieces"
+
+
+def test_paired_keys_are_one_axis_of_a_product() -> None:
+    plan = make_plan(SMALL, [f"{PAIRED}=[4.0,40],[5.0,40],[6.0,60]", "seed=1,2"])
+    assert [axis.key for axis in plan.axes] == ["problem.horizon", "dictionaries.control.pieces", "seed"]
+    pairs = [(4.0, 40), (5.0, 40), (6.0, 60)]
+    assert plan.values() == [(*pair, seed) for pair in pairs for seed in (1, 2)]
+    crossed = make_plan(SMALL, {"seed": [1, 2], PAIRED: np.array([[4.0, 40], [5.0, 50]])})
+    assert crossed.values() == [(seed, *pair) for seed in (1, 2) for pair in ((4.0, 40.0), (5.0, 50.0))]
+    config = plan.loaded(plan.values()[-1]).config.plain()
+    assert (config["problem"]["horizon"], config["dictionaries"]["control"]["pieces"], config["seed"]) == (6.0, 60, 2)
+
+
+@pytest.mark.parametrize("text", ["[4.0,40],[5.0,50]", "[[4.0,40],[5.0,50]]", " [4.0, 40] , [5.0, 50] "])
+def test_paired_keys_are_written_in_brackets_or_without(text: str) -> None:
+    assert make_plan(SMALL, [f"{PAIRED}={text}"]).values() == [(4.0, 40), (5.0, 50)]
+
+
+def test_paired_keys_stand_in_the_file_of_a_study_and_are_read_again(tmp_path: Path) -> None:
+    plan = make_plan(
+        SMALL, [f"{PAIRED}=[4.0,40],[5.0,50]", "seed=0:2:3", "method,problem.control.box=[exchange,1],[nominal,2]"]
+    )
+    (tmp_path / "sweep.yaml").write_text(plan.written())
+    again = read_plan(tmp_path / "sweep.yaml")
+    assert again.values() == plan.values()
+    assert len(plan.values()) == 12
+    assert again.written() == plan.written()
+    wider = make_plan(tmp_path / "sweep.yaml", [f"{PAIRED}=[7.0,70],[8.0,80]"])
+    assert {row[:2] for row in wider.values()} == {(7.0, 70), (8.0, 80)}
+
+
+def test_paired_keys_are_drawn_together_and_a_single_pair_is_a_change() -> None:
+    for points in ("random", "sobol"):
+        plan = make_plan(SMALL, [f"{PAIRED}=[4.0,40],[5.0,50]", "problem.control.box=0.5:1.0"], points=points, number=8)
+        rows = plan.values()
+        assert {row[:2] for row in rows} == {(4.0, 40), (5.0, 50)}
+        assert len({row[2] for row in rows}) == 8
+    single = make_plan(SMALL, [f"{PAIRED}=[4.0,40]", "seed=1,2"])
+    assert single.values() == [(1,), (2,)]
+    assert single.loaded((1,)).config.plain()["problem"]["horizon"] == 4.0
+
+
+@pytest.mark.parametrize(
+    ("axes", "words"),
+    [
+        ([f"{PAIRED}=4,5"], "expected lists of 2 values, one for each key, such as"),
+        ([f"{PAIRED}=[4.0,40],[5.0]"], "expected lists of 2 values"),
+        ([f"{PAIRED}=[4.0,40],[4.0,40]"], "every value once"),
+        ([f"{PAIRED}=[4.0,40],[5.0,50]", "problem.horizon=4,5"], "every key once"),
+        (["seed,title=[1,a],[2,b]"], "a key that decides a result"),
+    ],
+)
+def test_pairs_that_make_no_sense_are_refused(axes: list[str], words: str) -> None:
+    with pytest.raises(sr.InputError, match=words):
+        make_plan(SMALL, axes)
+
+
+@pytest.mark.parametrize("change", [{"axes": ["problem.horizon=4,5"]}, {"overrides": ["problem.horizon=4"]}])
+def test_one_of_two_paired_keys_is_not_changed_alone(change: dict[str, list[str]], tmp_path: Path) -> None:
+    (tmp_path / "sweep.yaml").write_text(make_plan(SMALL, [f"{PAIRED}=[4.0,40],[5.0,50]"]).written())
+    with pytest.raises(sr.InputError, match="together, since these keys are paired"):
+        make_plan(tmp_path / "sweep.yaml", **change)
+
+
+def test_a_study_of_pairs_has_a_table_and_a_figure(tmp_path: Path) -> None:
+    axes = {PAIRED: [[4.5, 10], [5.0, 10], [5.5, 20]], "solver.name": ["piqp", "clarabel"]}
+    study = sr.sweep(SMALL, axes, out=tmp_path / "study")
+    assert [
+        (row["problem.horizon"], row["dictionaries.control.pieces"], row["solver.name"]) for row in study.table
+    ] == [(horizon, pieces, name) for horizon, pieces in axes[PAIRED] for name in axes["solver.name"]]
+    assert {row["status"] for row in study.table} == {"certified"}
+    assert (tmp_path / "study" / "sweep.png").stat().st_size > 0
+    assert len(sr.sweep(tmp_path / "study").table) == 6

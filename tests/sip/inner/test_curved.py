@@ -101,3 +101,53 @@ def test_a_program_with_free_variables_and_a_quadratic_cost_has_a_lower_bound():
     )
     assert result.lower_bound > -np.inf
     assert abs(result.cost - result.lower_bound) <= 1e-8
+
+
+def ill_conditioned(seed, largest, n=8, rows=6):
+    """A Hessian of condition 1e12 whose eigenvectors are not those of the entries, a linear cost, and rows."""
+    rng = np.random.default_rng(seed)
+    turned = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    P = (turned * np.logspace(0, -12, n) * largest) @ turned.T
+    return (P + P.T) / 2, rng.standard_normal(n), rng.standard_normal((rows, n)), np.abs(rng.standard_normal(rows))
+
+
+@pytest.mark.parametrize("reach", [10.0, np.inf])
+@pytest.mark.parametrize(("largest", "seed"), [(1.0, 0), (1e6, 0), (1e6, 1), (1e6, 2), (1e12, 2)])
+def test_a_hessian_of_condition_1e12_is_solved_as_bare_piqp_solves_it(seed, largest, reach):
+    piqp = pytest.importorskip("piqp")
+    P, q, G, h = ill_conditioned(seed, largest)
+    bare, box = piqp.DenseSolver(), np.full(8, reach)
+    bare.settings.max_iter = 500
+    bare.setup(P, q, None, None, G, None, h, -box, box)
+    status, x = bare.solve(), bare.result.x
+    result = sr.solve(sr.SemiInfiniteProgram(n=8, P=P, q=q, G=G, h=h, lower=-reach, upper=reach))
+    assert result.lower_bound <= result.value
+    assert abs(result.value - result.lower_bound) <= 2e-8 * abs(result.value)
+    if status == piqp.PIQP_SOLVED:
+        cost = 0.5 * x @ P @ x + q @ x
+        assert result.value <= cost + 1e-6 * abs(cost)
+        if np.isfinite(reach) and largest == 1.0:
+            assert abs(result.value - cost) <= 1e-7 * abs(cost)
+
+
+def test_a_matrix_is_proven_where_its_trace_proves_nothing():
+    rng = np.random.default_rng(3)
+    turned = np.linalg.qr(rng.standard_normal((24, 24)))[0]
+    P = (turned * np.logspace(0, -14, 24)) @ turned.T
+    P = (P + P.T) / 2
+    c = least_curvature(P)
+    left = [[Fraction(float(v)) for v in row] for row in P]
+    for i, curvature in enumerate(c):
+        left[i][i] -= Fraction(float(curvature))
+    assert all(pivot > 0 for pivot in pivots(left))
+
+
+def test_squares_that_cancel_are_summed_with_more_digits():
+    P = ill_conditioned(4, 1e12)[0]
+    x = np.linalg.eigh(P)[1][:, 0]
+    exact = sum(
+        Fraction(float(P[i, j])) * Fraction(float(x[i])) * Fraction(float(x[j])) for i in range(8) for j in range(8)
+    )
+    program = sr.SemiInfiniteProgram(n=8, P=P, q=np.zeros(8)).finite
+    assert abs(program.objective(x) - float(exact / 2)) <= 1e-8 * abs(float(exact))
+    assert abs(program.objective(x) - float(exact / 2)) <= 2.0**-50 * program.magnitude(x)

@@ -431,3 +431,69 @@ def test_a_search_says_how_far_it_is_and_is_not_moved_by_it():
     assert repr(search) == "AskTell: 0 of 8 evaluations, least value inf"
     search.tell(search.ask(1), [0.25])
     assert repr(search) == "AskTell: 1 of 8 evaluations, least value 0.25"
+
+
+@pytest.mark.parametrize("name", ["maxlipo", "sobol", "simulated_annealing"])
+def test_one_process_asks_and_another_one_tells(name):
+    arguments = {"box": BOX, "name": name, "budget": 30, "seed": 4, "polish": 0}
+    asking = sr.ask_tell(**arguments)
+    out = [asking.ask(1, fresh=True)[0] for _ in range(4)]
+    asking.tell(out[1], [bowl(out[1][np.newaxis])[0]])
+    state = json.loads(json.dumps(asking.state()))
+    telling = sr.ask_tell(**arguments, state=state)
+    assert telling.state() == state
+    new = telling.ask(1, fresh=True)
+    assert new.tolist()[0] not in [point.tolist() for point in out], "what is out is not given again"
+    for point in (out[0], out[2], out[3]):
+        telling.tell(point, bowl(point[np.newaxis]))
+    with pytest.raises(sr.InputError, match="no value yet"):
+        telling.tell(out[2], [0.0])
+    back = sr.ask_tell(**arguments, state=json.loads(json.dumps(telling.state())))
+    assert back.evaluations == 4
+    back.tell(new, bowl(new))
+    by_hand(back)
+    assert back.done
+    for search in (asking, telling, back):
+        search.close()
+
+
+def test_points_of_workers_that_never_come_back_are_let_go():
+    arguments = {"box": BOX, "name": "sobol", "budget": 6, "polish": 0}
+    with sr.ask_tell(**arguments) as asking:
+        lost = asking.ask(4, fresh=True).tolist()
+        state = asking.state()
+    with sr.ask_tell(**arguments, state=state) as again:
+        assert again.ask(4).tolist() == lost, "what the search waits for"
+        assert not [point for point in again.ask(2, fresh=True).tolist() if point in lost]
+    with sr.ask_tell(**arguments, state={**state, "out": [], "ahead": []}) as again:
+        assert again.ask(4, fresh=True).tolist() == lost
+    for broken in ({"out": [[9.0, 9.0]]}, {"out": 3}, {"out": [[0.0, 0.0]], "ahead": [1]}):
+        with pytest.raises(sr.InputError, match=r"state\."):
+            sr.ask_tell(**arguments, state={**state, **broken})
+
+
+def test_target_patience_and_known_points_hold_by_hand_too():
+    search = sr.ask_tell(BOX, "random_search", budget=300, minimise=True, target=0.5, seed=2)
+    while not search.done:
+        points = search.ask(1)
+        search.tell(points, -bowl(points))
+    assert search.best_value <= 0.5
+    assert search.evaluations < 300
+    known = (np.array([[0.0, 0.0], [-1.0, 2.0]]), [3.0, 1.0])
+    search = sr.ask_tell(BOX, "simulated_annealing", budget=50, minimise=True, known=known, patience=5, polish=0)
+    while not search.done:
+        points = search.ask()
+        search.tell(points, np.full(len(points), 2.0))
+    assert search.evaluations == 5
+    assert search.report().best_value == 1.0
+    assert search.report().best_point.tolist() == [-1.0, 2.0]
+    state = json.loads(json.dumps(search.state()))
+    again = sr.ask_tell(
+        BOX, "simulated_annealing", budget=50, minimise=True, known=known, patience=5, polish=0, state=state
+    )
+    assert again.done
+
+
+def test_whole_numbers_are_refused_by_a_search_that_follows_slopes():
+    with pytest.raises(sr.InputError, match="a maximiser that compares values, such as simulated_annealing"):
+        sr.ask_tell(sr.Box([0, 0.0], [9, 1.0]), "gradient_ascent", budget=20, integer=[0])

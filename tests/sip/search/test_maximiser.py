@@ -257,3 +257,86 @@ def test_a_yardstick_and_a_proof_are_not_polished_unless_asked():
         report = sr.maximise(lambda p: p[:, 0], box, name, budget=30, **options)
         assert "polished" not in report.stopped
         assert "polished" in sr.maximise(lambda p: p[:, 0], box, name, budget=30, polish=0.5, **options).stopped
+
+
+SLOPE = sr.Box([0.0, 0.0], [1.0, 1.0])
+
+
+@pytest.mark.parametrize("name", ["random_search", "simulated_annealing", "direct", "maxlipo", "sobol"])
+def test_a_target_ends_the_search_where_it_is_reached(name):
+    calls = []
+
+    def rising(points):
+        calls.append(len(points))
+        return points.sum(axis=1)
+
+    report = sr.maximise(rising, SLOPE, name, budget=5000, target=1.2)
+    assert report.best_value >= 1.2
+    assert report.stopped == "the target 1.2 is reached"
+    assert (report.trace.best[: -calls[-1]] < 1.2).all(), "in the last batch, and without a polish"
+    assert report.evaluations < 5000
+
+
+@pytest.mark.parametrize("name", ["random_search", "simulated_annealing", "sequool", "gradient_ascent"])
+@pytest.mark.parametrize("patience", [1, 7, 40])
+def test_patience_ends_it_after_exactly_so_many_evaluations_without_a_gain(name, patience):
+    report = sr.maximise(lambda x: np.minimum(x.sum(axis=1), 0.9), SLOPE, name, budget=2000, patience=patience, seed=1)
+    best = report.trace.best
+    last = int(np.argmax(best == best[-1]))
+    assert report.evaluations == last + 1 + patience
+    assert "gained nothing" in report.stopped
+    gains = np.flatnonzero(np.diff(best, prepend=-np.inf) > 0)
+    assert np.diff(gains).max(initial=0) <= patience
+
+
+@pytest.mark.parametrize("answer", [True, np.True_])
+def test_a_callback_that_returns_true_ends_it(answer):
+    heard = []
+
+    def callback(points, values):
+        heard.append(len(points))
+        return answer if len(heard) == 3 else None
+
+    report = sr.maximise(lambda x: x.sum(axis=1), SLOPE, "simulated_annealing", budget=500, callback=callback)
+    assert len(heard) == 3
+    assert report.evaluations == sum(heard)
+    assert report.stopped == "the callback says so"
+    unheard = sr.maximise(lambda x: x.sum(axis=1), SLOPE, "sobol", budget=50, callback=lambda *given: len(given))
+    assert unheard.evaluations == 50, "only the answer True is one"
+
+
+@pytest.mark.parametrize("name", ["simulated_annealing", "maxlipo", "adalipo", "dual_annealing", "gradient_ascent"])
+def test_points_known_from_before_are_not_evaluated_and_the_search_goes_on_from_them(name):
+    points = np.array([[0.1, 0.9], [0.7, 0.25], [0.4, 0.4]])
+    asked = []
+
+    def bowl(x):
+        asked.extend(x.tolist())
+        return -((x - [0.7, 0.2]) ** 2).sum(axis=1)
+
+    values = -((points - [0.7, 0.2]) ** 2).sum(axis=1)
+    report = sr.maximise(bowl, SLOPE, name, budget=40, known=(points, values), polish=0.2)
+    assert len(asked) == report.evaluations == len(report.trace.points) <= 40
+    assert not [point for point in points.tolist() if point in asked]
+    assert report.best_value >= values.max()
+    only = sr.maximise(lambda x: -1e9 + 0 * x[:, 0], SLOPE, name, budget=20, known=(points, values))
+    assert only.best_point.tolist() == [0.7, 0.25]
+    assert only.evaluations <= 20
+    done = sr.maximise(bowl, SLOPE, name, budget=40, known=(points, values), target=values.max())
+    assert done.evaluations == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"target": float("nan")}, "target: expected a number"),
+        ({"target": "1"}, "target: expected a number"),
+        ({"patience": 0}, "patience"),
+        ({"known": ([[0.5, 0.5]], [1.0, 2.0])}, "known: expected a value for each point"),
+        ({"known": ([[0.5, 2.0]], [1.0])}, "known: expected points of the box"),
+        ({"known": 3}, "known: expected points and their values"),
+    ],
+)
+def test_ends_and_known_points_that_make_no_sense_are_refused(options, words):
+    with pytest.raises(sr.InputError, match=words):
+        sr.maximise(lambda x: x.sum(axis=1), SLOPE, "sobol", budget=10, **options)
