@@ -23,6 +23,7 @@ class Direct(sr.Maximiser, sr.Options):
     """
 
     scaled: ClassVar[bool] = True
+    apart: ClassVar[bool] = True
 
     eps: float = Field(default=1e-8, ge=0.0, le=1.0)
     """Least improvement, relative to the best value, that a rectangle must promise: small is local and accurate."""

@@ -4,7 +4,7 @@ they lie."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from pydantic import Field
@@ -36,10 +36,13 @@ class SequOOL(sr.Maximiser, sr.Options):
 
     In high dimension: a coordinate is cut only once in every ``d`` depths, so ``rho`` is about ``3^(-1/d)``;
     coordinates from ``hmax + 1`` on stay at the centre of the box for good (``hmax`` is about 140 for 1000
-    evaluations). It is strong up to some ten coordinates. Cells that are permutations of one another, such as the same
-    index tuple in another order, are not recognised; what an earlier search found is not used. Below depth ``34 d`` the
-    cells are smaller than the spacing of floating-point numbers, and points repeat.
+    evaluations); in a tuple that is another place for every index. It is strong up to some ten coordinates. Cells that
+    are permutations of one another, such as the same index tuple in another order, are not recognised; what an earlier
+    search found is not used. Below depth ``34 d`` the cells are smaller than the spacing of floating-point numbers, and
+    points repeat.
     """
+
+    apart: ClassVar[bool] = True
 
     openings: int | None = Field(default=None, ge=1, le=10**7)
     """The paper's ``n``: ``hmax = floor(n / (1 + 1/2 + ... + 1/n))``, which opens at most ``n + 1`` cells; the budget

@@ -131,10 +131,13 @@ class Maximiser(ABC):
     ``scaled``: it is shown a box whose sides have a length of about 1, and values of about 1, in units that are powers
     of two: the units of the user then change nothing, whatever numbers of its own it compares with. One that only
     compares values, or has a constant of the user's, as a Lipschitz constant or a temperature, does without.
+    ``apart``: of tuples of indices it is shown every index shifted round its box, so that all of them are apart where
+    it begins, in the middle; one that draws its points at random does without.
     ``whole``: it makes sense of a function that is constant between whole numbers; one that follows slopes does not.
     """
 
     scaled: ClassVar[bool] = False
+    apart: ClassVar[bool] = False
     whole: ClassVar[bool] = True
 
     @property

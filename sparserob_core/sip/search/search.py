@@ -16,9 +16,8 @@ from sparserob_core.sip.events import Notify, Phase, ignore
 from sparserob_core.sip.maximiser import EvaluationError, LinearBlocks, Maximiser, Objective, Report, SearchEnded, Trace
 from sparserob_core.sip.rules import Metropolis, Progress
 from sparserob_core.sip.search.block_ascent import block_ascent
-from sparserob_core.sip.search.moving import Moving
+from sparserob_core.sip.search.handed import Apart, Moving, Scaled
 from sparserob_core.sip.search.notifier import Notifier, Standing
-from sparserob_core.sip.search.scaled import Scaled
 
 Function: TypeAlias = Callable[[Array], object]
 
@@ -453,6 +452,8 @@ def maximise(
 
 def _bound(maximiser: Maximiser, name: str, objective: Objective, rng: np.random.Generator) -> float:
     """The upper bound that a maximiser claims; what it raises, other than an error of this project, is its fault."""
+    if maximiser.apart and objective.acting is not None:  # a tuple of indices
+        objective = Apart(objective)
     scaled = Scaled(objective, objective.known()[1]) if maximiser.scaled else None
     try:
         claimed: object = maximiser.search(objective if scaled is None else scaled, rng)

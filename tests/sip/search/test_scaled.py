@@ -1,4 +1,4 @@
-"""Guards sip/search/scaled.py, and that no shipped search and no foreign one takes notice of units: the same seed walks
+"""Guards sip/search/handed.py, and that no shipped search and no foreign one takes notice of units: the same seed walks
 the same way, to the last bit, in coordinates and values that differ by powers of two."""
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 
 import sparserob_core as sr
-from sparserob_core.sip.search.scaled import power_of_two
+from sparserob_core.sip.search.handed import power_of_two
 
 LOWER, UPPER = np.array([-2.0, -3.0]), np.array([3.0, 2.5])
 UNITS = [((30, 30), 0), ((-40, -40), 0), ((0, 0), -30), ((0, 0), 60), ((20, -7), -41)]

@@ -1,4 +1,4 @@
-"""Guards sip/search/moving: a maximiser sees the coordinates that can move, and the report speaks of all of them."""
+"""Guards sip/search/handed: a maximiser sees the coordinates that can move, and the report speaks of all of them."""
 
 from __future__ import annotations
 
@@ -114,3 +114,44 @@ def test_which_blocks_act_is_handed_on_where_every_block_moves_alike(even):
     target = Target(hill, box, lambda p: p, block=3, acting=lambda: acts)
     maximise(target, probe, 9, np.random.default_rng(0))
     assert probe.acting() is acts if even else probe.acting is None
+
+
+class Middle(sr.Maximiser):
+    """Evaluates the middle of its box alone, and shows it."""
+
+    apart = True
+
+    def search(self, objective, rng):
+        middle = (objective.domain.lower + objective.domain.upper)[np.newaxis] / 2.0
+        objective.sketch("cells", middle - 0.01, middle + 0.01)
+        objective.evaluate(middle)
+        self.best, self.linear = objective.best_point, objective.linear
+        return np.inf
+
+
+def test_in_the_middle_of_a_tuple_its_indices_are_apart():
+    """Five indices ``(t, p)``: times in the middles of five equal parts, parameters no two within a tenth."""
+    box, maximiser, seen = sr.Box([0.0, -1.0] * 5, [10.0, 1.0] * 5), Middle(), []
+    acting = Target(hill, box, block=2, acting=lambda: np.ones(5, dtype=bool))
+    report = maximise(acting, maximiser, 1, np.random.default_rng(0), notify=seen.append)
+    place = report.best_point.reshape(5, 2)
+    assert place[:, 0] == pytest.approx([1.0, 3.0, 5.0, 7.0, 9.0])
+    assert np.diff(np.sort(place[:, 1])).min() > 0.1
+    assert maximiser.best == pytest.approx([5.0, 0.0] * 5) and maximiser.linear is None
+    plain = maximise(Target(hill, box, block=2), Middle(), 1, np.random.default_rng(0))
+    assert plain.best_point == pytest.approx([5.0, 0.0] * 5)
+
+
+def test_shifted_points_are_within_the_box_and_lead_back():
+    from sparserob_core.sip.search.handed import Apart
+
+    class Here:
+        domain, block = sr.Box([2.0, -1.0, 0.0] * 4, [5.0, 1.0, 1.0] * 4), 3
+
+    apart = Apart(Here())
+    points = np.random.default_rng(1).uniform(Here.domain.lower, Here.domain.upper, size=(200, 12))
+    points = np.vstack([points, Here.domain.lower, Here.domain.upper])
+    full = apart.full(points)
+    assert (full >= Here.domain.lower).all() and (full <= Here.domain.upper).all()
+    assert apart.own(full)[:200] == pytest.approx(points[:200], abs=1e-12)
+    assert apart.full(apart.own(points))[:200] == pytest.approx(points[:200], abs=1e-12)
