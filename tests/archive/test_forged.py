@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sparserob_core.experiment.check.check import check
@@ -80,7 +81,7 @@ def violation_enlarged(files: Forgery) -> None:
 
 def time_of_action_raised(files: Forgery) -> None:
     fewest = files.certificate["fewest_active"]
-    fewest["lower"] = min(1.0, 0.05 + (fewest["upper"] or fewest["lower"]))
+    fewest["lower"] = fewest["upper"] + 0.05
     files.result["sparsity"]["fewest_active"]["lower"] = fewest["lower"]
 
 
@@ -88,34 +89,46 @@ def costs(files: Forgery) -> bool:
     return bool(files.certificate["cost"]) and bool(files.certificate["lower_bound"])
 
 
+def is_closed(files: Forgery) -> bool:
+    """Whether the bounds meet, so that a higher one is false; that of a control that is refuted may be too low."""
+    return costs(files) and files.certificate["status"] == "certified"
+
+
 def is_proven(files: Forgery) -> bool:
-    return files.certificate["status"] in ("certified", "verified")
+    return files.certificate["status"] in ("certified", "verified") and bool(files.certificate["proof"])
+
+
+def answers(files: Forgery) -> bool:
+    return is_proven(files) and bool(np.any(files.certificate.get("gains") or 0.0))
+
+
+def is_weighed(files: Forgery) -> bool:
+    """Whether the bound is a sum over multipliers, which no other ones reach, and no tree."""
+    return is_closed(files) and bool(files.certificate["multipliers"]) and is_pressed(files)
 
 
 def is_pressed(files: Forgery) -> bool:
     """Whether a bound rests on a multiplier."""
-    status = files.certificate["status"]
-    closed = status == "infeasible" or (status == "certified" and costs(files))
-    return closed and any(entry["multiplier"] > 0.0 for entry in files.constraints)
+    closed = files.certificate["status"] == "infeasible" or is_closed(files)
+    imposed = (files.certificate["multipliers"] or {}).get("constraints") or []
+    return closed and any(entry["multiplier"] > 0.0 for entry in imposed)
 
 
 FORGED: dict[str, tuple[Forging, Callable[[Forgery], bool], str]] = {
-    "bound raised": (bound_raised, costs, "plain-drift"),
+    "bound raised": (bound_raised, is_closed, "plain-drift"),
     "cost lowered": (cost_lowered, costs, "in_time-delay"),
     "control changed": (control_changed, costs, "plain-polytope_measurable"),
     "nothing done": (nothing_done, lambda files: is_proven(files) and costs(files), "pair-parameters"),
     "box lost": (box_lost, is_proven, "plain-window"),
     "box shifted": (box_shifted, is_proven, "in_time-window"),
-    "multiplier changed": (multiplier_changed, is_pressed, "in_time-execution"),
+    "multiplier changed": (multiplier_changed, is_weighed, "in_time-execution"),
     "sign changed": (sign_changed, is_pressed, "infeasible-box"),
-    "gain changed": (
-        gain_changed, lambda files: is_proven(files) and bool(files.certificate.get("gains")), "plain-affine",
-    ),
+    "gain changed": (gain_changed, answers, "plain-affine"),
     "violation enlarged": (
         violation_enlarged, lambda files: files.certificate["status"] == "refuted", "nominal_in_time-box",
     ),
     "time of action raised": (
-        time_of_action_raised, lambda files: bool(files.certificate.get("fewest_active")), "plain-haar",
+        time_of_action_raised, lambda files: is_proven(files) and "fewest_active" in files.certificate, "plain-haar",
     ),
 }  # fmt: skip
 """By what is forged: how, of which runs it can be, and the run of which it is in the first stage."""
