@@ -28,7 +28,7 @@ endef
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo live paper test tests test-changed test-slow test-pythons mutants lint style types bench dist docs docs-pictures clean
+.PHONY: help install demo live paper test tests test-changed test-slow test-pythons archive mutants lint style types bench dist docs docs-pictures clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
@@ -38,6 +38,7 @@ help:
 	@echo "make test        lint, types, import rules, tests: the first stage, about three minutes on two processors"
 	@echo "make test-changed  the tests of the first stage that the changes since main can affect (SINCE=REVISION)"
 	@echo "make test-slow   the second stage: what takes long, and larger instances of what the first one tests"
+	@echo "make archive     seconds that the checks of archived runs take, and took the version that made them (MEMORY=1: their memory too)"
 	@echo "make mutants     300 small errors in what proves and checks (COUNT=20 SEED=1 for fewer): which do the tests notice? (hours)"
 	@echo "make test-pythons  the tests of the first stage on every Python from 3.11 to 3.14 that is found"
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
@@ -104,6 +105,10 @@ test-changed: $(INSTALLED)
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist worksteal -p no:cacheprovider
+
+# Ends with 1 where the checks take more than 1.5 times as long in sum, or one of them more than 4 times.
+archive: $(INSTALLED)
+	@$(BIN)/python -m tests.archive MEMORY=$(MEMORY)
 
 # COUNT, SEED, FOLDERS=checker,sip/proof, STAGE=folder (not the whole first stage for what survives), JOBS.
 mutants: $(INSTALLED)

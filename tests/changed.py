@@ -15,7 +15,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = "sparserob_core"
-WHOLE = {"known_answers", "contracts", "plugins", "rules"}  # folders of tests that stand at no place of the package
+# folders of tests that stand at no place of the package
+WHOLE = {"archive", "known_answers", "contracts", "plugins", "rules"}
 
 
 def importers() -> Callable[[str], set[str]]:

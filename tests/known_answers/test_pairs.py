@@ -1,5 +1,5 @@
 """Guards the table of pairs in docs/scope.md: features of problems, two at a time, are what the table says: proven and
-checked, proven alone, left open, or refused."""
+checked, proven alone, left open, or refused; what is proven lies between the values of linear programs on samples."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
+from tests.support.oracle import bounds_of, outside
 from tests.support.places import ROOT
 
 Config = dict[str, Any]
@@ -140,16 +141,24 @@ SIGNS = {
 NAMES = list(FEATURES)
 
 
-def sign(names: set[str], directory: Path) -> str:
-    """What becomes of a problem with these features."""
+def combined(names: set[str]) -> Config:
+    """The problem with these features."""
     config = copy.deepcopy(BASE)
     for name, put in FEATURES.items():
         if name in names:
             put(config)
+    return config
+
+
+def sign(names: set[str], directory: Path) -> str:
+    """What becomes of a problem with these features; bounds that programs on samples contradict are none."""
+    config = combined(names)
     try:
         outcome = sr.run(config, out=directory, quiet=True, figures=False)
     except sr.InputError:
         return SIGNS["refused", ""]
+    assert outcome.result is not None
+    assert outside(outcome.result, bounds_of(config)) == [], names
     status = "proven" if outcome.status in ("certified", "verified") else outcome.status
     return SIGNS[status, check(directory).status]
 
