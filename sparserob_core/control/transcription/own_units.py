@@ -110,19 +110,20 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     if sides is not None:
         beside = Moving(moved, sides[0]).at(times) if moved.moves else None
         found = reaches(functionals, constraint.parameters, control, sides[0], times, beside, constraint.gains)
-        near = np.abs(sides[0]) @ _driven(functionals, constraint.parameters, control)
+        near = np.abs(sides[0]).sum(axis=1) * _driven(functionals, constraint.parameters)
         return units_of_sides(*constraint_sides(constraint), *found, near)
     box = constraint.index_set
     z = sampled(box.dimension - 1 - constraint.parameters.count)
     indices = np.hstack([np.tile(box.lower[: box.dimension - z.shape[1]], (z.shape[0], 1)), z])
-    directions = constraint.functionals_at(indices)[1]
+    _, directions, _, heights = constraint.functionals_at(indices)
     _, added = reaches(functionals, constraint.parameters, control, np.eye(directions.shape[1]), times)
     added = added + moved.size
     if (np.abs(directions) @ added).max() <= 1.0 / RESOLVED:  # a sum along c is at most |c| times those along the axes
         return np.ones(1)
     reach, added = reaches(functionals, constraint.parameters, control, directions, times)
     added = added + moved.reach(directions)
-    near = np.abs(directions) @ _driven(functionals, constraint.parameters, control)
+    near = np.abs(directions).sum(axis=1) * _driven(functionals, constraint.parameters)
+    near = np.maximum(near, np.abs(heights))
     if (THIN * np.minimum(added, near) > 1.0).all():
         reach = reach + moved.reach(directions)
         return np.maximum(1.0, power_of_two(np.array([POINT * reach[reach > 0.0].min(initial=added.max())])))
@@ -151,10 +152,11 @@ def constraint_sides(constraint: StateConstraint) -> tuple[Array, Array]:
 
 def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array | float = np.inf) -> Array:
     """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
-    those of them that are not 0, nor `THIN` beside the sums ``added (r,)``, or beside what these are without growth,
-    ``driven (r,)``; of a row whose width is, ``reach`` alone, since nothing is left to keep away from it. No less than
-    what double precision resolves of these. A power of two, 1.2 to 2.5 times below that."""
-    across, thin = widths(H, h), np.where(np.isfinite(added), THIN * np.minimum(added, driven), 0.0)
+    those of them that are not 0, nor `THIN` beside the sums ``added (r,)``, or beside ``|h|`` and what the sums are
+    without growth and control, ``driven (r,)``; of a row whose width is, ``reach`` alone, since nothing is left to keep
+    away from it. No less than what double precision resolves of these. A power of two, 1.2 to 2.5 times below that."""
+    beside = np.minimum(added, np.maximum(driven, np.abs(h)))
+    across, thin = widths(H, h), np.where(np.isfinite(added), THIN * beside, 0.0)
     near = np.where(across > thin, np.stack([np.abs(h), across]), 0.0)
     reach = np.where(across > thin, 1.0, POINT) * reach
     sizes = np.vstack([reach[None], np.where(near > thin, near, 0.0)])
@@ -219,18 +221,18 @@ def reaches(
     return reach, sums.max(axis=(0, 1))
 
 
-def _driven(functionals: WorstCase, parameters: ParameterIndex, control: ConvexSet) -> Array:
-    """How far each state comes from 0 by all that acts on it for the whole horizon and one coupling, ``(d,)``: what no
-    instability has amplified."""
+def _driven(functionals: WorstCase, parameters: ParameterIndex) -> float:
+    """How far any state comes from 0 in the whole horizon, in own units, by where it begins, by drift and disturbance,
+    and by one coupling: what no instability has amplified, and no control that need not act."""
     response, time = functionals.response, float(functionals.response.grid.breakpoints[-1])
-    A, B, E = _largest([mode.matrices(looked_at(parameters)) for mode in response.system.forced.modes])
-    inputs, begun = extent(control), np.abs(response.initial_state)
+    system = response.system
+    A, B, E = _largest([mode.matrices(looked_at(parameters)) for mode in system.forced.modes])
+    far = np.abs(response.initial_state) + time * B[:, system.controls :].sum(axis=1)
     if functionals.initial is not None:
-        begun = begun + extent(functionals.initial)
-    far = begun + time * B @ np.concatenate([inputs, np.ones(B.shape[1] - inputs.size)])
+        far = far + extent(functionals.initial)
     if functionals.disturbance is not None:
         far = far + time * E @ extent(functionals.disturbance.bound)
-    return np.asarray(far + time * A @ far)
+    return float((far + time * A @ far).max())
 
 
 def _largest(every: Sequence[tuple[Array, Array, Array]]) -> list[Array]:
