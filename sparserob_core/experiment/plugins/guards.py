@@ -190,6 +190,10 @@ class _Maximiser(Maximiser):
         return asked(self.origin, "scaled", lambda: self._maximiser.scaled, bool)
 
     @property
+    def apart(self) -> bool:  # type: ignore[override]
+        return asked(self.origin, "apart", lambda: self._maximiser.apart, bool)
+
+    @property
     def whole(self) -> bool:  # type: ignore[override]
         return asked(self.origin, "whole", lambda: self._maximiser.whole, bool)
 

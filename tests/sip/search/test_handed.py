@@ -32,7 +32,12 @@ class Probe(sr.Maximiser):
 def test_a_maximiser_sees_the_coordinates_that_can_move_and_their_part_of_each_index():
     probe = Probe()
     report = maximise(
-        Target(hill, BOX, lambda p: -2 * (p - 0.25), block=3), probe, 9, np.random.default_rng(0), start=BOX.lower
+        Target(hill, BOX, lambda p: -2 * (p - 0.25), block=3),
+        probe,
+        9,
+        np.random.default_rng(0),
+        Rules(polish=0.0),
+        start=BOX.lower,
     )
     assert probe.domain.lower.tolist() == BOX.lower[FREE].tolist()
     assert probe.domain.upper.tolist() == BOX.upper[FREE].tolist()
