@@ -299,8 +299,19 @@ class ConstraintFamily:
         """``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; positive where violated."""
         if self.excess is not None:
             return self.excess(x, indices)
-        G, h = self.rows(indices)
+        G, h = self.rows_at(indices, x.size)
         return np.asarray(G @ x - h, dtype=float)
+
+    def rows_at(self, indices: Array, n: int) -> tuple[Array, Array]:
+        """The rows ``(k, r, n)`` and right-hand sides ``(k, r)`` at indices ``(k, d)``; raises `InputError` where what
+        `rows` gives is of another shape."""
+        G, h = self.rows(indices)
+        if np.ndim(G) != 3 or np.shape(G)[::2] != (len(indices), n) or np.shape(G)[:2] != np.shape(h):
+            raise InputError(
+                f"family {self.name!r}: expected rows of shape ({len(indices)}, r, {n}) and right-hand sides"
+                f" ({len(indices)}, r), got {np.shape(G)} and {np.shape(h)}"
+            )
+        return G, h
 
 
 def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:

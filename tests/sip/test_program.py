@@ -166,3 +166,14 @@ def test_a_grid_that_is_too_large_is_compared_by_volume(monkeypatch):
     box = sr.Box([0.0, 0.0], [1.0, 1.0])
     assert uncovered(np.zeros((1, 2)), np.ones((1, 2)), box) is None
     assert uncovered(np.zeros((1, 2)), np.array([[1.0, 0.999]]), box) is not None
+
+
+@pytest.mark.parametrize("method", ["exchange", "sparserob"])
+def test_rows_of_another_shape_are_refused_by_every_method(method: str) -> None:
+    """Right-hand sides ``(k,)`` ended in a traceback of an index."""
+    family = sr.ConstraintFamily(
+        name="flat", index_set=sr.Box([0.0], [1.0]), rows=lambda t: (np.ones((len(t), 1, 2)), t[:, 0])
+    )
+    program = sr.SemiInfiniteProgram(n=2, q=[1.0, 1.0], lower=-5.0, upper=5.0, families=[family])
+    with pytest.raises(sr.InputError, match=r"family 'flat': expected rows of shape \(\d+, r, 2\)"):
+        sr.solve(program, method=method, regulariser="ridge", budget=20)

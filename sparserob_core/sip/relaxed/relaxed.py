@@ -81,7 +81,7 @@ def rows_at(
     if rows is not None and constraints.chosen is not None:
         where, which, (G, h) = every, rows, constraints.chosen(indices, rows)
     else:
-        G, h = constraints.rows(indices)
+        G, h = constraints.rows_at(indices, program.n)
         if rows is not None and rows.max() >= h.shape[1]:
             raise InputError(f"family {family!r}: worst: expected a row below {h.shape[1]}, got {int(rows.max())}")
         where, which = (

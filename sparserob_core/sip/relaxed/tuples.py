@@ -98,7 +98,7 @@ class TupleValue:
         self._solved_for = np.nan
         self._owed: Array | None = None
         lowest = self.layout.slot.lower[np.newaxis]
-        first = [self._family_rows(family, self.layout.indices(family, lowest)) for family in program.families]
+        first = [family.rows_at(self.layout.indices(family, lowest), program.n) for family in program.families]
         ends = np.cumsum([h.shape[1] for _, h in first], dtype=int)
         self._columns = list(zip(program.families, ends - [h.shape[1] for _, h in first], ends, strict=True))
         self._kinds = np.tile(np.arange(ends[-1] if first else 0), count)
@@ -291,18 +291,9 @@ class TupleValue:
             moves = new | _moved(self.layout.indices(family, old), indices)
             if moves.any():
                 moved = fresh[moves]
-                G, self._h[moved, first:last] = self._family_rows(family, indices[moves])
+                G, self._h[moved, first:last] = family.rows_at(indices[moves], self.program.n)
                 self._G[moved, first:last] = G
                 self._norms[moved, first:last] = np.maximum(np.sqrt((G * G).sum(axis=2)), TINY)
-
-    def _family_rows(self, family: ConstraintFamily, indices: Array) -> tuple[Array, Array]:
-        G, h = family.rows(indices)
-        if np.ndim(G) != 3 or np.shape(G)[::2] != (len(indices), self.program.n) or np.shape(G)[:2] != np.shape(h):
-            raise InputError(
-                f"family {family.name!r}: expected rows of shape ({len(indices)}, r, {self.program.n}) and right-hand"
-                f" sides ({len(indices)}, r), got {np.shape(G)} and {np.shape(h)}"
-            )
-        return G, h
 
 
 @dataclass(frozen=True, eq=False)
