@@ -123,7 +123,7 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     reach, added = reaches(functionals, constraint.parameters, control, directions, times)
     added = added + moved.reach(directions)
     near = np.abs(directions).sum(axis=1) * _driven(functionals, constraint.parameters)
-    near = np.maximum(near, np.abs(heights))
+    near = np.maximum(near, np.abs(heights)).max()
     if (THIN * np.minimum(added, near) > 1.0).all():
         reach = reach + moved.reach(directions)
         return np.maximum(1.0, power_of_two(np.array([POINT * reach[reach > 0.0].min(initial=added.max())])))

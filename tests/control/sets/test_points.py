@@ -176,8 +176,10 @@ def test_what_is_still_is_what_no_row_feels() -> None:
     assert still(terminal=fixed, initial_state={"centre": [1.0, 0.0], "box": [1e-12, 0.03]}) == [False, False]
 
 
-def test_what_an_unstable_plant_amplifies_is_not_still() -> None:
-    """``x' = 10 x + u + w`` over three units of time: a state of 1 is e^-30 of what it could become."""
+@pytest.mark.parametrize("size", [1e-3, 1e-12])
+def test_what_an_unstable_plant_amplifies_is_not_still(size: float) -> None:
+    """``x' = 10 x + u + w`` over three units of time: a state of 1 is e^-30 of what it could become; what is small at
+    the end is not still where it is felt at the beginning."""
     plant = {"A": [[10.0]], "B": [[1.0]]}
     model = assemble(
         load_config(
@@ -188,7 +190,7 @@ def test_what_an_unstable_plant_amplifies_is_not_still() -> None:
                     "horizon": 3.0,
                     "initial_state": [0.01],
                     "control": {"box": [1.0]},
-                    "disturbance": {"box": [1e-3]},
+                    "disturbance": {"box": [size]},
                     "terminal": [{"box": [0.5]}],
                 },
                 "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 6}},
