@@ -110,8 +110,12 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     if sides is not None:
         beside = Moving(moved, sides[0]).at(times) if moved.moves else None
         found = reaches(functionals, constraint.parameters, control, sides[0], times, beside, constraint.gains)
-        near = np.abs(sides[0]).sum(axis=1) * _driven(functionals, constraint.parameters)
-        return units_of_sides(*constraint_sides(constraint), *found, near)
+        H, h = constraint_sides(constraint)
+        size = np.abs(H).sum(axis=1)
+        used = (size > 0.0) & np.isfinite(h)
+        place = float((np.abs(h[used]) / size[used]).max(initial=0.0))
+        near = size * max(place, _driven(functionals, constraint.parameters))
+        return units_of_sides(H, h, *found, near)
     box = constraint.index_set
     z = sampled(box.dimension - 1 - constraint.parameters.count)
     indices = np.hstack([np.tile(box.lower[: box.dimension - z.shape[1]], (z.shape[0], 1)), z])
@@ -122,8 +126,9 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
         return np.ones(1)
     reach, added = reaches(functionals, constraint.parameters, control, directions, times)
     added = added + moved.reach(directions)
-    near = np.abs(directions).sum(axis=1) * _driven(functionals, constraint.parameters)
-    near = np.maximum(near, np.abs(heights)).max()
+    near = max(
+        np.abs(heights).max(), np.abs(directions).sum(axis=1).max() * _driven(functionals, constraint.parameters)
+    )
     if (THIN * np.minimum(added, near) > 1.0).all():
         reach = reach + moved.reach(directions)
         return np.maximum(1.0, power_of_two(np.array([POINT * reach[reach > 0.0].min(initial=added.max())])))
@@ -152,10 +157,10 @@ def constraint_sides(constraint: StateConstraint) -> tuple[Array, Array]:
 
 def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array | float = np.inf) -> Array:
     """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
-    those of them that are not 0, nor `THIN` beside the sums ``added (r,)``, or beside ``|h|`` and what the sums are
-    without growth and control, ``driven (r,)``; of a row whose width is, ``reach`` alone, since nothing is left to keep
+    those of them that are not 0, nor `THIN` beside the sums ``added (r,)``, or beside what these are without growth
+    and control, ``driven (r,)``; of a row whose width is, ``reach`` alone, since nothing is left to keep
     away from it. No less than what double precision resolves of these. A power of two, 1.2 to 2.5 times below that."""
-    beside = np.minimum(added, np.maximum(driven, np.abs(h)))
+    beside = np.minimum(added, driven)
     across, thin = widths(H, h), np.where(np.isfinite(added), THIN * beside, 0.0)
     near = np.where(across > thin, np.stack([np.abs(h), across]), 0.0)
     reach = np.where(across > thin, 1.0, POINT) * reach

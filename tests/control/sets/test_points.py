@@ -176,6 +176,23 @@ def test_what_is_still_is_what_no_row_feels() -> None:
     assert still(terminal=fixed, initial_state={"centre": [1.0, 0.0], "box": [1e-12, 0.03]}) == [False, False]
 
 
+@pytest.mark.parametrize(
+    "end",
+    [
+        {"norm": {"p": 2, "radius": 1e-12, "centre": [1.0, 0.0]}},
+        {"box": {"lower": [1.0, 0.0], "upper": [1.0 + 1e-12, 1e-12]}},
+    ],
+)
+def test_from_rest_to_a_thin_set_costs_what_its_point_does(end: dict[str, Any], tmp_path: Path) -> None:
+    """Nothing begins away from 0, so that the set is thin beside where it is."""
+    costs = []
+    for name, terminal in (("thin", end), ("point", {"equals": [1.0, 0.0]})):
+        outcome = solved(tmp_path / name, terminal=[terminal], initial_state=[0.0, 0.0])
+        assert outcome.status == "certified" and is_verified(outcome)
+        costs.append(outcome.summary["cost"])
+    assert costs[0] == pytest.approx(costs[1], rel=1e-8)
+
+
 @pytest.mark.parametrize("size", [1e-3, 1e-12])
 def test_what_an_unstable_plant_amplifies_is_not_still(size: float) -> None:
     """``x' = 10 x + u + w`` over three units of time: a state of 1 is e^-30 of what it could become; what is small at
