@@ -585,7 +585,7 @@ class Program:
                 price[g, k] = np.maximum(shared, 0.0) @ rows[:, group[0]]
         if self.counts:
             per = rows[0] if weights.ndim == 1 else np.ones(rows.shape[1])
-            time = np.array([[per[list(group)].max()] for group in self.groups]) * np.diff(ends)
+            time = np.array([[per[list(group)].sum()] for group in self.groups]) * np.diff(ends)
             return self._row(acts=time.ravel())
         return self._row(norm=problem.cost.l1 * price.ravel(), curve=np.ones(1))
 

@@ -20,8 +20,8 @@ from sparserob_core.sip.program import Enclosure, Separation
 
 # The size of a row that has none, in its unit: bound, width and nominal values are 0, as those of a control that is to
 # be 0. A billionth of it is excused, which is above the remainders of series that enclose a 0, and no rounding of any
-# number that a row could have. With ten digits more such rows stay open.
-NOTHING = 2.0**-150
+# number that a row could have. A ten-thousandth of it leaves such rows open.
+NOTHING = 2.0**-140
 
 
 class StateConstraint(Source):
