@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -91,7 +92,7 @@ class AdaLipo(sr.Maximiser, sr.Options):
         unit = 0.0
         while objective.remaining:
             unit = unit or _power_of_two(walk.evaluated.slope)
-            constant = unit * _on_grid(walk.evaluated.slope / (unit or 1.0), ratio)
+            constant = min(unit * _on_grid(walk.evaluated.slope / (unit or 1.0), ratio), sys.float_info.max)
             if rng.random() < self.exploration:
                 walk.explore()
             else:
