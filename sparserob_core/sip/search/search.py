@@ -431,9 +431,9 @@ def maximise(
             stopped = f"{stopped}; then polished"
             from sparserob_core.sip.search.local_search import polish
 
-            points, values = objective.seen()
-            scaled = Scaled(shown, values)
-            if not block_ascent(scaled):  # whose end no local method improves that knows less of the blocks
+            if not block_ascent(shown):  # whose end no local method improves that knows less of the blocks
+                points, values = objective.seen()
+                scaled = Scaled(shown, values)
                 polish(scaled, *scaled.seen(points[:, moves], values))
     except SearchEnded:
         pass
