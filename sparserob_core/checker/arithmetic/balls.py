@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb
+    from flint import arb, fmpq
 
 
 def balls(vector: Sequence[float] | Array) -> list[arb]:
@@ -48,3 +48,14 @@ def difference(a: float, b: float) -> tuple[float, float]:
     nearest = a - b
     part = nearest - a
     return nearest, (a - (nearest - part)) - (b + part)
+
+
+def spanning(rows: Sequence[Sequence[fmpq]]) -> list[list[fmpq]]:
+    """Rows that span what some do, as many as are independent."""
+    from flint import fmpq_mat
+
+    if not rows:
+        return []
+    reduced, rank = fmpq_mat(rows).rref()
+    table: list[list[fmpq]] = reduced.tolist()
+    return table[:rank]

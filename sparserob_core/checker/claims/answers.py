@@ -516,11 +516,7 @@ def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: st
 
 
 def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
-    return _support(shape, sign * np.eye(shape.dimension)[channel])
-
-
-def _support(shape: ConvexSet, direction: Array) -> arb:
-    return known(shape).support(balls(direction))
+    return known(shape).support(balls(sign * np.eye(shape.dimension)[channel]))
 
 
 def _width(shape: ConvexSet, channel: int) -> arb:
@@ -541,7 +537,7 @@ def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb
             for vector, length in _segments(part, own)
         ]
     chords, axes = _chords(shape, middle), np.eye(shape.dimension)
-    wide = [_support(shape, axis) + _support(shape, -axis) for axis in axes]
+    wide = [_width(shape, channel) for channel in range(shape.dimension)]
     if all(wide[b].is_zero() or chord > NEAR * wide[b] for b, chord in enumerate(chords)):
         kept = [b for b, width in enumerate(wide) if not width.is_zero()]
         return [([Fraction(float(v)) for v in axes[b]], chords[b]) for b in kept]

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.checker.arithmetic.balls import spanning
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.flow import middles, scaled, stacked
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat, fmpq, fmpq_mat
+    from flint import arb, arb_mat, fmpq_mat
 
 EVENED = 20  # steps in which rows and columns become of one size; the first few do most, twice as many change nothing
 
@@ -61,21 +62,12 @@ class Pushed:
         entered = [_rational(E.tolist()) * along for _, E in modes]
         pattern: Pattern = np.any([[[x != 0 for x in row] for row in E.tolist()] for E in entered], axis=0)
         linked = np.any([middles(A) != 0.0 for A, _ in modes], axis=0).astype(int)
-        spanned = _basis([row for one in entered for row in one.transpose().tolist()])
+        spanned = spanning([row for one in entered for row in one.transpose().tolist()])
         for _ in range(linked.shape[0] - 1):
             moved = [row for a in systems for row in (fmpq_mat(spanned) * a).tolist()] if spanned else []
-            spanned = _basis([*spanned, *moved])
+            spanned = spanning([*spanned, *moved])
             pattern = pattern | (linked @ pattern.astype(int) > 0)
         return Pushed(pattern, len(spanned), fmpq_mat([row for one in entered for row in one.tolist()]).rank())
-
-
-def _basis(rows: list[list[fmpq]]) -> list[list[fmpq]]:
-    """Independent rows that span what some rows do."""
-    from flint import fmpq_mat
-
-    reduced, rank = fmpq_mat(rows).rref()
-    basis: list[list[fmpq]] = reduced.tolist()[:rank]
-    return basis
 
 
 def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:

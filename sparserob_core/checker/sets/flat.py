@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls, below, rational
+from sparserob_core.checker.arithmetic.balls import above, balls, below, rational, spanning
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, rounding
 from sparserob_core.checker.sets.shape import NEAR, Facet, Shape, along, dot, facet, total
@@ -283,7 +283,7 @@ class Segments(Flat):
         across = _null_space(rows, d)
         rank = d - len(across)
         every = [[*chosen, *across] for chosen in combinations(rows, rank - 1)] if rank else []
-        every += [[*across[:i], *across[i + 1 :], *_basis(rows)] for i in range(len(across))]
+        every += [[*across[:i], *across[i + 1 :], *spanning(rows)] for i in range(len(across))]
         for chosen in every:
             minors = [
                 (-1) ** i * (fmpq_mat([[*r[:i], *r[i + 1 :]] for r in chosen]).det() if d > 1 else fmpq(1))
@@ -375,17 +375,6 @@ class Segments(Flat):
         return super().least(ups, downs, slope) if flat else Shape.least(self, ups, downs, slope)
 
 
-def _basis(rows: Sequence[Sequence[fmpq]]) -> list[list[fmpq]]:
-    """Rows that span what some do, as many as are independent."""
-    from flint import fmpq_mat
-
-    if not rows:
-        return []
-    reduced, rank = fmpq_mat(rows).rref()
-    table: list[list[fmpq]] = reduced.tolist()
-    return table[:rank]
-
-
 def _size(row: Sequence[Fraction]) -> float:
     return float(np.linalg.norm([float(v) for v in row]))
 
@@ -426,7 +415,7 @@ def _null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
     """Vectors ``(d,)`` that span what is orthogonal to all of the rows."""
     from flint import fmpq
 
-    basis = _basis(rows)
+    basis = spanning(rows)
     leads = [next(i for i, v in enumerate(row) if v != 0) for row in basis]
     found = []
     for free in (i for i in range(d) if i not in leads):

@@ -45,9 +45,7 @@ def innovations_seen(
     if pieces is not None:
         return np.concatenate([_measurable(response, control, pieces), begun], axis=2)
     grid, steps = response.grid, response.steps(KNOWN)
-    assert model.starts is not None
-    block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
-    pushes = steps.Gamma[0, response.which] @ grid.of_modes(steps.E[0])[grid.modes]
+    block, pushes = _pushes(response, model)
     commanded = grid.commanded(control.breakpoints)
     D = np.zeros((K, d, model.block_count, pushes.shape[2]))
     for piece in range(int(np.searchsorted(commanded, K - 1))):  # what happens on the last one is seen when all is over
@@ -58,6 +56,15 @@ def innovations_seen(
     return np.concatenate([D.reshape(K, d, -1), begun], axis=2)
 
 
+def _pushes(response: Response, model: DisturbanceModel) -> tuple[np.ndarray, Array]:
+    """The block that acts on every piece of the grid ``(L,)``, and what one of each of its entries makes of the state
+    at the end, ``(L, d, mw)``."""
+    grid, steps = response.grid, response.steps(KNOWN)
+    assert model.starts is not None
+    block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
+    return block, steps.Gamma[0, response.which] @ grid.of_modes(steps.E[0])[grid.modes]
+
+
 def unfelt(
     response: Response, model: DisturbanceModel | None, far: Array, begun: Array, rows: Array, least: float
 ) -> np.ndarray:
@@ -66,10 +73,8 @@ def unfelt(
     at any breakpoint."""
     grid, steps, first = response.grid, response.steps(KNOWN), 0
     if model is not None:
-        assert model.starts is not None
-        first = model.block_count * far.size
-        block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
-        pushes = steps.Gamma[0, response.which] @ grid.of_modes(steps.E[0])[grid.modes] * far
+        block, pushes = _pushes(response, model)
+        first, pushes = model.block_count * far.size, pushes * far
         own = block[:, None] * far.size + np.arange(far.size)
     nodes = np.zeros((response.initial_state.size, first + begun.size))
     nodes[:, first:] = np.eye(len(nodes), begun.size) * begun

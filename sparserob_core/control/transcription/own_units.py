@@ -292,7 +292,7 @@ def window_times(functionals: WorstCase, start: float, stop: float) -> Array:
 def _widths(convex: ConvexSet) -> Array:
     """The width of each component of a bounded set; where that is 0, its distance from 0."""
     axes = np.eye(convex.dimension)
-    width = convex.support(axes) + convex.support(-axes)
+    width = convex.width(axes)
     return np.where(width > 0.0, width, convex.reach(axes))
 
 
