@@ -157,7 +157,7 @@ class Cornered(Flat):
     def _offsets(self) -> list[list[Fraction]]:
         """What takes the first corner to the others, the longest first."""
         first, *others = self.corners
-        return sorted(([a - b for a, b in zip(x, first, strict=True)] for x in others), key=_size, reverse=True)
+        return _longest_first([[a - b for a, b in zip(x, first, strict=True)] for x in others])
 
     def nearest(self, point: Array) -> list[arb]:
         """A mean of corners."""
@@ -312,20 +312,19 @@ class Segments(Flat):
         """The segments that are long, the longest first; those along one another as one, and all of them in the set
         together."""
         found = list[list[Fraction]]()
-        rows = sorted(
-            ([Fraction(v) for v in g] for g in self.source.generators.tolist() if any(g)), key=_size, reverse=True
-        )
+        rows = _longest_first([[Fraction(v) for v in g] for g in self.source.generators.tolist() if any(g)])
+        widths = _widths(rows)
         for row in rows:
-            if _size(row) <= NEAR * _size(rows[0]):
-                break
+            if _share(row, widths) <= NEAR:
+                continue
             for place, other in enumerate(found):
                 sign = 1 if sum(a * b for a, b in zip(row, other, strict=True)) > 0 else -1
-                if len(_apart([other, row])) == 1:
+                if len(_apart([other, row], widths)) == 1:
                     found[place] = [b + sign * a for a, b in zip(row, other, strict=True)]
                     break
             else:
                 found.append(row)
-        return sorted(found, key=_size, reverse=True)
+        return _longest_first(found)
 
     @property
     def generators(self) -> list[list[Fraction]]:
@@ -379,18 +378,35 @@ def _size(row: Sequence[Fraction]) -> float:
     return float(np.linalg.norm([float(v) for v in row]))
 
 
-def _apart(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
-    """The rows that are further than `NEAR`, beside the longest of all, from what those before them span."""
+def _widths(rows: Sequence[list[Fraction]]) -> list[Fraction]:
+    """The largest entry of every column, 1 where there is none: the units of what the coordinates of a set mean differ,
+    and what is short beside another coordinate is not thin."""
+    return [max(map(abs, column)) or Fraction(1) for column in zip(*rows, strict=True)]
+
+
+def _share(row: Sequence[Fraction], widths: Sequence[Fraction]) -> float:
+    """How long a row is in such units."""
+    return _size([v / width for v, width in zip(row, widths, strict=True)])
+
+
+def _longest_first(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
+    """The rows by how long they are in units of their `_widths`."""
+    widths = _widths(rows)
+    return sorted(rows, key=lambda row: _share(row, widths), reverse=True)
+
+
+def _apart(rows: Sequence[list[Fraction]], widths: Sequence[Fraction] | None = None) -> list[list[Fraction]]:
+    """The rows that are further than `NEAR`, in units of the ``widths`` of all, from what those before them span."""
     chosen, basis = list[list[Fraction]](), list[Array]()
-    longest = max(map(_size, rows), default=0.0)
+    units = _widths(rows) if widths is None else widths
     for row in rows:
-        size = _size(row)
-        rest = np.array([float(v) for v in row]) / (size or 1.0)
+        size = _share(row, units)
+        rest = np.array([float(v / unit) for v, unit in zip(row, units, strict=True)]) / (size or 1.0)
         for _ in range(2):
             for other in basis:
                 rest = rest - (rest @ other) * other
         away = float(np.linalg.norm(rest))
-        if size * away > NEAR * longest:
+        if size * away > NEAR:
             chosen.append(row)
             basis.append(rest / away)
     return chosen

@@ -137,11 +137,22 @@ def test_a_set_that_is_thin_in_one_direction_of_three_keeps_its_points():
     box = Polytope(np.vstack([np.eye(3), -np.eye(3)]), np.array([1.0, 1.0, 1e-10] * 2))
     assert known(box).segments is None
     assert [float(x.mid()) for x in known(box).member([0.5, 0.25, 5e-11])] == [0.5, 0.25, 5e-11]
-    thin = known(sr.Zonotope(np.zeros(3), np.diag([1.0, 1.0, 1e-10])))  # short segments are left out
-    assert len(thin.segments) == 2 and thin.member([0.5, 0.25, 5e-11])[2] == 0
-    assert thin.member([0.5, 0.25, 1e-7]) is None
+    thin = known(sr.Zonotope(np.zeros(3), np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [1e-10, 1e-10, -2e-10]])))
+    assert len(thin.segments) == 2  # short segments are left out
+    near = thin.member([1.0 + 5e-11, 5e-11, 0.5 - 1e-10])
+    assert float((near[0] + near[1] - 2 * near[2]).mid()) == pytest.approx(0.0, abs=1e-14)
+    assert thin.member([1.0, 0.0, 0.5 - 1e-7]) is None
     leant = known(sr.Zonotope(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 1e-9]])))
     assert leant.segments is None
+
+
+@pytest.mark.parametrize("kind", ["polytope", "zonotope"])
+def test_a_coordinate_in_another_unit_makes_no_set_thin(kind):
+    """A rectangle of 1e4 times 1e-6 was taken for a segment, and its middle for an end: an honest run was refused."""
+    box = Polytope(np.vstack([np.eye(2), -np.eye(2)]), np.array([1e4, 1e-6] * 2))
+    shape = known(box if kind == "polytope" else sr.Zonotope(np.zeros(2), np.diag([1e4, 1e-6])))
+    assert shape.segments is None
+    assert [float(x.mid()) for x in shape.member([0.0, 1e-19])] == [0.0, 1e-19]
 
 
 def test_a_product_has_its_points_part_by_part():
