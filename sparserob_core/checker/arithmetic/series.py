@@ -1,316 +1,184 @@
-"""Matrices that depend on the parameters: truncated power series with ball matrices as coefficients."""
+"""Matrices that depend on parameters: polynomials with ball matrices as coefficients."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
-from sparserob_core.checker.arithmetic.jets import Monomials
+import numpy as np
+
+from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-SMALL = 0.25  # norm below which the exponential series is summed
-SPARE = 16  # bits of the working precision that what is left out of the series may take
-STRIDE = 4  # of the powers by which it is summed; divides the number of terms
-MOST_STRIDES = 2**60  # in one time: what takes more is no number
-STRIDES_KEPT = 256  # whole numbers of strides that are remembered, beside powers of two
-LEAST = 2.0**-900  # norm that counts, so that a stride is a number
+OUTWARD = 1.0 + 1e-12  # on sums of a few hundred numbers, each rounded
+TINY = 1e-300  # for what is too small to be a float
 
 
 @final
 class Series:
-    """``sum_k parts_k delta^k``; products drop what is beyond the degree of the monomials, which Lagrange's remainder
-    accounts for."""
-
-    __slots__ = ("_there", "monomials", "parts")
+    """``sum_k parts_k s^k``: at all parameters ``s`` from -1 to 1 the matrix is one that the balls allow. What products
+    have beyond the degree of the ``monomials`` is in the balls of the first part."""
 
     def __init__(self, monomials: Monomials, parts: Sequence[arb_mat]) -> None:
         self.monomials, self.parts = monomials, list(parts)
-        self._there: list[bool] | None = None
-
-    @property
-    def there(self) -> list[bool]:
-        """Which coefficients are not exactly 0: those of a system are few."""
-        if self._there is None:
-            from flint import arb_mat
-
-            zero = arb_mat(self.parts[0].nrows(), self.parts[0].ncols())
-            absent = [part == zero for part in self.parts]  # certainly equal; != is certainly different
-            self._there = [not gone for gone in absent]
-        return self._there
-
-    @property
-    def generated(self) -> list[bool]:
-        """Which coefficients a power of this series may have: those of monomials in the variables that appear."""
-        every = self.monomials.exponents
-        present = [e for e, here in zip(every, self.there, strict=True) if here]
-        appear = [any(e[i] for e in present) for i in range(self.monomials.count)]
-        return [all(appears or not power for appears, power in zip(appear, e, strict=True)) for e in every]
 
     @staticmethod
     def constant(monomials: Monomials, value: arb_mat) -> Series:
         """A matrix that does not depend on the parameters."""
         return Series(monomials, [value] + [value * 0] * (monomials.size - 1))
 
+    @staticmethod
+    def known(value: arb_mat) -> Series:
+        """A matrix where there are no parameters."""
+        return Series(NONE, [value])
+
+    @property
+    def matrix(self) -> arb_mat:
+        """The matrix where there are no parameters."""
+        (found,) = self.parts
+        return found
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """How many rows and columns it has."""
+        return self.parts[0].nrows(), self.parts[0].ncols()
+
+    @cached_property
+    def there(self) -> list[bool]:
+        """Which coefficients are not exactly 0: those of a system are few."""
+        zero = self.parts[0] * 0
+        absent = [part == zero for part in self.parts]  # certainly equal; != is certainly different
+        return [not gone for gone in absent]
+
+    @cached_property
+    def sizes(self) -> Array:
+        """Of every degree how large the entries of its coefficients are together at most, ``(D + 1, rows,
+        columns)``."""
+        found = np.zeros((self.monomials.degree + 1, *self.shape))
+        for degree, part, here in zip(self.monomials.degrees, self.parts, self.there, strict=True):
+            if here:
+                found[degree] += largest(part)
+        return found * OUTWARD
+
+    @property
+    def size(self) -> Array:
+        """How large the entries are at most, ``(rows, columns)``."""
+        return np.asarray(self.sizes.sum(axis=0) * OUTWARD)
+
+    @property
+    def middle(self) -> Series:
+        """The same with the middles of the balls."""
+        return Series(self.monomials, [part.mid() for part in self.parts])
+
     def __add__(self, other: Series) -> Series:
         return Series(self.monomials, [a + b for a, b in zip(self.parts, other.parts, strict=True)])
+
+    def __sub__(self, other: Series) -> Series:
+        return Series(self.monomials, [a - b for a, b in zip(self.parts, other.parts, strict=True)])
 
     def __mul__(self, other: Series) -> Series:
         if self.monomials.size == 1:
             return Series(self.monomials, [self.parts[0] * other.parts[0]])
-        from flint import arb_mat
-
         total: list[arb_mat | None] = [None] * self.monomials.size
-        left, right, there, products = self.parts, other.parts, other.there, self.monomials.products_with
-        for factor, pairs, here in zip(left, products, self.there, strict=True):
+        right, there, products = other.parts, other.there, self.monomials.products_with
+        for factor, pairs, here in zip(self.parts, products, self.there, strict=True):
             for j, k in pairs if here else ():
                 if there[j]:
                     term, so_far = factor * right[j], total[k]
                     total[k] = term if so_far is None else so_far + term
-        zero = arb_mat(left[0].nrows(), right[0].ncols())
-        return Series(self.monomials, [zero if part is None else part for part in total])
+        zero = zeros(self.shape[0], other.shape[1])
+        found = Series(self.monomials, [zero if part is None else part for part in total])
+        later = np.cumsum(other.sizes[:0:-1], axis=0)  # of the last degree, the last two, ...
+        beyond = sum((self.sizes[i] @ later[i - 1] for i in range(1, len(self.sizes))), np.zeros(found.shape))
+        return found.within(beyond * OUTWARD) if beyond.any() else found
+
+    def within(self, off: Array) -> Series:
+        """All that are off from it by at most ``off (rows, columns)`` at every parameter."""
+        return Series(self.monomials, [self.parts[0] + around(off), *self.parts[1:]])
 
     def scaled(self, factor: arb) -> Series:
         """Every coefficient times a number."""
         return Series(self.monomials, [part * factor for part in self.parts])
 
-    def applied(self, vector: arb_mat) -> Series:
+    def applied(self, columns: arb_mat) -> Series:
         """The product with a matrix that does not depend on the parameters."""
-        return Series(self.monomials, [part * vector for part in self.parts])
+        return Series(self.monomials, [part * columns for part in self.parts])
 
-    def size(self) -> arb:
-        """An upper bound of the summed Frobenius norms of the coefficients; that of a product is at most the product of
-        those."""
-        from flint import arb
-
-        return sum((upper(norm(part)) for part in self.parts), arb(0))
-
-    def exp(self) -> Series:
-        """The exponential: its series where the norm is small, and squaring back (Moler and Van Loan 2003, method 3),
-        with the tail bounded."""
-        from flint import arb, arb_mat, ctx
-
-        if self.monomials.size == 1:
-            return Series(self.monomials, [self.parts[0].exp()])
-        halvings = 0
-        size = self.size()
-        while not size < SMALL:
-            size, halvings = size / 2, halvings + 1
-            if halvings > 60:
-                return Series(self.monomials, [part * arb("nan") for part in self.parts])
-        small, n = self.scaled(arb(1) / 2**halvings), self.parts[0].nrows()
-        unit = arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
-        powers = [Series.constant(self.monomials, unit), small]
-        while len(powers) <= STRIDE:
-            powers.append(powers[-1] * small)
-        terms, left_out = STRIDE, arb(2) ** (SPARE - ctx.prec)
-        while not _tail(size, terms) < left_out:
-            terms += STRIDE
-        factors = [1 / arb(order).fac() for order in range(terms + 1)]
-        result = powers[0].scaled(factors[terms])
-        for first in range(terms - STRIDE, -1, -STRIDE):  # Paterson and Stockmeyer 1973
-            result = powers[STRIDE] * result
-            for order in range(STRIDE):
-                result = result + powers[order].scaled(factors[first + order])
-        tail = arb_mat([[arb(0, _tail(size, terms).upper())] * n] * n)
-        parts = [part + tail if mine else part for part, mine in zip(result.parts, self.generated, strict=True)]
-        result = Series(self.monomials, parts)
-        for _ in range(halvings):
-            result = result * result
-        return result
-
-    def held(self, inputs: Series, time: arb) -> tuple[Series, Series]:
-        """``e^{matrix time}`` and ``int_0^time e^{matrix s} ds inputs`` from one exponential (Van Loan 1978)."""
-        return self.beside(inputs).scaled(time).exp().apart(self.parts[0].nrows())
-
-    def beside(self, inputs: Series) -> Series:
-        """What drives a state and an input that stays as it is."""
-        from flint import arb, arb_mat
-
-        n, m = self.parts[0].nrows(), inputs.parts[0].ncols()
-        below = [[arb(0)] * (n + m)] * m
-        joined = [
-            arb_mat([a + b for a, b in zip(left.tolist(), right.tolist(), strict=True)] + below)
-            for left, right in zip(self.parts, inputs.parts, strict=True)
-        ]
-        return Series(self.monomials, joined)
-
-    def apart(self, n: int) -> tuple[Series, Series]:
-        """The first ``n`` rows: of the state, and of the input."""
+    def columns(self, first: int, last: int | None) -> Series:
+        """Some of the columns."""
         from flint import arb_mat
 
-        whole = [part.tolist() for part in self.parts]
-        return (
-            Series(self.monomials, [arb_mat([row[:n] for row in part[:n]]) for part in whole]),
-            Series(self.monomials, [arb_mat([row[n:] for row in part[:n]]) for part in whole]),
-        )
+        n, tables = self.shape[0], [[row[first:last] for row in part.tolist()] for part in self.parts]
+        return Series(self.monomials, [arb_mat(n, len(rows[0]), [x for row in rows for x in row]) for rows in tables])
 
-
-@final
-class Exponentials:
-    """``e^{matrix t}`` at many times ``t``. Powers of the matrix are made once: within a *stride*, in which its norm is
-    below `SMALL`, an exponential is a sum of them; the longer ones are products of whole strides, each remembered. Such
-    a sum costs about a product, a series of its own ten of these.
-
-    Norms are in ``units (n,)``, powers of two: any are right, those in which the matrix is small take the fewest
-    strides.
-    """
-
-    def __init__(self, matrix: Series, tick: float, units: Sequence[float] | None = None) -> None:
-        self.matrix, self.tick = matrix, tick
-        self._units = [1.0] * matrix.parts[0].nrows() if units is None else list(map(float, units))
-        self._known: dict[int, Series] = {}
-        self._strides: dict[int, Series] = {}
-
-    def at(self, ticks: int) -> Series:
-        """After that many ticks, exactly."""
-        from flint import arb
-
-        if ticks not in self._known:
-            self._known[ticks] = self.of(arb(self.tick) * ticks)
-        return self._known[ticks]
-
-    def around(self, ticks: int) -> Series:
-        """From so many ticks before to so many after."""
-        from flint import arb
-
-        return self.of(arb(0, self.tick * ticks))
-
-    def of(self, time: arb) -> Series:
-        """At every time of a ball that is not much wider than a stride."""
-        from flint import arb
-
-        stride = self._stride
-        count = 0 if stride is None else math.floor(min(float(time.mid()) / stride, MOST_STRIDES))
-        if stride is None or not count < MOST_STRIDES:
-            return self._none()
-        if not count > 0:
-            return self._near(time)
-        return self._whole(count) * self._near(time - arb(stride) * count)
-
-    def within(self, length: arb) -> Series:
-        """At every time from 0 to the ``length``."""
-        from flint import arb
-
-        halvings = 0
-        while not self._size * length < SMALL:
-            length, halvings = length / 2, halvings + 1
-            if halvings > 60:
-                return self._none()
-        found = self._near(arb(0).union(length))
-        for _ in range(halvings):
-            found = found * found
-        return found
-
-    def power(self, order: int) -> Series:
-        """A power of the matrix."""
-        while len(self._powers) <= order:
-            self._powers.append(self.matrix * self._powers[-1])
-        return self._powers[order]
-
-    @cached_property
-    def _powers(self) -> list[Series]:
+    def beside(self, other: Series) -> Series:
+        """With another one at its right."""
         from flint import arb_mat
 
-        n = self.matrix.parts[0].nrows()
-        unit = arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
-        return [Series.constant(self.matrix.monomials, unit), self.matrix]
+        (n, p), q = self.shape, other.shape[1]
+        pairs = [(a.tolist(), b.tolist()) for a, b in zip(self.parts, other.parts, strict=True)]
+        every = [[x for one, two in zip(a, b, strict=True) for x in (*one, *two)] for a, b in pairs]
+        return Series(self.monomials, [arb_mat(n, p + q, entries) for entries in every])
 
-    @cached_property
-    def _size(self) -> arb:
-        """`Series.size` of the matrix in the units."""
-        from flint import arb_mat
+    def above(self, below: arb_mat) -> Series:
+        """With the rows of a matrix below that does not depend on the parameters."""
+        none = (below * 0).tolist()
+        first, *others = (part.tolist() for part in self.parts)
+        return Series(self.monomials, [stacked(first + below.tolist()), *(stacked(part + none) for part in others)])
 
-        n, u = len(self._units), self._units
-        left, right = (
-            arb_mat([[factors[i] if i == j else 0 for j in range(n)] for i in range(n)])
-            for factors in ([1.0 / x for x in u], u)
-        )
-        return Series(self.matrix.monomials, [left * part * right for part in self.matrix.parts]).size()
+    def rows(self, count: int) -> Series:
+        """The first rows."""
+        return Series(self.monomials, [stacked(part.tolist()[:count]) for part in self.parts])
 
-    @cached_property
-    def _stride(self) -> float | None:
-        """A time in which the norm is below `SMALL`, a power of two; ``None`` where there is none."""
-        size = float(self._size.upper())
-        if not size < math.inf:
-            return None
-        return 2.0 ** math.floor(math.log2(SMALL / max(size, LEAST)))
-
-    @cached_property
-    def _terms(self) -> int:
-        """How many powers are added up within a stride."""
-        from flint import arb, ctx
-
-        terms = STRIDE
-        while not _tail(arb(SMALL), terms) < arb(2) ** (SPARE - ctx.prec):
-            terms += 1
-        return terms
-
-    @cached_property
-    def _table(self) -> arb_mat:
-        """Every entry of every coefficient of the powers, a column for each power."""
-        from flint import arb_mat
-
-        columns = [[x for part in self.power(order).parts for x in part.entries()] for order in range(self._terms + 1)]
-        return arb_mat(list(zip(*columns, strict=True)))
-
-    def _near(self, time: arb) -> Series:
-        """At every time of a ball by the powers, with what the others add in every unit."""
-        from flint import arb, arb_mat
-
-        size = upper(self._size * upper(abs(time)))
-        if not size < 1.0:
-            return self._none()
-        factors, n = [[arb(1)]], len(self._units)
-        for order in range(1, self._terms + 1):
-            factors.append([factors[-1][0] * time / order])
-        entries, tail = (self._table * arb_mat(factors)).entries(), _tail(size, self._terms).upper()
-        missing = arb_mat([[arb(0, (tail * (a / b)).upper()) for b in self._units] for a in self._units])
-        parts = [arb_mat(n, n, entries[first : first + n * n]) for first in range(0, len(entries), n * n)]
-        return Series(
-            self.matrix.monomials,
-            [part + missing if mine else part for part, mine in zip(parts, self._generated, strict=True)],
-        )
-
-    @cached_property
-    def _generated(self) -> list[bool]:
-        return self.matrix.generated
-
-    def _whole(self, count: int) -> Series:
-        """After whole strides."""
-        from flint import arb
-
-        if count in self._strides:
-            return self._strides[count]
-        last = count & -count
-        if count > last:
-            found = self._whole(count - last) * self._whole(last)
-            if len(self._strides) >= STRIDES_KEPT:
-                return found
-        elif count == 1:
-            assert self._stride is not None
-            found = self._near(arb(self._stride))
-        else:
-            found = self._whole(count // 2) * self._whole(count // 2)
-        self._strides[count] = found
-        return found
-
-    def _none(self) -> Series:
-        """Of a matrix that is too large for an exponential to be enclosed."""
-        from flint import arb
-
-        return Series(self.matrix.monomials, [part * arb("nan") for part in self.matrix.parts])
+    def transpose(self) -> Series:
+        """The transposed one."""
+        return Series(self.monomials, [part.transpose() for part in self.parts])
 
 
-def _tail(size: arb, terms: int) -> arb:
-    """A bound of what the exponential series adds after so many terms, of an argument of at most that ``size``, below
-    1."""
-    from flint import arb
+def identity(count: int) -> arb_mat:
+    """The matrix of ones on the diagonal."""
+    from flint import arb_mat
 
-    return size ** (terms + 1) * 2 / arb(terms + 1).fac()
+    return arb_mat(count, count, [int(i == j) for i in range(count) for j in range(count)])
+
+
+def zeros(rows: int, columns: int) -> arb_mat:
+    """A matrix of zeros."""
+    from flint import arb_mat
+
+    return arb_mat(rows, columns)
+
+
+def stacked(table: Sequence[Sequence[arb]]) -> arb_mat:
+    """A ball matrix from its rows."""
+    from flint import arb_mat
+
+    return arb_mat([list(row) for row in table])
+
+
+def around(off: Array) -> arb_mat:
+    """Balls around 0 with these radii."""
+    from flint import arb, arb_mat
+
+    if not np.isfinite(off).all():
+        raise Unchecked("the response grows beyond what numbers can hold")
+    return arb_mat(*off.shape, [arb(0, float(x)) for x in off.ravel()])
+
+
+def largest(matrix: arb_mat) -> Array:
+    """The largest absolute values of the entries."""
+    found = [0.0 if x.is_zero() else float(x.abs_upper()) + TINY for x in matrix.entries()]
+    return np.asarray(np.array(found).reshape(matrix.nrows(), matrix.ncols()) * OUTWARD)
+
+
+def middles(matrix: arb_mat) -> Array:
+    """The middles of balls."""
+    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
 
 
 def norm(matrix: arb_mat) -> arb:
@@ -321,3 +189,34 @@ def norm(matrix: arb_mat) -> arb:
 def upper(ball: arb) -> arb:
     """The upper end of a ball, as an exact number."""
     return ball.upper()
+
+
+def products(steps: Sequence[Series]) -> list[Series]:
+    """``Z_k = Phi_N ... Phi_{k+1}`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``: from the products of pairs
+    of them, each of which is made of at most twice as many products as there are levels."""
+    unit = Series.constant(steps[0].monomials, identity(steps[0].shape[0]))
+    if len(steps) == 1:
+        return [steps[0], unit]
+    odd = len(steps) % 2
+    pairs = [second * first for first, second in zip(steps[:-1:2], steps[1::2], strict=False)]
+    coarse = products([*pairs, *([steps[-1]] if odd else [])])
+    found: list[Series] = []
+    for k in range(len(steps) + 1):
+        place, inside = divmod(k, 2)
+        if not inside:
+            found.append(coarse[place])
+        elif k == len(steps):
+            found.append(unit)
+        else:
+            found.append(coarse[place + 1] * steps[k])
+    return found
+
+
+def prefixes(steps: Sequence[Series]) -> list[Series]:
+    """``Phi_k ... Phi_1`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``, as `products`."""
+    unit = Series.constant(steps[0].monomials, identity(steps[0].shape[0]))
+    if len(steps) == 1:
+        return [unit, steps[0]]
+    pairs = [second * first for first, second in zip(steps[:-1:2], steps[1::2], strict=False)]
+    coarse = prefixes([*pairs, *([steps[-1]] if len(steps) % 2 else [])])
+    return [coarse[k // 2] if k % 2 == 0 else steps[k - 1] * coarse[k // 2] for k in range(len(steps))] + [coarse[-1]]

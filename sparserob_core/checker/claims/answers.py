@@ -19,10 +19,9 @@ from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
 from sparserob_core.checker.cost.effort import at_most
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
-from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.reach.measurable import LoopBeside, MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 from sparserob_core.checker.sets.known import known
@@ -126,8 +125,8 @@ class Answers:
                 *parts, beside=MeasurableLoop.alone(case.problem, parts[4], parts[5], case.control.pieces)
             )
         measurable = case.measurable and changes is None
-        if isinstance(case.changing, VaryingFlow):
-            return (VaryingMeasurableLoop if measurable else VaryingLoop)(*parts, law=case.changing)
+        if case.changing is not None:
+            return (VaryingMeasurableLoop if measurable else VaryingLoop)(*parts, law=case.changing.at(()))
         return (MeasurableLoop if measurable else ClosedLoop)(*parts)
 
     @cached_property

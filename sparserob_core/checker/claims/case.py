@@ -13,23 +13,27 @@ from typing import TYPE_CHECKING, Any, final, get_args
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.duality import Duality, Row, before
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.cost.price import Price
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.flow.law import Box as ParameterBox
+from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.closed_loop import middle
-from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.integrals import Running, integrating, spelt
 from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.measurable import Side, Together
 from sparserob_core.checker.reach.superposition import parted
 from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
-from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadStates
+from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.varying.turns import in_turns
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners
@@ -49,6 +53,7 @@ if TYPE_CHECKING:
 
 
 RETURN, EQUALS, STEP = "return", "equals", "control_step"
+STATES_KEPT = 8  # over boxes of parameters
 INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: ten times what counts as no violation, so
 # that none is handed on from period to period
 
@@ -274,40 +279,47 @@ class Case:
         return min(bisect_right(self.grid, time) - 1, len(self.grid) - 2)
 
     @cached_property
-    def varying(self) -> VaryingFlow | SpreadFlow:
-        """The flow of a system that changes with time, over all of its parameters where these are no coordinates of its
-        state; raises `Unchecked` for another one."""
-        system = self.problem.system
-        if not isinstance(system, VaryingSystem):
-            raise Unchecked("the system does not change with time")
-        return (VaryingFlow if system.parameters is None else SpreadFlow)(system, self.grid[-1])
+    def flows(self) -> Flows:
+        """The flows of the system, over boxes of its parameters and at single ones."""
+        bound, until = self.problem.system.parameters, self.grid[-1]
+        plant, box = Plant.of(self.problem.system, until), None if bound is None else bound.bounding_box()
+        return Flows(plant, until, ParameterBox() if box is None else ParameterBox.between(box.lower, box.upper))
 
     @property
-    def changing(self) -> VaryingFlow | SpreadFlow | None:
+    def varying(self) -> Flows:
+        """`flows` of a system that changes with time; raises `Unchecked` for another one."""
+        if not isinstance(self.problem.system, VaryingSystem):
+            raise Unchecked("the system does not change with time")
+        return self.flows
+
+    @property
+    def changing(self) -> Flows | None:
         """`varying`; ``None`` where the system does not change with time."""
-        return self.varying if isinstance(self.problem.system, VaryingSystem) else None
-
-    def parts_of(self, box: Corners) -> list[tuple[Corners, list[float]]]:
-        """A box of parameters in parts over each of which the state is followed as a whole, and when the system becomes
-        another polynomial of the time there."""
-        if isinstance(self.changing, SpreadFlow):
-            return [(part, flow.ends[:-1]) for part, flow in self.changing.parted(box)]
-        return [(box, [] if self.changing is None else self.changing.ends[:-1])]
-
-    def spread(self, box: Corners) -> SpreadStates:
-        """All coefficients of the states over the part that holds a box of the parameters of a system that changes with
-        time."""
-        assert isinstance(self.changing, SpreadFlow)
-        for part, flow in self.changing.parted(box):
-            if part == box:
-                if flow not in self._spread:
-                    self._spread[flow] = SpreadStates(flow, self.scene)
-                return self._spread[flow]
-        raise Unchecked("a box of parameters lies in two parts")
+        return self.flows if isinstance(self.problem.system, VaryingSystem) else None
 
     @cached_property
-    def _spread(self) -> dict[SpreadFlow, SpreadStates]:
+    def marks(self) -> list[float]:
+        """The times from each of which to the next the state is a polynomial of the time."""
+        return self.grid if self.looped and self.changing is None else self.flows.at(self.flows.box.middle).marks(self.grid)
+
+    def states(self, box: ParameterBox) -> States:
+        """The states that are reached over a box of parameters, or over a larger one."""
+        flow = self.flows.holding(box)
+        if flow not in self._states:
+            if len(self._states) >= STATES_KEPT:
+                self._states.pop(next(iter(self._states)))
+            self._states[flow] = States(flow, self.scene)
+        return self._states[flow]
+
+    @cached_property
+    def _states(self) -> dict[Flow, States]:
         return {}
+
+    @property
+    def nominal_parameter(self) -> list[float]:
+        """The parameter at which the cost is counted."""
+        bound = self.problem.system.parameters
+        return [] if bound is None else nominal_point(bound).tolist()
 
     @cached_property
     def acting(self) -> list[float]:
@@ -371,7 +383,6 @@ class Case:
             None if changes is None else self.held,
             changes or [],
             self.problem.initial_set,
-            tuple(float(t) for t in self.problem.system.switches),
             self.lasting,
         )
 
@@ -433,9 +444,9 @@ class Case:
     def _missing(self, *errors: Any, **more: Any) -> VaryingExecution | SpreadExecution:
         """Errors in a system that changes with time, over all of its parameters."""
         law = self.varying
-        if isinstance(law, SpreadFlow):
+        if law.degree:
             return SpreadExecution(law, *errors, **more)
-        return VaryingExecution(law, *errors, **more)
+        return VaryingExecution(law.at(()), *errors, **more)
 
     def strayed_at(self, parameter: Sequence[float]) -> VaryingExecution | None:
         """`strayed` at one parameter."""
@@ -546,9 +557,8 @@ class Case:
 
     @cached_property
     def price(self) -> Price:
-        bound, changing = self.problem.system.parameters, self.changing
-        nominal = [] if bound is None else nominal_point(bound).tolist()
-        return Price(self.problem, self.control, self.clock, None if changing is None else changing.at(nominal))
+        changing = None if self.changing is None else self.changing.at(self.nominal_parameter)
+        return Price(self.problem, self.control, self.clock, changing)
 
     @cached_property
     def running(self) -> Running | None:
@@ -570,8 +580,8 @@ class Case:
     def motion(self) -> Motion:
         """What rows of a known system have in common, the inputs of the control before those of the disturbance."""
         assert self.still is not None
-        parts = flows(self.still, [])[0].parts
-        A, B, E = (parts[name][0] for name in ("A", "B", "E"))
+        (parts,) = modes_at(self.still, [])
+        A, B, E = (parts[name] for name in ("A", "B", "E"))
         if self.problem.disturbance is not None:
             B = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)])
         return Motion.of(A, B, self.grid[-1], self.clock)

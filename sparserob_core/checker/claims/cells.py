@@ -14,8 +14,6 @@ from sparserob_core.checker.claims.window import Beside
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.loop_tube import LoopTube, Still
 from sparserob_core.checker.reach.tube import Polynomial, Tube
-from sparserob_core.checker.reach.varying.spread import SpreadTube
-from sparserob_core.checker.reach.varying.tube import VaryingTube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.sides import Bounded, Sides
@@ -29,7 +27,7 @@ TIMES = 4
 MOST_BOXES = 8_000  # boxes of parameters and cells of directions
 BLAME = 0.2  # share of the error from which the box of parameters is to blame for it
 
-Reached: TypeAlias = Tube | VaryingTube | SpreadTube | LoopTube | Still
+Reached: TypeAlias = Tube | LoopTube | Still
 Interval: TypeAlias = tuple[int, float, float]
 """A piece of the grid, and a part of it from one time to another (which may be the same)."""
 

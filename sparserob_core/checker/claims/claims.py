@@ -20,7 +20,7 @@ from sparserob_core.checker.claims.replay import excused, witnessed
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.reach.loop_tube import Still
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters

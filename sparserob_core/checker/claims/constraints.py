@@ -13,23 +13,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, balls, below
-from sparserob_core.checker.arithmetic.jets import Monomials, expanded
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.cells import Interval, Proven, Reached, Work, prove
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.flow.law import Box as ParameterBox
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.adjoint import Adjoint, Stopped, Worst
-from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.loop_tube import LoopTube
-from sparserob_core.checker.reach.tube import Tube
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
-from sparserob_core.checker.reach.varying.spread import SpreadFlow, SpreadTube
-from sparserob_core.checker.reach.varying.tube import VaryingTube
+from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.reach.states import States
+from sparserob_core.checker.reach.tube import Rows, Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, Enclosed
@@ -43,7 +41,6 @@ if TYPE_CHECKING:
 
     from flint import arb
 
-DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of the expansion in the parameters, by their number; 2 beyond
 TUBES_KEPT = 8
 # States from which the rows of a known system are followed: a ball matrix for every length of a cell, as the tube has
 # them, takes as long as all rows. Of few states the tube takes less; of 48 it takes minutes, and of 270 hours.
@@ -359,12 +356,10 @@ def divided(
 ) -> list[tuple[Corners, list[Interval]]]:
     """A box of parameters in the parts over which the state is followed, and for each the ``times``, cut wherever
     anything turns or jumps."""
-    found, always = list[tuple[Corners, list[Interval]]](), window.cuts(case.control.breakpoints.tolist())
-    for part, ends in case.parts_of(box):
-        every = np.array(sorted({*case.grid, *always, *ends}))
-        parts = (cut(np.array(case.grid), every, start, stop) for start, stop in times)
-        found.append((part, [one for several in parts for one in several]))
-    return found
+    always = window.cuts(case.control.breakpoints.tolist())
+    every = np.array(sorted({*case.grid, *always, *case.marks}))
+    parts = (cut(np.array(case.grid), every, start, stop) for start, stop in times)
+    return [(box, [one for several in parts for one in several])]
 
 
 def _facets(window: Window, units: RowUnits) -> tuple[Array, Array, Sides | None]:
@@ -393,31 +388,18 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
     if case.looped:
         loop_tube = LoopTube(answers_of(case).loop, basis, gains)
         return lambda _: loop_tube
-    if isinstance(case.changing, SpreadFlow):
-        return lru_cache(maxsize=TUBES_KEPT)(lambda box: SpreadTube(case.spread(box), basis, box))
-    if case.changing is not None:
-        known_tube = VaryingTube(case.changing, case.scene, basis)
-        return lambda _: known_tube
     nu = case.problem.system.parameter_count
     widened = nu and not parameters_of(case).is_box
     extra = WIDER * (upper[:, 1 : 1 + nu].max(axis=0) - lower[:, 1 : 1 + nu].min(axis=0)) if widened else np.zeros(nu)
-    made: dict[Corners, Tube] = {}
+    seen = dict[int, Rows]()
 
-    def tube(box: Corners) -> Tube:
-        if box in made:
-            made[box] = made.pop(box)  # the latest
-        else:
-            low, high = np.array(box[0]), np.array(box[1])
-            centre = (low + high) / 2
-            radius = np.nextafter(np.maximum(high - centre, centre - low) + extra, np.inf) if nu else np.zeros(0)
-            if len(made) >= TUBES_KEPT:
-                made.pop(next(iter(made)))
-            made[box] = Tube(
-                flows(case.problem.system, centre.tolist(), radius.tolist(), DEGREES.get(nu, 2)),
-                case.scene,
-                basis,
-            )
-        return made[box]
+    @lru_cache(maxsize=TUBES_KEPT)
+    def tube(corners: Corners) -> Tube:
+        box = ParameterBox.between(corners[0], corners[1]).wider(extra)
+        states = case.states(box)
+        if len(seen) >= TUBES_KEPT and id(states) not in seen:
+            seen.clear()
+        return Tube(seen.setdefault(id(states), Rows(states, basis)), box)
 
     return tube
 
@@ -458,13 +440,11 @@ def missed(case: Case) -> list[tuple[arb, float]]:
 
 def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
     """The final state ``(d, 1)`` where no uncertainty reaches what is fixed of it, whatever the control."""
-    if isinstance(case.changing, SpreadFlow):
-        raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
     for state, _ in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
-    if isinstance(case.changing, VaryingFlow):  # over many orbits, in units that follow them
-        return list(VaryingTube(case.changing, scene, np.eye(case.problem.system.states)).nodes[-1].tolist())
+    if case.changing is not None:  # over many orbits, in units that follow them
+        return list(States(case.changing.at(case.nominal_parameter), scene).nodes[-1].matrix.tolist())
     return case.nominal_states[-1].tolist()
 
 
@@ -477,18 +457,13 @@ def of_fixed(case: Case) -> str:
 def _reached(case: Case, state: int) -> bool:
     """Whether an uncertain entry, a disturbance or the choice of an initial state may reach a state: follow the entries
     of ``A`` that are not 0 at every parameter."""
-    every, reaching = _linked(case, state)
-    uncertain = any(
-        not part[i, j].is_zero()
-        for parts in every
-        for name in ("A", "B")
-        for part in parts[name][1:]
-        for i in reaching
-        for j in range(part.ncols())
-    )
+    reaching, rows = _linked(case, state), sorted(_linked(case, state))
+    there, moved = case.flows.links
+    d, m = case.problem.system.states, case.flows.plant.driven
+    uncertain = bool(moved[rows, : d + m].any())
     bound = case.problem.disturbance
     free = [] if bound is None else [w for w, size in enumerate(known(bound).radius) if size > math.ulp(0.0)]
-    pushed = any(not part[i, w].is_zero() for parts in every for part in parts["E"] for i in reaching for w in free)
+    pushed = bool(there[np.ix_(rows, [d + m + w for w in free])].any())
     begun = case.problem.initial_set
     moved = begun is not None and any(known(begun).radius[j] > math.ulp(0.0) for j in reaching)
     return uncertain or pushed or moved
@@ -497,40 +472,20 @@ def _reached(case: Case, state: int) -> bool:
 def _rests(case: Case, state: int) -> bool:
     """Whether a state begins at 0 and nothing ever moves it: neither another state that is linked to it, nor a control
     of the decision, nor a drift."""
-    every, reaching = _linked(case, state)
+    reaching, (there, _) = _linked(case, state), case.flows.links
     m, early = case.problem.system.controls, case.problem.initial_control
     commands = [*case.pieces, *([] if early is None else [stacked([[u] for u in balls(np.asarray(early))])])]
     idle = [all(command[channel, 0].is_zero() for command in commands) for channel in range(m)]
-    driven = any(
-        not parts["B"][0][i, channel].is_zero()
-        for parts in every
-        for i in reaching
-        for channel in range(parts["B"][0].ncols())
-        if channel >= m or not idle[channel]
-    )
+    d, columns = case.problem.system.states, case.flows.plant.driven
+    acting = [d + channel for channel in range(columns) if channel >= m or not idle[channel]]
+    driven = bool(there[np.ix_(sorted(reaching), acting)].any())
     return not driven and not any(np.asarray(case.problem.initial_state)[[*reaching]])
 
 
-def _linked(case: Case, state: int) -> tuple[list[Any], set[int]]:
-    """The entries of every system that takes its turn, and the states that may reach a state by those of ``A`` that
-    are not 0 at every parameter."""
-    system, wide = case.problem.system, _hull(case)
-    every = (
-        [case.changing.links]
-        if isinstance(case.changing, VaryingFlow)
-        else [expanded(mode, Monomials(len(wide), 1), wide, [1.0] * len(wide)) for mode in system.modes]
-    )
-    d, reaching = system.states, {state}
+def _linked(case: Case, state: int) -> set[int]:
+    """The states that may reach a state by entries of ``A`` that are not 0 at every time and parameter."""
+    d, reaching = case.problem.system.states, {state}
+    A = case.flows.links[0][:, :d]
     for _ in range(d):
-        reaching |= {j for i in reaching for j in range(d) if any(not one["A"][0][i, j].is_zero() for one in every)}
-    return every, reaching
-
-
-def _hull(case: Case) -> Sequence[arb]:
-    """A ball around every parameter's values."""
-    bound = case.problem.system.parameters
-    if bound is None:
-        return []
-    axes = [[float(i == j) for j in range(bound.dimension)] for i in range(bound.dimension)]
-    shape = known(bound)
-    return [(-shape.support(balls([-a for a in axis]))).union(shape.support(balls(axis))) for axis in axes]
+        reaching |= {int(j) for i in reaching for j in np.flatnonzero(A[i])}
+    return reaching

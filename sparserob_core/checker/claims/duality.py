@@ -19,10 +19,11 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.cost.price import Price, Tangent
 from sparserob_core.checker.outcome import Broken
-from sparserob_core.checker.reach.flow import Flow, flows, stacked
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.reach.lasting import Lasting, summed
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
-from sparserob_core.checker.reach.varying.spread import SpreadFlow
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -66,9 +67,10 @@ class Duality:
     problem: OptimalControlProblem
     control: Dictionary
     changes: list[float] | None
-    varying: VaryingFlow | SpreadFlow | None = None
+    varying: Flows | None = None
     held: ConvexSet | None = None
     lasting: Lasting | None = None
+    _known: dict[tuple[float, ...], list[dict[str, arb_mat]]] = field(default_factory=dict, repr=False)
     _steps: dict[tuple[tuple[float, ...], int, tuple[float, float]], arb_mat] = field(default_factory=dict, repr=False)
 
     @property
@@ -113,12 +115,11 @@ class Duality:
         it."""
         if self.varying is not None:
             return self._varying_row(self.varying.at(parameter), direction, time, limit, disturbed)
-        every, delay = flows(self.problem.system, parameter), self.problem.system.delay
-        parts = every[0].parts
-        d, m, columns = parts["A"][0].nrows(), self.problem.system.controls, parts["B"][0].ncols()
+        delay, parts = self.problem.system.delay, self._modes(parameter)[0]
+        d, m, columns = parts["A"].nrows(), self.problem.system.controls, parts["B"].ncols()
         breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
         jumps = self.changes if self.changes is not None else []
-        lags = self._lags(every, direction, time, {0.0, *(s for s in (*breaks, *jumps) if s < time)})
+        lags = self._lags(parameter, direction, time, {0.0, *(s for s in (*breaks, *jumps) if s < time)})
         constant = (
             sum((lags[0.0][i] * _exact(x) for i, x in enumerate(np.asarray(self.problem.initial_state))), _exact(0.0))
             - limit
@@ -131,14 +132,14 @@ class Duality:
         if disturbed and self.problem.initial_set is not None:
             constant = constant + known(self.problem.initial_set).support(lags[0.0][:d])
         if disturbed and self.changes is not None and self.problem.disturbance is not None:
-            mw = parts["E"][0].ncols()
+            mw = parts["E"].ncols()
             pushes = _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw)
             for weights in summed(self.lasting, pushes):
                 if any(not w.is_zero() for w in weights):
                     constant = constant + known(self.problem.disturbance).support(weights)
         return Row(constant, slope)
 
-    def _varying_row(self, flow: VaryingFlow, direction: Array, time: float, limit: arb, disturbed: bool) -> Row:
+    def _varying_row(self, flow: Flow, direction: Array, time: float, limit: arb, disturbed: bool) -> Row:
         """`row` of a system that changes with time, at a parameter that is known."""
         m, problem = self.problem.system.controls, self.problem
         delay, jumps = problem.system.delay, self.changes or []
@@ -179,10 +180,9 @@ class Duality:
             given = {s: (row * one).entries() for s, one in zip(begins, weights.disturbance, strict=True)}
             late = [_exact(0.0)] * self.problem.system.disturbances
             return [given[s] if s < time else late for s in jumps]
-        every = flows(self.problem.system, ())
-        parts = every[0].parts
-        first, mw = direction.size + parts["B"][0].ncols(), parts["E"][0].ncols()
-        lags = self._lags(every, direction, time, {0.0, *(s for s in jumps if s < time)})
+        parts = self._modes(())[0]
+        first, mw = direction.size + parts["B"].ncols(), parts["E"].ncols()
+        lags = self._lags((), direction, time, {0.0, *(s for s in jumps if s < time)})
         return _differences([lags[s][first:] if s < time else None for s in jumps], mw)
 
     def carried(self, direction: Array, time: float) -> list[arb]:
@@ -190,15 +190,26 @@ class Duality:
         if self.varying is not None:
             row = stacked([[_exact(c) for c in direction]])
             return list((row * self.varying.at(()).weights([0.0, time]).free).entries())
-        return self._lags(flows(self.problem.system, ()), direction, time, {0.0})[0.0][: direction.size]
+        return self._lags((), direction, time, {0.0})[0.0][: direction.size]
 
-    def _lags(self, every: Sequence[Flow], direction: Array, time: float, since: set[float]) -> dict[float, list[arb]]:
+    def _modes(self, parameter: Sequence[float]) -> list[dict[str, arb_mat]]:
+        """The systems that take turns, at a parameter."""
+        point = tuple(map(float, parameter))
+        if point not in self._known:
+            if len(self._known) >= STEPS_KEPT:
+                self._known.clear()
+            self._known[point] = modes_at(self.problem.system, point)
+        return self._known[point]
+
+    def _lags(
+        self, parameter: Sequence[float], direction: Array, time: float, since: set[float]
+    ) -> dict[float, list[arb]]:
         """``c'e^{A (t - s)}`` and its integrals from each of the times ``since`` to ``time``, times ``B`` and ``E``;
         back through the systems that took turns until then. From one time to the next by the exponential of the step,
         which is the same wherever pieces are equally long; every `LEAPS` times anew, since balls grow."""
 
         switches, d = self.problem.system.switches, direction.size
-        matrices = [_joined(flow) for flow in every]
+        matrices = [_joined(mode) for mode in self._modes(parameter)]
         column, found = [_exact(v) for v in (*direction, *np.zeros(matrices[0].nrows() - d))], {}
         for leg in range(bisect_left(switches, time), -1, -1):
             begin, end = (0.0, *switches)[leg], min((*switches, time)[leg], time)
@@ -208,7 +219,7 @@ class Duality:
                 if number % LEAPS == 0:
                     moved = (matrices[leg] * (_exact(end) - _exact(s))).exp() * row
                 else:
-                    length = (every[leg].centre, leg, difference(latest, s))
+                    length = (tuple(map(float, parameter)), leg, difference(latest, s))
                     if length not in self._steps:
                         step = (matrices[leg] * (_exact(latest) - _exact(s))).exp()
                         if len(self._steps) >= STEPS_KEPT:
@@ -369,9 +380,9 @@ def before(problem: OptimalControlProblem) -> list[float]:
     return [0.0] * problem.system.controls if given is None else [float(u) for u in np.asarray(given)]
 
 
-def _joined(flow: Flow) -> arb_mat:
+def _joined(mode: dict[str, arb_mat]) -> arb_mat:
     """``y' = A'y`` with the integrals of ``B'y`` and ``E'y``."""
-    A, B, E = (flow.parts[name][0].transpose() for name in ("A", "B", "E"))
+    A, B, E = (mode[name].transpose() for name in ("A", "B", "E"))
     table = [row for part in (A, B, E) for row in part.tolist()]
     return stacked([row + [_exact(0.0)] * (len(table) - len(row)) for row in table])
 

@@ -17,12 +17,13 @@ from sparserob_core.checker.claims.constraints import beside, erring_at, followe
 from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.flow import flows, stacked
-from sparserob_core.checker.reach.flow import held as held_for
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.still import held as held_for
+from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.reach.loop_tube import LoopTube
-from sparserob_core.checker.reach.tube import Polynomial, Tube
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
-from sparserob_core.checker.reach.varying.tube import VaryingTube
+from sparserob_core.checker.reach.states import States
+from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along
 from sparserob_core.sip.convex_set import Array
@@ -45,11 +46,11 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
 
     if case.changing is not None:
         return _changed(case, case.changing.at(parameter.tolist()), time, signal, deviation)
-    every = [flow.parts for flow in flows(case.problem.system, parameter.tolist())]
+    every = modes_at(case.problem.system, parameter.tolist())
     wanted = case.problem.disturbance is not None
     w = _admissible(case, signal) if wanted else None
     both = [
-        stacked([left + right for left, right in zip(parts["B"][0].tolist(), parts["E"][0].tolist(), strict=True)])
+        stacked([left + right for left, right in zip(parts["B"].tolist(), parts["E"].tolist(), strict=True)])
         for parts in every
     ]
     x = _start(case, deviation)
@@ -64,7 +65,7 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     return state
 
 
-def _changed(case: Case, flow: VaryingFlow, time: float, signal: object, deviation: object) -> list[arb]:
+def _changed(case: Case, flow: Flow, time: float, signal: object, deviation: object) -> list[arb]:
     """`reached` of a system that changes with time."""
     w = _admissible(case, signal) if case.problem.disturbance is not None else None
     weights = flow.weights([0.0, *(t for t in case.grid[1:-1] if t < time), time])
@@ -242,9 +243,8 @@ def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains
     if case.looped:
         return LoopTube(answers_of(case).loop, basis, gains)
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
-    if case.changing is not None:
-        return VaryingTube(case.changing.at(parameter.tolist()), scene, basis)
-    return Tube(flows(case.problem.system, parameter.tolist()), scene, basis)
+    flow = case.flows.at(parameter.tolist())
+    return Tube(Rows(States(flow, scene), basis), flow.box)
 
 
 def _begun(case: Case, data: object) -> Array:

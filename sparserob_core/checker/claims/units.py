@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from sparserob_core.checker.claims.duality import before
 from sparserob_core.checker.outcome import RESOLVED, THIN, TOLERANCE, Unchecked
-from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.flow import Flow, flows, held, stacked
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
-from sparserob_core.checker.reach.varying.spread import SpreadFlow
+from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.flow.still import held, modes_at
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -66,7 +66,7 @@ class RowUnits:
     stop: float
     reference: Array | None = None
     acting: Array | None = None
-    varying: VaryingFlow | SpreadFlow | None = None
+    varying: Flows | None = None
     nominal: Callable[[Array, Array], Array] | None = None
 
     @cached_property
@@ -208,7 +208,7 @@ class RowUnits:
         for k in range(count - 1, -1, -1):
             first = int(np.searchsorted(places, k, side="right"))
             if first < len(places):
-                Phi, Gamma, Delta = step.over(nodes[k], nodes[k + 1], bisect_right(self.scene.switches, nodes[k]))
+                Phi, Gamma, Delta = step.over(nodes[k], nodes[k + 1], bisect_right(self.problem.system.switches, nodes[k]))
                 driven[k, first:], pushed[k, first:] = v[first:] @ Gamma, v[first:] @ Delta
                 v[first:] = v[first:] @ Phi
         start = np.asarray(self.problem.initial_state, dtype=float)
@@ -275,7 +275,7 @@ class _Steps:
     parameter: tuple[float, ...]
     controls: int
     tick: float
-    varying: VaryingFlow | SpreadFlow | None
+    varying: Flows | None
     _known: dict[tuple[int, int], tuple[Array, Array, Array]] = field(default_factory=dict)
 
     def over(self, start: float, stop: float, leg: int) -> tuple[Array, Array, Array]:
@@ -285,22 +285,22 @@ class _Steps:
 
         if self.varying is not None:
             Phi, Gamma, Delta = self.varying.at(self.parameter).over(start, stop)
-            return _floats(Phi), _floats(Gamma), _floats(Delta)
+            return _floats(Phi.matrix), _floats(Gamma.matrix), _floats(Delta.matrix)
         key = (leg, round((stop - start) / self.tick))
         if key not in self._known:
-            parts = self._flows[leg].parts
-            both = stacked([b + e for b, e in zip(parts["B"][0].tolist(), parts["E"][0].tolist(), strict=True)])
+            parts = self._modes[leg]
+            both = stacked([b + e for b, e in zip(parts["B"].tolist(), parts["E"].tolist(), strict=True)])
             if both.nrows() >= COARSE:
-                flow, table = _held(_floats(parts["A"][0]), _floats(both), stop - start)
+                flow, table = _held(_floats(parts["A"]), _floats(both), stop - start)
             else:
-                Phi, Gamma = held(parts["A"][0], both, arb(stop - start))
+                Phi, Gamma = held(parts["A"], both, arb(stop - start))
                 flow, table = _floats(Phi), _floats(Gamma)
             self._known[key] = (flow, table[:, : self.controls], table[:, self.controls :])
         return self._known[key]
 
     @cached_property
-    def _flows(self) -> list[Flow]:
-        return flows(self.problem.system, self.parameter)
+    def _modes(self) -> list[dict[str, arb_mat]]:
+        return modes_at(self.problem.system, self.parameter)
 
 
 def _floats(matrix: arb_mat) -> Array:

@@ -12,9 +12,9 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.sets.known import known
@@ -26,8 +26,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-    from sparserob_core.checker.reach.flow import Flow
-    from sparserob_core.checker.reach.tube import Known
+    from sparserob_core.checker.reach.tube import Around
     from sparserob_core.checker.sets.parameters import Corners
 
 DIRECTIONS_KEPT = 4096  # of cells of directions, which are asked for at every time; with a tenth of them some anew
@@ -119,7 +118,7 @@ class Beside:
         stop: float,
         z: Array,
         piece: int | None = None,
-        within: tuple[Corners, Known | Flow] | None = None,
+        within: tuple[Corners, Around] | None = None,
     ) -> list[Polynomial]:
         """The polynomials of ``c'x``, one for every ``z (k, b)``, with what stands beside it on ``[start, stop]``; with
         the control of a ``piece``, that of the interval unless given. ``within``: the box of parameters, where they are
@@ -133,7 +132,7 @@ class Beside:
             level = level + stacked([[_exact(v) for v in row] for row in self.gains]) * control
         terms = [level]
         if stop > start and self.window.reference is not None:
-            length = self.scene.duration(self.scene.ticks(start, stop))
+            length = _exact(stop) - _exact(start)
             terms.append(-basis * stacked([[v * length] for v in slope]))
         enclosed = Enclosed.all(terms, (len(terms), self.basis.shape[0]))
         mid = enclosed.mid @ z.T
@@ -190,24 +189,19 @@ class Beside:
         c: Array,
         start: float,
         stop: float,
-        within: tuple[Corners, Known | Flow],
+        within: tuple[Corners, Around],
     ) -> Polynomial:
         """A polynomial with what errors of execution add to ``c'x`` on ``[start, stop]`` over a box of parameters."""
         found = delivered.over(c, [start] if start == stop else [start, stop], *within)
         terms, off = found.ends[:1], found.off
         if len(found.ends) > 1:
-            rise = (found.ends[1] - found.ends[0]) * self._stretch(start, stop)
+            rise = found.ends[1] - found.ends[0]
             terms = np.stack([found.ends[0], rise])
             off += rounding(8) * float(np.abs(found.ends).sum() + np.abs(rise).sum())
         added = _plus(poly, terms, off)
         turning = added.turning + float(found.wide.sum())
         bent = found.wide if added.bent is None else added.bent + found.wide
         return replace(added, kinks=added.kinks + found.over, turning=turning, bent=bent)
-
-    def _stretch(self, start: float, stop: float) -> float:
-        """About how long an interval is on the clock of the scene, in times of its length."""
-        length = self.scene.duration(self.scene.ticks(start, stop)) / (_exact(stop) - _exact(start))
-        return float(length.mid())
 
     def _erring(
         self, delivered: Execution | VaryingExecution, c: Array, start: float, stop: float
@@ -219,9 +213,8 @@ class Beside:
         if len(ends) == 1:
             return np.array([level]), off
         rise = (ends[1][0] + ends[1][1] - ends[0][0] - ends[0][1]) / 2.0
-        slope = rise * self._stretch(start, stop)
-        off += delivered.bent(c, start, stop) + rounding(8) * (abs(slope) + abs(ends[0][1]) + abs(ends[1][1]))
-        return np.array([level, slope]), off
+        off += delivered.bent(c, start, stop) + rounding(8) * (abs(rise) + abs(ends[0][1]) + abs(ends[1][1]))
+        return np.array([level, rise]), off
 
 
 def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import norm
+from sparserob_core.checker.arithmetic.series import around, norm, stacked
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.flow import Flow, flows, stacked
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.control.problem.cost import Quadratic, nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -144,15 +144,14 @@ class Nominal:
         """Those of the systems that take turns."""
         parameters = problem.system.parameters
         point = () if parameters is None else tuple(map(float, nominal_point(parameters)))
-        return [Nominal._of(problem, flow) for flow in flows(problem.system, point)]
+        return [Nominal._of(problem, mode) for mode in modes_at(problem.system, point)]
 
     @staticmethod
-    def _of(problem: OptimalControlProblem, flow: Flow) -> Nominal:
+    def _of(problem: OptimalControlProblem, parts: dict[str, arb_mat]) -> Nominal:
         from flint import arb
 
         d, m, zero = problem.system.states, problem.system.controls, arb(0)
-        parts = flow.parts
-        A, B, E = (parts[name][0].tolist() for name in ("A", "B", "E"))
+        A, B, E = (parts[name].tolist() for name in ("A", "B", "E"))
         w = [] if problem.disturbance is None else balls(nominal_point(problem.disturbance))
         pushed = [sum((e * v for e, v in zip(row, w, strict=True)), zero) if w else zero for row in E]
         drift = [sum(row[m:], push) for row, push in zip(B, pushed, strict=True)]  # further inputs are 1
@@ -189,20 +188,19 @@ class Changing:
     """`Nominal` of a system that changes with time, of which ``law`` is the flow."""
 
     problem: OptimalControlProblem
-    law: VaryingFlow
+    law: Flow
     _known: dict[tuple[float, float], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
 
     def step(self, start: float, stop: float, acting: bool) -> arb_mat:
         """What the time from ``start`` to ``stop`` does to ``z``."""
-        parts = [part.tolist() for part in self.law.over(start, stop)]
-        return self._of(stacked([[*a, *b, *e] for a, b, e in zip(*parts, strict=True)]), True, acting)
+        Phi, Gamma, Delta = self.law.over(start, stop)
+        return self._of(Phi.beside(Gamma).beside(Delta).matrix, True, acting)
 
     def over(self, start: float, stop: float, M: arb_mat, acting: bool) -> tuple[arb_mat, arb_mat]:
         """What the time from ``start`` to ``stop`` does to ``z``, and what it costs, segment by segment of the law;
         ``acting``: a control of the decision acts, not the one before time 0."""
         if (start, stop) not in self._known:
-            times = [start, *(t for t in self.law.ends if start < t < stop), stop]
-            parts = [self._within(*ends, M, acting) for ends in pairwise(times)]
+            parts = [self._within(*ends, M, acting) for ends in pairwise(self.law.marks([start, stop]))]
             flow, weight = parts[0]
             for onward, cost in parts[1:]:
                 weight = weight + flow.transpose() * cost * flow
@@ -215,8 +213,9 @@ class Changing:
         leaves out is in a ball at every time."""
         from flint import arb
 
-        terms, rest = self.law.within(start, stop, EVERY)
-        every, left = [self._of(term, n == 0, acting) for n, term in enumerate(terms)], self._of(rest, False, acting)
+        terms, off = self.law.within(start, stop, start, stop, EVERY)
+        every = [self._of(term.matrix, n == 0, acting) for n, term in enumerate(terms)]
+        left = self._of(around(off), False, acting)
         flow = every[0]
         for term in every[1:]:
             flow = flow + term

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import norm
+from sparserob_core.checker.arithmetic.series import norm, stacked
+from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.cost.nominal import Changing, Walk, ball_of, nominal_states, walked
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
-from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -50,7 +49,7 @@ class Price:
     problem: OptimalControlProblem
     control: Dictionary
     clock: Clock = NO_LIMIT
-    varying: VaryingFlow | None = None
+    varying: Flow | None = None
     _latest: deque[tuple[Sequence[arb_mat], int, Walk]] = field(default_factory=lambda: deque(maxlen=KEPT))
 
     @cached_property

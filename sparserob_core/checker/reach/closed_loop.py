@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import norm
+from sparserob_core.checker.arithmetic.series import middles, norm, stacked
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.flow import OwnUnits, flows, held, middles, stacked
+from sparserob_core.checker.flow.still import held, modes_at
+from sparserob_core.checker.flow.units import OwnUnits
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
@@ -79,7 +80,7 @@ class ClosedLoop:
     @cached_property
     def modes(self) -> list[dict[str, arb_mat]]:
         """``A``, ``B``, ``E`` of the systems that take turns."""
-        return [{name: matrices[0] for name, matrices in flow.parts.items()} for flow in flows(self.system, ())]
+        return modes_at(self.system, ())
 
     @property
     def parts(self) -> dict[str, arb_mat]:

@@ -18,7 +18,8 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Clock
 from sparserob_core.checker.reach.adjoint import CENTRED, ORDER, Adjoint, Motion, subtract_times
-from sparserob_core.checker.reach.flow import flows, stacked
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.reach.measurable import signed, swept
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -59,8 +60,8 @@ class Execution:
     @cached_property
     def motion(self) -> Motion:
         """What the rows share, with ``B`` as far as errors enter by it."""
-        (flow,) = flows(self.problem.system, [])
-        A, B, m = flow.parts["A"][0], flow.parts["B"][0], self.shares.size
+        (mode,) = modes_at(self.problem.system, [])
+        A, B, m = mode["A"], mode["B"], self.shares.size
         B = stacked([[x * (i not in self.problem.commanded) for x in row[:m]] for i, row in enumerate(B.tolist())])
         return Motion.of(A, B, float(self.breakpoints[-1]), self.clock)
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
-from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.reach.tube import Known, Polynomial
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.reach.tube import Around, Polynomial
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
 
@@ -28,7 +28,7 @@ class LoopTube:
     loop: ClosedLoop
     basis: Array
     gains: Array
-    flow: Known = Known()  # noqa: RUF009  immutable
+    flow: Around = Around()  # noqa: RUF009  immutable
     _heights: dict[tuple[int, float, bytes], Enclosed] = field(default_factory=dict, repr=False)
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
@@ -64,7 +64,7 @@ class Still:
 
     heights: Callable[[int, arb_mat], list[arb]]
     basis: Array
-    flow: Known = Known()  # noqa: RUF009  immutable
+    flow: Around = Around()  # noqa: RUF009  immutable
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
         """As `Tube.cells`, at one place."""

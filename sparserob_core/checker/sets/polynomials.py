@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.jets import Monomials
+from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 
@@ -51,6 +51,13 @@ class Enclosed:
         if not (np.isfinite(mid).all() and np.isfinite(rad).all()):
             raise Unchecked("the response grows beyond what numbers can hold")
         return Enclosed(mid, (rad + HALF_ULP * np.abs(mid)) * OUTWARD + TINY)
+
+
+def product(left: Enclosed, right: Enclosed) -> Enclosed:
+    """Matrices ``(..., a, d)`` times matrices ``(..., d, n)``."""
+    size, there = np.abs(left.mid), np.abs(right.mid)
+    rad = size @ (right.rad + rounding(size.shape[-1]) * there) + left.rad @ (there + right.rad)
+    return Enclosed(left.mid @ right.mid, rad * OUTWARD)
 
 
 @final

@@ -8,35 +8,36 @@ piece is a polynomial with balls as coefficients.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from itertools import product as every_choice
+from math import comb
 from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.arithmetic.series import Series, products
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.flow.law import Box
+from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.measurable import Side, Together, signed, swept
-from sparserob_core.checker.reach.varying.flow import VaryingFlow, products
-from sparserob_core.checker.reach.varying.loop import ORDER
-from sparserob_core.checker.reach.varying.spread import SpreadFlow
+from sparserob_core.checker.reach.states import enclosed, ring
+from sparserob_core.checker.reach.tube import Around
 from sparserob_core.checker.sets.along import Curve
+from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb_mat
 
-    from sparserob_core.checker.reach.flow import Flow
-    from sparserob_core.checker.reach.tube import Known
-    from sparserob_core.checker.sets.parameters import Corners
-
+ORDER = 8  # of the states in the time on a cell; what comes after counts twice, half of it takes shorter cells
 KEPT = 16  # nodes, up to which the transitions from every earlier one are remembered; cells come one after another
 PLACES_KEPT = 128  # parameters at which what errors do is remembered
 TIMES_KEPT = 4096  # times at which what errors make of the states is remembered
+MEANS = 1.0 / np.arange(1.0, 257.0)  # of |u|^p from -1 to 1
 
 
 @final
@@ -48,7 +49,7 @@ class VaryingExecution:
     ``side``: what enters by all columns at once, in the place of channels of their own; there is one share of 1 then,
     and integrals are those of its support function, which is not negative."""
 
-    law: VaryingFlow
+    law: Flow
     shares: Array
     breakpoints: Array
     pieces: Sequence[arb_mat]
@@ -63,8 +64,7 @@ class VaryingExecution:
     @cached_property
     def marks(self) -> list[float]:
         """Where a piece of the command begins or ends, or a segment of the system."""
-        last = float(self.breakpoints[-1])
-        return sorted({*self.breakpoints.tolist(), *(end for end in self.law.ends if 0.0 < end < last)})
+        return self.law.marks(self.breakpoints.tolist())
 
     @cached_property
     def owner(self) -> np.ndarray:
@@ -141,7 +141,8 @@ class VaryingExecution:
         last = int(np.searchsorted(begins, time, side="left")) - 1
         kernels, lines = [], []
         if (which < last).any():
-            begun = Enclosed.of(stacked([balls(row) for row in rows]) * self.law.over(self.marks[last], time)[0])
+            onwards = self.law.over(self.marks[last], time)[0].matrix
+            begun = Enclosed.of(exactly(rows) * onwards)
             past, onward = which[which < last], self._onward_to(last)
             found = _carried(begun, Enclosed(onward.mid[past], onward.rad[past]))
             kernels += [self._kernel(self.marks[k], self.marks[k + 1]) for k in past]
@@ -182,10 +183,10 @@ class VaryingExecution:
     def _kernel(self, start: float, stop: float) -> Enclosed:
         """That of an interval, in powers of ``u`` from -1 to 1 across it, ``(p + 1, d, m)``."""
         if (start, stop) not in self._kernels:
-            terms = pushes(self.law, start, stop, range(self.first, self.first + self.columns))
             if len(self._kernels) >= TIMES_KEPT:
                 self._kernels.clear()
-            self._kernels[start, stop] = Enclosed.all(terms, (len(terms), terms[0].nrows(), self.columns))
+            found = pushes(self.law, start, stop, slice(self.first, self.first + self.columns))
+            self._kernels[start, stop] = Enclosed(found.mid[:, 0], found.rad[:, 0])
         return self._kernels[start, stop]
 
     def _onward_to(self, node: int) -> Enclosed:
@@ -194,47 +195,49 @@ class VaryingExecution:
             found = products(self._steps[:node])[1:]
             if len(self._onward) >= KEPT:
                 self._onward.clear()
-            self._onward[node] = Enclosed.all(found, (node, *2 * (self.law.system.states,)))
+            whole = enclosed(found)
+            self._onward[node] = Enclosed(whole.mid[:, 0], whole.rad[:, 0])
         return self._onward[node]
 
     @cached_property
-    def _steps(self) -> list[arb_mat]:
+    def _steps(self) -> list[Series]:
         return [self.law.over(*ends)[0] for ends in pairwise(self.marks)]
 
 
-def pushes(law: VaryingFlow, start: float, stop: float, columns: Sequence[int]) -> list[arb_mat]:
-    """What some ``columns`` of ``[B E]`` make, at any time of an interval within one segment, of the state at its end,
-    times its length: coefficients ``(d, m)`` of powers of ``u`` from -1 to 1 across what is left of it."""
-    from flint import arb, arb_poly
+def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:
+    """What some ``columns`` of ``[B E]`` make, at any time of an interval without marks, of the state at its end, times
+    its length: coefficients ``(p + 1, M, d, m)`` of powers of ``u`` from -1 to 1 across what is left of it."""
+    from flint import arb, arb_mat
 
-    terms, half, none = law.kernel(start, stop), arb_poly([arb(1) / 2, arb(1) / 2]), arb(0)
-    every = [[arb_poly([one[i, j] for one in terms])(half).coeffs() for j in columns] for i in range(terms[0].nrows())]
-    return [
-        stacked([[entry[k] if k < len(entry) else none for entry in row] for row in every]) for k in range(len(terms))
-    ]
+    terms, off = law.kernel(start, stop)
+    d, (count, size) = law.states, (len(terms), terms[0].shape[1])
+    table = arb_mat([[x for part in term.parts for x in part.entries()] for term in terms])
+    weights = arb_mat([[arb(comb(n, j)) / 2**n for n in range(count)] for j in range(count)])
+    found = Enclosed.all([weights * table], (count, law.monomials.size, d, size))
+    found.rad[0, 0] += off
+    return Enclosed(found.mid[..., columns], found.rad[..., columns])
 
 
 def above_chord(
-    law: VaryingFlow, rows: Array, start: float, stop: float, begun: Array, size: Array, first: int
+    law: Flow, rows: Array, start: float, stop: float, begun: Array, size: Array, first: int
 ) -> Array:
     """How far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to the time may be above their chords on ``[start,
-    stop]``, which lies within one segment, for ``rows (r, d)``: ``(r,)``. Of every state they are at most ``begun
-    (d,)`` at the start, and ``size (m,)`` is what drives them through the columns of ``[B E]`` from the ``first`` one
-    on.
+    stop]``, which lies between two marks, for ``rows (r, d)``: ``(r,)``, at every parameter. Of every state they are at
+    most ``begun (d,)`` at the start, and ``size (m,)`` is what drives them through the columns of ``[B E]`` from the
+    ``first`` one on.
 
     An integrand that began before is ``|c'Phi(t, start) y|``, above its chord by no more than ``c'Phi(t, start) y``
     is from its own: its terms ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What begins within the
     cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
     """
     d, width = rows.shape[1], (stop - start) * (1.0 + rounding(2))
-    terms, rest = law.within(start, stop, ORDER)
-    lines, total = stacked([balls(row) for row in rows]), np.zeros(len(rows))
-    for n, term in enumerate([*terms[2:], rest], 2):
-        found = Enclosed.of(lines * stacked([row[:d] for row in term.tolist()]))
-        factor = 2.0 if n == len(terms) else (n - 1) * n ** (-n / (n - 1))
-        total += factor * ((np.abs(found.mid) + found.rad) @ begun)
+    terms, off = law.within(start, stop, start, stop, ORDER + 1)
+    lines, total = exactly(rows), 2.0 * (np.abs(rows) @ off[:, :d]) @ begun
+    for n, term in enumerate(terms[2:], 2):
+        found = enclosed([Series(term.monomials, [lines * part for part in term.columns(0, d).parts])])
+        total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(found.mid) + found.rad).sum(axis=(0, 1)) @ begun)
     if size.any():
-        (most, slope), units = law.most(start, stop), np.array(law.units_on(start, stop))
+        most, slope, units = law.sizes(start, stop)
         entering = slice(d + first, d + first + size.size)
         A, B = most[:, :d], most[:, entering]
         pace = float((A * units / units[:, None]).sum(axis=1).max())
@@ -258,7 +261,7 @@ class SpreadExecution:
     support function of a ``side`` in the place of the absolute value: of a sum it is not above the sum of both.
     """
 
-    law: SpreadFlow
+    flows: Flows
     shares: Array
     breakpoints: Array
     pieces: Sequence[arb_mat]
@@ -267,7 +270,7 @@ class SpreadExecution:
     numb: Sequence[int] = ()
     side: Side | Curve | Together | None = None
     _at: dict[tuple[float, ...], VaryingExecution] = field(default_factory=dict, repr=False)
-    _parts: dict[SpreadFlow, SpreadExecution] = field(default_factory=dict, repr=False)
+    _onward: dict[tuple[Box, float], tuple[Enclosed, Enclosed, np.ndarray]] = field(default_factory=dict, repr=False)
 
     def at(self, parameter: Sequence[float]) -> VaryingExecution:
         """That at one parameter."""
@@ -275,20 +278,13 @@ class SpreadExecution:
         if point not in self._at:
             if len(self._at) >= PLACES_KEPT:
                 self._at.clear()
-            law, enters = self.law.at(point), (self.first, self.off, self.numb, self.side)
+            law, enters = self.flows.at(point), (self.first, self.off, self.numb, self.side)
             self._at[point] = VaryingExecution(law, self.shares, self.breakpoints, self.pieces, *enters)
         return self._at[point]
 
-    def over(self, c: Array, times: Sequence[float], box: Corners, flow: Known | Flow) -> Spreading:
+    def over(self, c: Array, times: Sequence[float], box: Corners, flow: Around) -> Spreading:
         """What the worst errors add to ``c'x`` at one or two ``times``, between which there is no mark, over a ``box``
-        of parameters, which is in one part of all; ``flow`` has the monomials on it."""
-        part = next((law for inside, law in self.law.parted(box) if inside == box), None)
-        if part is None:
-            raise Unchecked("a box of parameters lies in several parts")
-        if part is not self.law:
-            if part not in self._parts:
-                self._parts[part] = replace(self, law=part, _parts={})
-            return self._parts[part].over(c, times, box, flow)
+        of parameters; ``flow`` has the monomials on it."""
         low, high, centre, radius = map(np.array, (*box, flow.centre, flow.radius))
         signs = np.array(list(every_choice((-1.0, 1.0), repeat=low.size)))
         corners = np.where(signs > 0.0, high, low).tolist()
@@ -305,55 +301,76 @@ class SpreadExecution:
         inside = np.minimum(high - centre, centre - low) * (1.0 - rounding(2))
         skew = float(((radius - inside) / np.where(radius > 0.0, radius, 1.0)).sum())
         rest += 2.0 * skew * float(np.ptp(middle, axis=0).max()) + rounding(4 * len(signs) + 8) * float(found.max())
-        wide, bent = self._curved(c, times, radius)
+        wide, lost, bent = self._curved(c, times, Box(flow.centre, flow.radius))
         least = np.array([self.at(centre.tolist()).added(c, time)[0] for time in times])
         over = max(0.0, float((middle.mean(axis=0) - least).max()))
         total = float(wide.sum()) * OUTWARD
-        lost = 2.0 * float(np.abs(c) @ self._lost)
-        return Spreading(ends, (off + rest + total + lost + bent) * OUTWARD, over * OUTWARD, wide)
+        return Spreading(ends, (off + rest + total + 2.0 * lost + bent) * OUTWARD, over * OUTWARD, wide)
 
-    def _curved(self, c: Array, times: Sequence[float], radius: Array) -> tuple[Array, float]:
-        """How far integrals may be above what is linear between corners whose halves are ``radius (nu,)``, by each
-        parameter, but for what is beyond the degree; and in the time above a chord between ``times``."""
-        law, sizes = self.law, self._sizes
-        place = min(max(0, int(np.searchsorted(self.breakpoints, times[0], side="right")) - 1), len(sizes) - 1)
-        piece = self._entering(sizes[place])
-        felt = np.where(np.isin(np.arange(c.size), list(self.numb)), 0.0, np.abs(c))
-        norms, lost = self._reached, self._lost
-        degrees = np.arange(float(norms.shape[1]))
-        shares = radius / np.where(np.array(law.parts.scales) > 0.0, law.parts.scales, 1.0) * (1.0 + rounding(4))
-        unit = float(felt @ law.units) * OUTWARD
-        second = float((norms @ (degrees * (degrees - 1.0))).max(initial=0.0))
-        wide = unit * second * shares**2 / 2.0
-        width = (times[-1] - times[0]) * (1.0 + rounding(2))
-        states = float(norms.sum(axis=1).max(initial=0.0)) + float((lost / law.units).max(initial=0.0))
-        bent = 0.0 if not width else width**2 / 8.0 * unit * law.bent(times[0], piece, states)
-        return wide * OUTWARD, bent * OUTWARD
+    def _curved(self, c: Array, times: Sequence[float], box: Box) -> tuple[Array, float, float]:
+        """How far integrals may be above what is linear between the corners of a box, by each parameter, but for what
+        is beyond the degree; how much that is; and in the time above a chord between ``times``."""
+        flow = self.flows.holding(box)
+        shares = np.array(box.halves) / np.where(np.array(flow.box.halves) > 0.0, flow.box.halves, 1.0)
+        shares, exponents = shares * (1.0 + rounding(4)), np.array(flow.monomials.exponents, dtype=float)
+        felt = np.where(np.isin(np.arange(c.size), list(self.numb)), 0.0, c)
+        wide, lost, curved = np.zeros(len(shares)), 0.0, exponents * (exponents - 1.0)
+        for time in times:
+            size, off = self._summed(flow, felt[None], time)
+            wide = np.maximum(wide, (size[0] @ curved) * shares**2 / 2.0)
+            lost = max(lost, float(off[0]))
+        bent = 0.0
+        if times[-1] > times[0]:
+            size, off = self._summed(flow, np.where(np.isin(np.arange(c.size), list(self.numb)), 0.0, np.eye(c.size)), times[0])
+            sizes = self._sizes
+            place = min(max(0, int(np.searchsorted(self.breakpoints, times[0], side="right")) - 1), len(sizes) - 1)
+            begun = size.sum(axis=1) + off
+            bent = float(above_chord(flow, felt[None], times[0], times[-1], begun, sizes[place], self.first)[0])
+        return wide * OUTWARD, lost * OUTWARD, bent * OUTWARD
+
+    def _summed(self, flow: Flow, rows: Array, time: float) -> tuple[Array, Array]:
+        """What errors add along ``rows (n, d)`` by a time, at most, and in absolute values: every coefficient in the
+        parameters ``(n, M)``, and what is beyond these ``(n,)``."""
+        key = flow.box, time
+        if key not in self._onward:
+            if len(self._onward) >= KEPT:
+                self._onward.clear()
+            self._onward[key] = self._reaching(flow, time)
+        onward, kernels, owner = self._onward[key]
+        size, off = np.zeros((len(rows), flow.monomials.size)), np.zeros(len(rows))
+        for q in range(len(owner)):
+            along = Enclosed(
+                *(np.einsum("nd,mde->mne", one, part[q])
+                  for one, part in ((rows, onward.mid), (np.abs(rows), onward.rad + rounding(rows.shape[1]) * np.abs(onward.mid))))
+            )  # fmt: skip
+            found = ring(flow.monomials, Enclosed(kernels.mid[q].swapaxes(-1, -2), kernels.rad[q].swapaxes(-1, -2)),
+                         Enclosed(along.mid.swapaxes(-1, -2), along.rad.swapaxes(-1, -2)))  # fmt: skip
+            entering = self._sizes[owner[q]]  # of u from -1 to 1, half of the interval
+            size += np.einsum("pmjn,j,p->nm", np.abs(found.mid), entering, MEANS[: len(found.mid)])
+            off += np.einsum("pmjn,j->n", found.rad, entering)
+        return size * OUTWARD, off * OUTWARD
+
+    def _reaching(self, flow: Flow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
+        """The transitions from the end of every interval between marks to a time, ``(q, M, d, d)``; the kernels of these
+        intervals, ``(q, p + 1, M, d, m)``; and the piece of the command that each is in."""
+        ends = [t for t in self.breakpoints.tolist() if t < time]
+        marks = flow.marks([*ends, time]) if ends else [time]
+        steps = [flow.over(*pair)[0] for pair in pairwise(marks)]
+        d, m = flow.states, int(self._sizes.shape[1])
+        if not steps:
+            none = np.zeros((2, 0, flow.monomials.size, d, d)), np.zeros((2, 0, 1, flow.monomials.size, d, m))
+            return Enclosed(*none[0]), Enclosed(*none[1]), np.zeros(0, dtype=int)
+        every = [pushes(flow, *pair, slice(self.first, self.first + m)) for pair in pairwise(marks)]
+        order = max(len(one.mid) for one in every)
+        pad = [[np.pad(part, ((0, order - len(part)), *[(0, 0)] * 3)) for part in (one.mid, one.rad)] for one in every]
+        owner = np.searchsorted(self.breakpoints, np.array(marks[:-1]), side="right") - 1
+        return enclosed(products(steps)[1:]), Enclosed(*(np.array(one) for one in zip(*pad, strict=True))), owner
 
     @cached_property
     def _sizes(self) -> Array:
         """How large what enters by every column may be on every piece, ``(K, m)``, at most."""
-        known = self.at(self.law.parts.middle)
+        known = self.at(self.flows.box.middle)
         return (known.sizes.mid + known.sizes.rad) * known.far * OUTWARD
-
-    @cached_property
-    def _inputs(self) -> Array:
-        """How large at any time, among all inputs."""
-        return self._entering(self._sizes.max(axis=0, initial=0.0))
-
-    def _entering(self, sizes: Array) -> Array:
-        """All inputs, of which those of its columns are of ``sizes (m,)`` and others 0."""
-        found = np.zeros(self.law.inputs)
-        found[self.first : self.first + sizes.size] = sizes
-        return found
-
-    @cached_property
-    def _reached(self) -> Array:
-        return self.law.reached(np.zeros(self.law.system.states), self._inputs)
-
-    @cached_property
-    def _lost(self) -> Array:
-        return self.law.lost(np.zeros(self.law.system.states), self._inputs)
 
 
 class Spreading(NamedTuple):

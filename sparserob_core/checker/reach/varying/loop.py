@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.series import around, stacked
+from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
-from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.preimages import Pushed
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
 
@@ -29,10 +29,10 @@ ORDER = 8  # of the states in the time on a cell; what comes after counts twice,
 class VaryingLoop(ClosedLoop):
     """The same of a system of which ``law`` is the flow."""
 
-    law: VaryingFlow | None = None
+    law: Flow | None = None
 
     @cached_property
-    def _flow(self) -> VaryingFlow:
+    def _flow(self) -> Flow:
         assert self.law is not None
         return self.law
 
@@ -52,16 +52,17 @@ class VaryingLoop(ClosedLoop):
 
     def _moved(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         Phi, Gamma, Delta = self._flow.over(start, stop)
-        both = stacked([[*one, *two] for one, two in zip(Gamma.tolist(), Delta.tolist(), strict=True)])
-        return Phi, both * self.drives[piece]
+        return Phi.matrix, Gamma.beside(Delta).matrix * self.drives[piece]
 
     def _passed(self, piece: int) -> tuple[arb_mat, arb_mat]:
         Phi, _, Delta = self._flow.over(self.grid[piece], self.grid[piece + 1])
-        return Phi, Delta
+        return Phi.matrix, Delta.matrix
 
     def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
         """As that of `ClosedLoop`, from which numbers are other than 0 at any time alone."""
-        A, E = (np.array(self._flow.links[name][0].tolist(), dtype=float) != 0.0 for name in ("A", "E"))
+        d, m = self._flow.states, self._flow.driven
+        there = np.any([one.sizes[0] > 0.0 for one in self._flow.law.stretches], axis=0)
+        A, E = there[:, :d], there[:, d + m :]
         pattern = E.astype(int) @ np.array([[bool(v) for v in vector] for vector in vectors]).T > 0
         for _ in range(len(A) - 1):
             pattern = pattern | (A.astype(int) @ pattern.astype(int) > 0)
@@ -70,13 +71,14 @@ class VaryingLoop(ClosedLoop):
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """As that of `ClosedLoop`, within one segment of the system: the states are a power series of the share ``s``
         of the cell, whose term ``a s^n`` is at most ``(n - 1) n^(-n / (n - 1)) |a|`` from its chord."""
-        terms, rest = self._flow.within(start, stop, ORDER)
+        terms, off = self._flow.within(start, stop, start, stop, ORDER + 1)
         both = stacked([*self.state(piece, start).tolist(), *self.drives[piece].tolist()])
         line, sizes = exactly(rows), np.concatenate([[1.0], self.radii])
         total = np.zeros((line.nrows(), sizes.size))
         for n, term in enumerate(terms[2:], 2):
-            found = Enclosed.of(line * (term * both))
+            found = Enclosed.of(line * (term.matrix * both))
             total += (np.abs(found.mid) + found.rad) * ((n - 1) * n ** (-n / (n - 1)) * OUTWARD)
-        found = Enclosed.of(line * (rest * both))  # at both ends too, of which the chord takes the larger share
+        # at both ends too, of which the chord takes the larger share
+        found = Enclosed.of(line * (around(off) * both))
         total += 2.0 * (np.abs(found.mid) + found.rad)
         return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)

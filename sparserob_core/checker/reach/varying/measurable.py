@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.checker.reach.measurable import Kernel, MeasurableLoop, as_enclosed
 from sparserob_core.checker.reach.varying.execution import above_chord, pushes
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
-from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -39,24 +39,24 @@ class VaryingMeasurableLoop(VaryingLoop, MeasurableLoop):
         if (start, stop) not in self._ways:
             if len(self._ways) >= KEPT:
                 self._ways.clear()
-            ends = [start, *(end for end in self._flow.ends if start < end < stop), stop]
-            every: list[list[arb_mat]] = []
-            onward = self._identity
+            ends = self._flow.marks([start, stop])
+            every, onward = list[Enclosed](), self._identity
             for first, last in reversed(list(pairwise(ends))):
                 terms = pushes(self._flow, first, last, self._entries)
-                every.append([onward * term for term in terms])
-                onward = onward * self._flow.over(first, last)[0]
-            most = max(map(len, every))
-            padded = [term for terms in every for term in (*terms, *[terms[0] * 0] * (most - len(terms)))]
-            found = Enclosed.all(padded, (len(every), most, self.system.states, self.width))
-            self._ways[start, stop] = Kernel(found.mid, found.rad.sum(axis=1) * OUTWARD, 0.5)
+                every.append(product(Enclosed.of(onward), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
+                onward = onward * self._flow.over(first, last)[0].matrix
+            most = max(len(one.mid) for one in every)
+            mid, rad = (
+                np.array([np.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in parts])
+                for parts in zip(*((one.mid, one.rad) for one in every), strict=True)
+            )
+            self._ways[start, stop] = Kernel(mid, rad.sum(axis=1) * OUTWARD, 0.5)
         return self._ways[start, stop]
 
     @property
-    def _entries(self) -> range:
+    def _entries(self) -> slice:
         """The columns of the disturbance in ``[B E]``."""
-        first = self.system.controls + (self.system.c is not None)
-        return range(first, first + self.width)
+        return slice(self._flow.driven, self._flow.driven + self.width)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """As of `VaryingLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
@@ -67,5 +67,5 @@ class VaryingMeasurableLoop(VaryingLoop, MeasurableLoop):
             ends = self.under_way(piece, start, axes)
             begun = np.maximum(ends.mid + ends.rad, 0.0) * OUTWARD
         states = begun.reshape(2, -1).max(axis=0)
-        more = above_chord(self._flow, rows, start, stop, states, size * OUTWARD, self._entries.start)
+        more = above_chord(self._flow, rows, start, stop, states, size * OUTWARD, self._flow.driven)
         return np.asarray((super().bent(piece, start, stop, rows) + more) * OUTWARD)

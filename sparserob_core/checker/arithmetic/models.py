@@ -1,0 +1,279 @@
+"""Numbers that depend on the time and on parameters: polynomials with balls as coefficients (Taylor models, Makino and
+Berz 2003)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.outcome import Unchecked
+
+if TYPE_CHECKING:
+    from flint import arb, arb_poly, arb_series
+
+LARGEST_POWER = 64  # of a natural number, what is multiplied out
+ENOUGH = 2.0**-110  # of a function, what its series may leave out: less takes terms that nothing shows
+NEWTON = 80  # steps, each halves at least; with a tenth of them long ellipses get wide balls
+
+Part: TypeAlias = "arb_poly | None"
+
+
+@final
+@dataclass(frozen=True)
+class Frame:
+    """What models are polynomials of: the time, from -1 to 1 across an interval, up to an ``order``; and the
+    ``monomials`` of parameters, from -1 to 1 across a box."""
+
+    monomials: Monomials
+    order: int
+
+
+@final
+class Model:
+    """``sum_k parts_k(r) s^k``, ``r`` the time and ``s`` the parameters: at every ``(r, s)`` the number is one that the
+    balls allow. What products have beyond the frame is in the balls before their lowest powers, since ``|r|, |s| <=
+    1``."""
+
+    __slots__ = ("frame", "parts")
+
+    def __init__(self, frame: Frame, parts: Sequence[Part]) -> None:
+        self.frame, self.parts = frame, list(parts)
+
+    @staticmethod
+    def number(frame: Frame, value: arb) -> Model:
+        """What depends on nothing."""
+        from flint import arb_poly
+
+        return Model(frame, [arb_poly([value]), *[None] * (frame.monomials.size - 1)])
+
+    @staticmethod
+    def time(frame: Frame, middle: arb, half: arb) -> Model:
+        """``middle + half r``."""
+        from flint import arb_poly
+
+        return Model(frame, [arb_poly([middle, half]), *[None] * (frame.monomials.size - 1)])
+
+    @staticmethod
+    def parameter(frame: Frame, place: int, middle: arb, half: arb) -> Model:
+        """``middle + half s_place``."""
+        from flint import arb_poly
+
+        found = Model.number(frame, middle)
+        if not half.is_zero():
+            found.parts[frame.monomials.linear(place)] = arb_poly([half])
+        return found
+
+    @property
+    def size(self) -> arb:
+        """The most that it can be."""
+        from flint import arb
+
+        return sum((_size(part) for part in self.parts if part is not None), arb(0))
+
+    def _other(self, value: object) -> Model:
+        from flint import arb
+
+        if isinstance(value, Model):
+            return value
+        if isinstance(value, int | float | np.integer | np.floating):
+            return Model.number(self.frame, arb(float(value)))
+        raise Unchecked(f"an entry of the system holds a {type(value).__name__}, expected a number")
+
+    def __add__(self, other: object) -> Model:
+        pairs = zip(self.parts, self._other(other).parts, strict=True)
+        return Model(self.frame, [a if b is None else b if a is None else a + b for a, b in pairs])
+
+    def __neg__(self) -> Model:
+        return Model(self.frame, [None if part is None else -part for part in self.parts])
+
+    def __pos__(self) -> Model:
+        return self
+
+    def __sub__(self, other: object) -> Model:
+        return self + -self._other(other)
+
+    def __rsub__(self, other: object) -> Model:
+        return self._other(other) - self
+
+    def __mul__(self, other: object) -> Model:
+        right, monomials = self._other(other).parts, self.frame.monomials
+        found: list[Part] = [None] * monomials.size
+        for a, pairs in zip(self.parts, monomials.products_with, strict=True):
+            for j, k in () if a is None else pairs:
+                b, total = right[j], found[k]
+                if b is not None:
+                    found[k] = a * b if total is None else total + a * b
+        return Model(self.frame, found)._within(_beyond(monomials, self.parts, right))
+
+    def _within(self, beyond: arb) -> Model:
+        """The model up to its order in the time, and a number that is at most so large."""
+        from flint import arb, arb_poly
+
+        parts = list(self.parts)
+        for k, part in enumerate(parts):
+            if part is not None and part.length() > self.frame.order + 1:
+                rest = sum(map(abs, part.coeffs()[self.frame.order + 1 :]), arb(0))
+                parts[k] = part.truncate(self.frame.order + 1) + arb_poly([arb(0, rest.upper())])
+        if not beyond.is_zero():
+            ball, first = arb_poly([arb(0, beyond.upper())]), parts[0]
+            parts[0] = ball if first is None else first + ball
+        return Model(self.frame, parts)
+
+    def __truediv__(self, other: object) -> Model:
+        return self * self._other(other)._through(lambda series: 1 / series)
+
+    def __rtruediv__(self, other: object) -> Model:
+        return self._other(other) / self
+
+    def __pow__(self, other: object) -> Model:
+        if isinstance(other, int | float | np.integer | np.floating) and float(other).is_integer():
+            count = int(other)
+            if abs(count) <= LARGEST_POWER:
+                found, base = self._other(1.0), self
+                for _ in range(abs(count)):
+                    found = found * base
+                return found if count >= 0 else 1.0 / found
+        return (self._other(other) * self.log()).exp()
+
+    def __rpow__(self, other: object) -> Model:
+        return self._other(other) ** self
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def _through(self, function: Callable[[arb_series], Any]) -> Model:
+        """A function of it: its Taylor polynomial at an exact number in the middle, with Lagrange's remainder."""
+        from flint import arb, arb_series, ctx
+
+        first = self.parts[0]
+        c = arb(first[0].mid()) if first is not None and first.length() else arb(0)
+        away = self - Model.number(self.frame, c)
+        far, count = away.size.upper(), self.frame.order + self.frame.monomials.degree + 1
+        before, ctx.cap = ctx.cap, count + 1
+        try:
+            near, wide = (function(arb_series([at, 1], count + 1)) for at in (c, arb(c, far)))
+            coefficients, bounds = ([one[k] for k in range(count + 1)] for one in (near, wide))
+        except (ValueError, ZeroDivisionError) as error:
+            raise Unchecked(f"an entry of the system is not finite ({error})") from error
+        finally:
+            ctx.cap = before
+        if not all(one.is_finite() for one in (*coefficients, *bounds)):
+            raise Unchecked("an entry of the system is not finite")
+        power, rests, wanted = arb(1), [], arb(ENOUGH) * abs(coefficients[0])
+        for bound in bounds[1:]:
+            power = power * far
+            rests.append((abs(bound) * power).upper())
+        least = min(range(count), key=lambda k: float(rests[k]))
+        order = next((k for k, rest in enumerate(rests) if rest <= wanted), least)
+        found = Model.number(self.frame, coefficients[order])
+        for coefficient in reversed(coefficients[:order]):
+            found = found * away + Model.number(self.frame, coefficient)
+        return found._within(rests[order])
+
+    def exp(self) -> Model:
+        return self._through(lambda s: s.exp())
+
+    def sin(self) -> Model:
+        return self._through(lambda s: s.sin())
+
+    def cos(self) -> Model:
+        return self._through(lambda s: s.cos())
+
+    def tan(self) -> Model:
+        return self._through(lambda s: _steep(s, s[0].tan(), 1 / s[0].cos() ** 2, 1))
+
+    def log(self) -> Model:
+        return self._through(lambda s: s.log())
+
+    def sqrt(self) -> Model:
+        return self._through(lambda s: s.sqrt())
+
+    def tanh(self) -> Model:
+        return self._through(lambda s: _steep(s, s[0].tanh(), s[0].sech() ** 2, -1))
+
+    def kepler(self, eccentricity: float) -> Model:
+        """The ``E`` with ``E - e sin E`` equal to it."""
+        return self._through(lambda s: kepler_series(s, eccentricity, s.prec))
+
+
+def _size(part: arb_poly) -> arb:
+    from flint import arb
+
+    return sum(map(abs, part.coeffs()), arb(0))
+
+
+def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -> arb:
+    """How large the terms of a product are whose degree in the parameters is more than is kept."""
+    from flint import arb
+
+    if not monomials.degree:
+        return arb(0)
+    sizes = [[arb(0)] * (monomials.degree + 1) for _ in range(2)]
+    for side, parts in zip(sizes, (left, right), strict=True):
+        for degree, part in zip(monomials.degrees, parts, strict=True):
+            if part is not None:
+                side[degree] = side[degree] + _size(part)
+    total = arb(0)
+    for i, size in enumerate(sizes[0]):
+        if i and not size.is_zero():
+            total = total + size * sum(sizes[1][monomials.degree + 1 - i :], arb(0))
+    return total
+
+
+def _steep(argument: arb_series, value: arb, slope: arb, sign: int) -> arb_series:
+    """The tangent of ``c + s``, or with the ``sign`` -1 the hyperbolic one, from its value and its slope at ``c``: ``g'
+    = h`` and ``h = 1 + sign g g``, so that ``h' = 2 sign g h``; of wide balls less is lost than by quotients."""
+    from flint import arb_series
+
+    g, h = [value], [slope]
+    for n in range(argument.prec - 1):
+        h.append(2 * sign * sum((g[k] * h[n - k] for k in range(n + 1)), value * 0) / (n + 1))
+        g.append(h[n] / (n + 1))
+    return arb_series(g, argument.prec)
+
+
+def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_series:
+    """The first ``length`` terms of the ``E`` with ``E - e sin E`` equal to a series ``M``, whatever number of a ball
+    its constant is: from ``E' = M' + e E' cos E``, term by term."""
+    from flint import arb, arb_series
+
+    e, M = arb(eccentricity), anomaly[0]
+    E = [kepler_root(arb(M.lower()), e).union(kepler_root(arb(M.upper()), e))]  # E increases with M
+    s, c = [E[0].sin()], [E[0].cos()]
+    slope = 1 - e * c[0]
+    for n in range(length - 1):
+        moved = [(k + 1) * one for k, one in enumerate(E[1:])]
+        pushed = sum((moved[k] * c[n - k] for k in range(n)), arb(0))
+        E.append(((n + 1) * anomaly[n + 1] + e * pushed) / (slope * (n + 1)))
+        moved.append((n + 1) * E[-1])
+        s.append(sum((moved[k] * c[n - k] for k in range(n + 1)), arb(0)) / (n + 1))
+        c.append(-sum((moved[k] * s[n - k] for k in range(n + 1)), arb(0)) / (n + 1))
+    return arb_series(E, length)
+
+
+def kepler_root(anomaly: arb, e: arb) -> arb:
+    """A ball around the ``E`` with ``E - e sin E = M`` of a number ``M``: by Newton's method, and then as far to either
+    side as the sign of the equation shows."""
+    from flint import arb, ctx
+
+    E = anomaly
+    low, high = anomaly - e, anomaly + e
+    for _ in range(NEWTON):
+        missed = arb((E - e * E.sin() - anomaly).mid())
+        if missed > 0:
+            high = E
+        else:
+            low = E
+        E = arb((E - missed / (1 - e * E.cos())).mid())
+        if not (low <= E <= high):
+            E = arb(((low + high) / 2).mid())
+    width = arb(2) ** (8 - ctx.prec) * (1 + abs(anomaly))
+    for _ in range(ctx.prec):
+        below, above = E - width, E + width
+        if below - e * below.sin() < anomaly and above - e * above.sin() > anomaly:
+            return below.union(above)
+        width = 4 * width
+    raise Unchecked("Kepler's equation is not solved")

@@ -1,0 +1,85 @@
+"""The monomials of polynomials in parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from typing import final
+
+
+@final
+@dataclass(frozen=True)
+class Monomials:
+    """The monomials of at most ``degree`` in ``count`` variables, by degree; number 0 is the constant."""
+
+    count: int
+    degree: int
+
+    @property
+    def exponents(self) -> list[tuple[int, ...]]:
+        """Exponent vectors, in increasing degree."""
+        return _exponents(self.count, self.degree)
+
+    @property
+    def number(self) -> dict[tuple[int, ...], int]:
+        """The place of an exponent vector."""
+        return _places(self.count, self.degree)
+
+    @property
+    def products(self) -> list[tuple[int, int, int]]:
+        """All ``(i, j, k)`` with monomial ``i`` times monomial ``j`` equal to monomial ``k``."""
+        return _products(self.count, self.degree)
+
+    @property
+    def products_with(self) -> list[list[tuple[int, int]]]:
+        """The same for every monomial ``i``: all ``(j, k)``."""
+        return _products_with(self.count, self.degree)
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return len(self.exponents)
+
+    @property
+    def degrees(self) -> list[int]:
+        """The degree of every monomial."""
+        return [sum(e) for e in self.exponents]
+
+    def linear(self, variable: int) -> int:
+        """The place of a variable alone."""
+        return self.number[tuple(int(i == variable) for i in range(self.count))]
+
+
+NONE = Monomials(0, 0)
+
+
+@lru_cache(maxsize=64)
+def _exponents(count: int, degree: int) -> list[tuple[int, ...]]:
+    every = [e for e in product(range(degree + 1), repeat=count) if sum(e) <= degree]
+    return sorted(every, key=lambda e: (sum(e), e))
+
+
+@lru_cache(maxsize=64)
+def _places(count: int, degree: int) -> dict[tuple[int, ...], int]:
+    return {e: i for i, e in enumerate(_exponents(count, degree))}
+
+
+@lru_cache(maxsize=64)
+def _products_with(count: int, degree: int) -> list[list[tuple[int, int]]]:
+    found: list[list[tuple[int, int]]] = [[] for _ in _exponents(count, degree)]
+    for i, j, k in _products(count, degree):
+        found[i].append((j, k))
+    return found
+
+
+@lru_cache(maxsize=64)
+def _products(count: int, degree: int) -> list[tuple[int, int, int]]:
+    places, every = _places(count, degree), _exponents(count, degree)
+    return [
+        (i, j, places[g])
+        for i, e in enumerate(every)
+        for j, f in enumerate(every)
+        if sum(e) + sum(f) <= degree
+        for g in [tuple(a + b for a, b in zip(e, f, strict=True))]
+    ]

@@ -1,0 +1,1 @@
+"""The flow of the system: guessed in numbers, verified in balls."""

@@ -1,0 +1,227 @@
+"""The flow of a system over one box of parameters: what any time makes of its states and of inputs that stay the
+same."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from math import ceil
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import difference
+from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.arithmetic.series import OUTWARD, Series, products, zeros
+from sparserob_core.checker.flow.law import Box, Law
+from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.flow.segment import Segment, solve
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+KEPT = 4096  # parts of the horizon whose flows are remembered
+POINTS_KEPT = 256  # flows at single parameters
+LONGER = 1.0 + 2.0**-30  # than the parts of time, whose ends are rounded, is the time of which the flow is verified
+ENOUGH = 2.0**-64  # of a kernel, which goes on as numbers of 53 bits, what its last terms may be: 2^-54 would show
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """What a state at a time is made of: ``free`` times the state at 0, and ``control`` and ``disturbance`` times the
+    inputs on every piece of a grid."""
+
+    free: arb_mat
+    control: list[arb_mat]
+    disturbance: list[arb_mat]
+
+
+@final
+@dataclass(eq=False)
+class Flow:
+    """The system ``x' = A x + B u + E w`` from 0 to ``until``, at every parameter of a ``box``; a drift is one more
+    column of ``B``, whose input is always 1. To a ``degree`` in the parameters, of which there may be none; between
+    the marks of a ``timing`` where there is one."""
+
+    plant: Plant
+    until: float
+    box: Box = Box()  # noqa: RUF009  immutable
+    degree: int = 0
+    timing: Law | None = None
+    _segments: dict[tuple[float, float], Segment] = field(default_factory=dict, repr=False)
+    _over: dict[tuple[float, float], tuple[Series, Series]] = field(default_factory=dict, repr=False)
+    _ends: dict[tuple[int, tuple[float, float]], Series] = field(default_factory=dict, repr=False)
+    _points: dict[tuple[float, ...], Flow] = field(default_factory=dict, repr=False)
+    _weights: dict[tuple[float, ...], Weights] = field(default_factory=dict, repr=False)
+
+    def at(self, parameter: Sequence[float]) -> Flow:
+        """The flow at one parameter."""
+        point = tuple(map(float, parameter))
+        if point == self.box.middle and not self.degree:
+            return self
+        if point not in self._points:
+            if len(self._points) >= POINTS_KEPT:
+                self._points.clear()
+            self._points[point] = Flow(self.plant, self.until, Box(point, (0.0,) * len(point)))
+        return self._points[point]
+
+    @cached_property
+    def law(self) -> Law:
+        """The law of the system on the box."""
+        return Law(self.plant, self.until, self.box, self.degree, self.timing)
+
+    @property
+    def monomials(self) -> Monomials:
+        """Those of the parameters."""
+        return self.law.monomials
+
+    @property
+    def states(self) -> int:
+        """How many states there are."""
+        return self.plant.states
+
+    @property
+    def driven(self) -> int:
+        """How many inputs there are before the disturbances: controls, and a drift."""
+        return self.plant.driven
+
+    @cached_property
+    def _begins(self) -> list[float]:
+        return [one.start for one in self.law.stretches]
+
+    def _place(self, start: float, stop: float) -> int:
+        """The stretch that holds an interval; raises `Unchecked` where none does."""
+        if not 0.0 <= start <= stop <= self.until:
+            raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
+        place = max(0, bisect_right(self._begins, start) - 1)
+        if stop > self.law.stretches[place].stop:
+            raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
+        return place
+
+    def marks(self, times: Sequence[float]) -> list[float]:
+        """Increasing times with others between them, such that the flow is a polynomial from each to the next."""
+        found = [times[0]]
+        for start, stop in pairwise(times):
+            ends = [one for one in self._begins if start < one < stop]
+            for a, b in pairwise([start, *ends, stop]):
+                stretch = self.law.stretches[self._place(a, b)]
+                count = ceil((b - a) / stretch.stride * (1.0 - 1e-14)) if stretch.is_still else 1
+                found += [float(t) for t in np.linspace(a, b, max(1, count) + 1)[1:-1]] + [b]
+        return found
+
+    def _segment(self, start: float, stop: float) -> tuple[Segment, arb]:
+        """The flow from ``start`` on, and which share of it has passed at ``stop``."""
+        from flint import arb
+
+        place = self._place(start, stop)
+        stretch = self.law.stretches[place]
+        key, length = (start, stop), arb(1)
+        if stretch.is_still:  # of all lengths one flow
+            key = (-1.0, stretch.start)
+            length = (arb(stop) - arb(start)) / arb(stretch.stride * LONGER)
+        if key not in self._segments:
+            if len(self._segments) >= KEPT:
+                self._segments.clear()
+            ends = (0.0, stretch.stride * LONGER) if stretch.is_still else key
+            self._segments[key] = solve(*stretch.between(*ends), stretch.units)
+        if not length <= 1:
+            raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
+        return self._segments[key], length
+
+    def kind(self, start: float, stop: float) -> tuple[int, tuple[float, float]]:
+        """Intervals of one kind have one flow."""
+        place = self._place(start, stop)
+        still = self.law.stretches[place].is_still
+        return (place, difference(stop, start)) if still else (-1 - place, (start, stop))
+
+    def step(self, start: float, stop: float) -> Series:
+        """``[Phi Gamma]``, what an interval from one mark to the next makes of states and of inputs."""
+        key = self.kind(start, stop)
+        if key not in self._ends:
+            if len(self._ends) >= KEPT:
+                self._ends.clear()
+            segment, share = self._segment(start, stop)
+            self._ends[key] = segment.at(share)
+        return self._ends[key]
+
+    def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
+        """What an interval makes of a state, of controls that stay the same (a drift among them), and of such
+        disturbances."""
+        if (start, stop) not in self._over:
+            whole: tuple[Series, Series] | None = None
+            for a, b in pairwise(self.marks([start, stop])):
+                part = self.step(a, b)
+                Phi, pushed = part.columns(0, self.states), part.columns(self.states, None)
+                whole = (Phi, pushed) if whole is None else (Phi * whole[0], Phi * whole[1] + pushed)
+            assert whole is not None
+            if len(self._over) >= KEPT:
+                self._over.clear()
+            self._over[start, stop] = whole
+        Phi, pushed = self._over[start, stop]
+        return Phi, pushed.columns(0, self.driven), pushed.columns(self.driven, None)
+
+    def within(
+        self, begin: float, end: float, start: float, stop: float, order: int
+    ) -> tuple[list[Series], Array]:
+        """What the time from ``begin`` on makes of states and of inputs that stay the same, on ``[start, stop]`` within
+        ``[begin, end]``, on which the flow is a polynomial: so many terms in the share of the interval, ``(d, d + w)``
+        each, and by how much they are off at most."""
+        from flint import arb
+
+        segment, share = self._segment(begin, end)
+        if begin == end:
+            return segment.within(arb(0), arb(0), order)
+        length = arb(end) - arb(begin)
+        first, width = ((arb(b) - arb(a)) / length * share for a, b in ((begin, start), (start, stop)))
+        return segment.within(first, width, order)
+
+    def kernel(self, start: float, stop: float) -> tuple[list[Series], Array]:
+        """What inputs at any time ``s`` on an interval without marks make of the state at its end: ``h Phi(stop, s) [B
+        E](s)`` as terms ``(d, w)`` in the share of the interval that is left at ``s``, and by how much they are off at
+        most. The rows of ``Phi(stop, s)`` are the flow of the transposed system, backwards."""
+        stretch = self.law.stretches[self._place(start, stop)]
+        A, F = stretch.between(start, stop, backwards=True)
+        none = Series.constant(self.monomials, zeros(self.states, 0))
+        rows = solve([one.transpose() for one in A], [none], 1.0 / stretch.units)
+        back, w = [one.transpose() for one in rows.terms], F[0].shape[1]
+        wanted = max(float((one.size / stretch.units[:, None]).max(initial=0.0)) for one in F) * ENOUGH
+        inputs, found, off = [one.size for one in F], list[Series](), np.zeros((self.states, w))
+        off += rows.off.T @ np.sum(inputs, axis=0)
+        sizes = [one.size for one in back]
+        for n in range(len(back) + len(F) - 1):
+            pairs = [(n - k, k) for k in range(len(F)) if 0 <= n - k < len(back)]
+            bound = sum((sizes[i] @ inputs[k] for i, k in pairs), np.zeros((self.states, w)))
+            if n and float((bound / stretch.units[:, None]).max(initial=0.0)) * 2.0 <= wanted:
+                off += bound
+                continue
+            term = back[pairs[0][0]] * F[pairs[0][1]]
+            for i, k in pairs[1:]:
+                term = term + back[i] * F[k]
+            while len(found) < n:
+                found.append(Series.constant(self.monomials, zeros(self.states, w)))
+            found.append(term)
+        return found, off * OUTWARD
+
+    def sizes(self, start: float, stop: float) -> tuple[Array, Array, Array]:
+        """The largest absolute values of ``[A B E]`` and of its derivative on the stretch that an interval is in, ``(d,
+        d + w)`` each, and the units of the states in which it is small there."""
+        stretch = self.law.stretches[self._place(start, stop)]
+        return *stretch.sizes, stretch.units
+
+    def weights(self, grid: Sequence[float]) -> Weights:
+        """What the state at the end of a grid, which begins at 0, is made of, where the parameters are known."""
+        key = tuple(grid)
+        if key not in self._weights:
+            parts = [self.over(*ends) for ends in pairwise(grid)]
+            after = products([part[0] for part in parts])
+            control, disturbance = (
+                [(Z * part[i]).matrix for Z, part in zip(after[1:], parts, strict=True)] for i in (1, 2)
+            )
+            self._weights[key] = Weights(after[0].matrix, control, disturbance)
+        return self._weights[key]

@@ -1,0 +1,117 @@
+"""The flows of an uncertain system: over boxes of parameters, and at single ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.law import Box, Law
+from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.outcome import Unchecked
+
+DEGREES = {0: 0, 1: 12, 2: 7, 3: 5, 4: 3}  # of expansions in so many parameters; 2 beyond
+CLOSE = 1e-11  # of transitions over the horizon, what an expansion may leave out that serves smaller boxes too
+HALVINGS = 10  # of the box of all parameters, until a box has a flow of its own
+KEPT = 64  # flows over boxes
+
+
+@final
+@dataclass(eq=False)
+class Flows:
+    """The flows of a ``plant`` up to the time ``until``, whose parameters are in a ``box``."""
+
+    plant: Plant
+    until: float
+    box: Box = Box()  # noqa: RUF009  immutable
+    _made: dict[Box, Flow] = field(default_factory=dict, repr=False)
+    _close: dict[Box, bool] = field(default_factory=dict, repr=False)
+
+    def at(self, parameter: Sequence[float]) -> Flow:
+        """The flow at one parameter, of which there may be none."""
+        return self._points.at(parameter)
+
+    @cached_property
+    def _points(self) -> Flow:
+        return Flow(self.plant, self.until)
+
+    @property
+    def degree(self) -> int:
+        """That of expansions over boxes."""
+        return DEGREES.get(len(self.box.middle), 2)
+
+    def over(self, box: Box) -> Flow:
+        """The flow over a box."""
+        if not self.degree:
+            return self.at(())
+        if box not in self._made:
+            if len(self._made) >= KEPT:
+                self._made.pop(next(iter(self._made)))
+            self._made[box] = Flow(self.plant, self.until, box, self.degree, self.timing)
+        return self._made[box]
+
+    @cached_property
+    def timing(self) -> Law:
+        """The law in the middle of all parameters, whose stretches are those of all boxes."""
+        return self.at(self.box.middle).law
+
+    def holding(self, box: Box) -> Flow:
+        """A flow over a box, or over a larger one where the expansion is close over all of that."""
+        part = self.box
+        for _ in range(HALVINGS if self.degree else 0):
+            if part == box or not part.holds(box):
+                break
+            if self._is_close(part):
+                return self.over(part)
+            part = next((half for half in part.halved(self._axis(part)) if half.holds(box)), box)
+        return self.over(box)
+
+    def _is_close(self, box: Box) -> bool:
+        """Whether little is left out over a box."""
+        if box not in self._close:
+            try:
+                flow = self.over(box)
+                Phi, units = flow.over(0.0, self.until)[0], flow.law.units
+                off = np.array([[float(x.rad()) for x in row] for row in Phi.parts[0].tolist()])
+                size, lost = ((one * units / units[:, None]).max() for one in (Phi.size, off))
+                self._close[box] = bool(lost <= CLOSE * max(1.0, size))
+            except Unchecked:
+                self._close[box] = False
+        return self._close[box]
+
+    def _axis(self, box: Box) -> int:
+        """The parameter that moves the system most across a box."""
+        try:
+            law = Law(self.plant, self.until, box, 1, self.timing)
+            sizes = np.zeros(len(box.middle))
+            for one in law.stretches:
+                u = law.units
+                for j in range(sizes.size):
+                    table = one.table[law.monomials.linear(j)]
+                    size = np.array([[sum(float(c.abs_upper()) for c in e.coeffs()) for e in row] for row in table])
+                    sizes[j] += (one.stop - one.start) * (size[:, : len(u)] * u / u[:, None]).sum(axis=1).max()
+            return int(sizes.argmax()) if sizes.any() else int(np.argmax(box.halves))
+        except Unchecked:
+            return int(np.argmax(box.halves))
+
+    @cached_property
+    def links(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which entries of ``[A B E]`` are other than 0 at any time and parameter, and which depend on the
+        parameters."""
+        law = Law(self.plant, self.until, self.box, min(1, self.degree), self.timing)
+        there, moved = [], []
+        for one in law.stretches:
+            first, *others = one.table
+            there.append(one.sizes[0] > 0.0)
+            moved.append([[any(part[i][j].length() for part in others) or _is_wide(first[i][j])
+                           for j in range(len(first[0]))] for i in range(len(first))])  # fmt: skip
+        return np.any(there, axis=0), np.any(moved, axis=0) & (self.degree > 0)
+
+
+def _is_wide(entry: object) -> bool:
+    """Whether a number is known less closely than rounding makes it."""
+    return any(float(one.rad()) > 2.0**-60 * float(abs(one).upper()) for one in entry.coeffs())  # type: ignore[attr-defined]

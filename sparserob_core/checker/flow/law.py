@@ -1,0 +1,261 @@
+"""The law of a system, ``[A B c E]``, on stretches of time and over one box of parameters: polynomials that enclose
+it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cached_property
+from itertools import pairwise
+from math import ceil, floor, inf, log2
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.models import Frame, Model
+from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
+from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked
+from sparserob_core.checker.flow.plant import Phase, Plant
+from sparserob_core.checker.flow.segment import SHARP
+from sparserob_core.checker.flow.units import balanced
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb_poly
+
+ORDER = 24  # of the law in time on a stretch; with a tenth of it stretches are a million times shorter
+LONG = 2.0  # norm of the system times the length of a stretch; ten times more takes more terms than there are
+SHORTER = 0.5  # of `LONG`, to which a slow part is brought: ten times less doubles digits lost, 1 takes more terms
+FIRST = 8  # stretches of what changes with time, to begin with
+SHORTEST = 2.0**-30  # of the horizon: a shorter stretch holds a pole
+
+
+@final
+@dataclass(frozen=True)
+class Box:
+    """A box of parameters: its ``middle (nu,)``, exact numbers, and ``halves (nu,)`` of its widths, or more."""
+
+    middle: tuple[float, ...] = ()
+    halves: tuple[float, ...] = ()
+
+    @staticmethod
+    def between(low: Sequence[float], high: Sequence[float]) -> Box:
+        """That between two corners."""
+        ends = [(a, b, (a + b) / 2) for a, b in zip(map(float, low), map(float, high), strict=True)]
+        halves = [0.0 if a == b else float(np.nextafter(max(b - m, m - a), np.inf)) for a, b, m in ends]
+        return Box(tuple(m for _, _, m in ends), tuple(halves))
+
+    def wider(self, extra: Sequence[float] | Array) -> Box:
+        """The box with so much more at either side."""
+        more = [h + float(x) for h, x in zip(self.halves, extra, strict=True)]
+        return Box(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more)) if any(extra) else self
+
+    def holds(self, other: Box) -> bool:
+        """Whether another box is in this one; exactly, where sums of two floats are rounded."""
+        for m, h, n, k in zip(self.middle, self.halves, other.middle, other.halves, strict=True):
+            if abs(Fraction(n) - Fraction(m)) + Fraction(k) > Fraction(h):
+                return False
+        return True
+
+    def halved(self, axis: int) -> list[Box]:
+        """Both halves across a parameter, each a little larger than half."""
+        found = []
+        for sign in (-0.5, 0.5):
+            middle, halves = list(self.middle), list(self.halves)
+            middle[axis] += sign * halves[axis]
+            halves[axis] *= 0.5 * (1.0 + 1e-9)
+            found.append(Box(tuple(middle), tuple(halves)))
+        return found
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """The law from ``start`` to ``stop``: for every monomial of the parameters a table ``(d, d + w)`` of polynomials in
+    the time, from -1 to 1 across the stretch. ``units (d,)`` of the states, in which it is small there; within a
+    ``stride``, a power of two, it moves the states by little."""
+
+    start: float
+    stop: float
+    frame: Frame
+    table: list[list[list[arb_poly]]]
+    units: Array
+    stride: float = inf
+
+    @cached_property
+    def is_still(self) -> bool:
+        """Whether nothing changes with time."""
+        return all(entry.length() <= 1 for part in self.table for row in part for entry in row)
+
+    def between(self, start: float, stop: float, backwards: bool = False) -> tuple[list[Series], list[Series]]:
+        """``A`` and ``[B c E]`` times the length of a part of the stretch, as polynomials in the share of it that has
+        passed, or ``backwards`` in that which is left: a series for each power."""
+        from flint import arb, arb_poly
+
+        half, length = (arb(self.stop) - arb(self.start)) / 2, arb(stop) - arb(start)
+        begin = (arb(stop if backwards else start) - (arb(self.start) + arb(self.stop)) / 2) / half
+        shifted, d = arb_poly([begin, (-length if backwards else length) / half]), len(self.table[0])
+        parts = [[[(entry(shifted) * length).coeffs() for entry in row] for row in part] for part in self.table]
+        order, none = max(1, *(len(entry) for part in parts for row in part for entry in row)), arb(0)
+        every = []
+        for k in range(order):
+            tables = [[[e[k] if k < len(e) else none for e in row] for row in part] for part in parts]
+            every.append(Series(self.frame.monomials, list(map(stacked, tables))))
+        return _kept([one.columns(0, d) for one in every], self.units), [one.columns(d, None) for one in every]
+
+    @cached_property
+    def sizes(self) -> tuple[Array, Array]:
+        """The largest absolute values of the law and of its derivative in time, ``(d, d + w)`` each."""
+        half = (self.stop - self.start) / 2.0
+        found = np.zeros((2, len(self.table[0]), len(self.table[0][0])))
+        for part in self.table:
+            for i, row in enumerate(part):
+                for j, entry in enumerate(row):
+                    for n, one in enumerate(entry.coeffs()):
+                        size = float(one.abs_upper()) * OUTWARD
+                        found[:, i, j] += size, size * n / half
+        return found[0] * OUTWARD, found[1] * OUTWARD
+
+
+def _kept(A: list[Series], units: Array) -> list[Series]:
+    """The powers of which more is left than nothing; those beyond are in the balls of the first."""
+    sizes = [one.size for one in A]
+    paces = [float((size * units / units[:, None]).sum(axis=1).max(initial=0.0)) for size in sizes]
+    kept = len(A)
+    while kept > 1 and sum(paces[kept - 1 :]) <= SHARP:
+        kept -= 1
+    return A if kept == len(A) else [A[0].within(np.sum(sizes[kept:], axis=0) * OUTWARD), *A[1:kept]]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Law:
+    """The law of a ``plant`` up to the time ``until`` over a ``box`` of parameters, to a ``degree`` in these; on the
+    stretches of a ``timing`` where there is one."""
+
+    plant: Plant
+    until: float
+    box: Box
+    degree: int = 0
+    timing: Law | None = None
+
+    @cached_property
+    def monomials(self) -> Monomials:
+        """Those of the parameters."""
+        return Monomials(len(self.box.middle), self.degree) if self.degree else NONE
+
+    @cached_property
+    def units(self) -> Array:
+        """Units ``(d,)`` of the states, powers of two, in which the system is small."""
+        A = self._looks[0]
+        return balanced(A, self.until, np.ones(A.shape[0]) / self.until)
+
+    @cached_property
+    def _looks(self) -> tuple[Array, Array]:
+        """The largest absolute values of the entries of ``A``, and of every column of ``[B c E]``, at some times in the
+        middle of the box; any would do."""
+        every = np.array([np.abs(table) for table in self.plant.looked_at(self.box.middle)])
+        with np.errstate(invalid="ignore"):
+            A, inputs = every[..., : self.plant.states].max(axis=0), every[..., self.plant.states :].max(axis=(0, 1))
+        return np.where(np.isfinite(A), A, 0.0), np.where(np.isfinite(inputs) & (inputs > 0.0), inputs, 1.0)
+
+    @cached_property
+    def stretches(self) -> list[Stretch]:
+        """The law on parts of the horizon, one after another, each halved where it is too long; raises `Unchecked`
+        where it is not finite."""
+        if self.timing is not None:
+            return [self._on_same(one) for one in self.timing.stretches]
+        cut = [(phase.begin, min(phase.until, self.until), phase) for phase in self.plant.phases]
+        return [one for begin, until, phase in cut if begin < until for one in self._on(begin, until, phase)]
+
+    def _on_same(self, other: Stretch) -> Stretch:
+        phase = next(one for one in reversed(self.plant.phases) if one.begin <= other.start)
+        return replace(other, **dict(zip(("frame", "table"), self._table(other.start, other.stop, phase, self.monomials), strict=True)))
+
+    def _on(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
+        whole = self._still(begin, until, phase)
+        if whole is not None:
+            return [whole]
+        count = ceil(FIRST * (until - begin) / self.until)
+        todo, found = list(pairwise(np.linspace(begin, until, count + 1).tolist()))[::-1], []
+        while todo:
+            start, stop = todo.pop()
+            part = self._stretch(start, stop, phase)
+            if part is not None:
+                found.append(part)
+                continue
+            if stop - start <= SHORTEST * self.until:
+                raise Unchecked(f"near t = {start:.9g} the system is not enclosed")
+            middle = (start + stop) / 2
+            todo += [(middle, stop), (start, middle)]
+        return found
+
+    def _still(self, begin: float, until: float, phase: Phase) -> Stretch | None:
+        """All of a law that does not change with time; ``None`` of another one."""
+        try:
+            found = Stretch(begin, until, *self._table(begin, until, phase, self.monomials), self.units)
+        except Unchecked:
+            return None
+        if not found.is_still:
+            return None
+        d, u, longest = len(self.units), self.units, 2.0 ** ceil(log2(until - begin))
+        pace = float((found.sizes[0][:, :d] * u / u[:, None]).sum(axis=1).max(initial=0.0))
+        return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / pace))) if pace > 0.0 else longest)
+
+    def _stretch(self, start: float, stop: float, phase: Phase) -> Stretch | None:
+        """The law from ``start`` to ``stop``; ``None`` where that is too long: by what it is in the middle of the
+        box."""
+        try:
+            frame, middle = self._table(start, stop, phase, NONE)
+            d, u = len(middle[0]), self.units
+            size = np.array([[sum(float(c.abs_upper()) for c in e.coeffs()) for e in row] for row in middle[0]])
+            lost = np.array([[sum(float(c.rad()) for c in e.coeffs()) for e in row] for row in middle[0]])
+            paces, gone = ((one[:, :d] * u / u[:, None]) for one in (size, lost))
+            pace, long = float(paces.sum(axis=1).max(initial=0.0)), float((stop - start) * OUTWARD)
+            ratios = np.ones(d) if pace * long <= LONG else _slow(paces * long)
+            least = SHARP * max(pace, float((self._looks[0] * u / u[:, None]).sum(axis=1).max(initial=0.0)))
+            if ratios is None or not gone.sum(axis=1).max(initial=0.0) * ratios.max() <= least:
+                return None
+            if not (lost[:, d:] <= SHARP * self._looks[1]).all():
+                return None
+            table = middle if self.monomials.size == 1 else self._table(start, stop, phase, self.monomials)[1]
+        except Unchecked:
+            return None
+        return Stretch(start, stop, Frame(self.monomials, ORDER), table, u * ratios)
+
+    def _table(
+        self, start: float, stop: float, phase: Phase, monomials: Monomials
+    ) -> tuple[Frame, list[list[list[arb_poly]]]]:
+        """Every entry of the law from ``start`` to ``stop``, monomial by monomial."""
+        from flint import arb, arb_poly
+
+        frame = Frame(monomials, ORDER)
+        p = np.empty(1 + len(self.box.middle), dtype=object)
+        p[0] = Model.time(frame, (arb(start) + arb(stop)) / 2, (arb(stop) - arb(start)) / 2)
+        for j, (middle, half) in enumerate(zip(self.box.middle, self.box.halves, strict=True)):
+            wide = arb(half) if monomials.count else arb(0)
+            p[1 + j] = Model.number(frame, arb(middle)) if wide.is_zero() else Model.parameter(frame, j, arb(middle), wide)
+        values = phase.called(p)
+        found = [[[arb_poly([])] * values.shape[1] for _ in range(values.shape[0])] for _ in range(monomials.size)]
+        for (i, j), value in np.ndenumerate(values):
+            parts = value.parts if isinstance(value, Model) else [arb_poly([float(value)])]
+            for k, part in enumerate(parts):
+                if part is not None:
+                    if not all(one.is_finite() for one in part.coeffs()):
+                        raise Unchecked("an entry of the system is not finite")
+                    found[k][i][j] = part
+        return frame, found
+
+
+def _slow(most: Array) -> Array | None:
+    """Ratios of units of the states, in which a system that moves them by at most ``most (d, d)`` of the units that
+    they have is small enough, to those in which it is not: with ``g`` a share of `LONG`, ``u = (1 - M / g)^-1 1`` has
+    ``M u <= g u``; ``None`` where there are none."""
+    M = most / (SHORTER * LONG)
+    u = np.linalg.lstsq(np.eye(len(M)) - M, np.ones(len(M)), rcond=None)[0]
+    if not (np.isfinite(u).all() and u.min() > 0.0):
+        return None
+    ratios = np.maximum(u, 1.0)
+    return np.asarray(ratios) if (most @ ratios <= LONG * ratios).all() else None

@@ -1,0 +1,149 @@
+"""The flow of ``x' = A x + F u`` over a share of time from 0 to 1, and at every parameter: a polynomial that is guessed,
+and then verified.
+
+Nothing about the guess is believed. The *defect* of a polynomial ``P`` is ``P' - A P - F``: what it leaves of the
+equation. It is bounded in balls, and by Gronwall's inequality the polynomial is off from the flow by at most what the
+defect adds up to, times ``e^(int |A|)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.series import OUTWARD, Series, identity, zeros
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+SHARP = 2.0**-100  # of the system's numbers, what a guess leaves out; 2^-10 would show in what states miss
+TERMS = 64  # of a guess, at most
+FAR = 300.0  # of the exponent in Gronwall's inequality: beyond, nothing is known
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """``[Phi Gamma]``, what a share ``x`` of the time makes of the states at its beginning and of inputs that stay the
+    same: ``sum_n terms_n x^n``, off by at most ``off (d, d + w)`` at every share and parameter."""
+
+    terms: list[Series]
+    off: Array
+
+    def at(self, share: arb) -> Series:
+        """The flow at a share of the time."""
+        (value,), off = self.within(share, share * 0, 1)
+        return value.within(off)
+
+    def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
+        """The flow on shares from ``start`` on, as so many terms of a polynomial in the share of the ``width``; and by
+        how much that is off at most."""
+        from flint import arb, arb_mat
+
+        count, (d, columns), first = len(self.terms), self.terms[0].shape, self.terms[0]
+        a, b = ([one**n for n in range(count)] for one in (start, width))
+        kept = min(order, count)
+        weights = [
+            [a[n - j] * b[j] * comb(n, j) if n >= j else arb(0) for n in range(count)] for j in range(kept)
+        ]
+        size, table, moved = d * columns, arb_mat(weights) * self._table, []
+        for row in table.tolist():
+            parts = [arb_mat(d, columns, row[k : k + size]) for k in range(0, len(row), size)]
+            moved.append(Series(first.monomials, parts))
+        beyond = [
+            float(sum((a[n - j] * b[j] * comb(n, j) for j in range(kept, n + 1)), arb(0)).abs_upper())
+            for n in range(count)
+        ]
+        return moved, np.einsum("n,nij->ij", beyond, self._sizes) * OUTWARD + self.off
+
+    @cached_property
+    def _table(self) -> arb_mat:
+        """Every entry of every coefficient, a row for each term."""
+        from flint import arb_mat
+
+        return arb_mat([[x for part in term.parts for x in part.entries()] for term in self.terms])
+
+    @cached_property
+    def _sizes(self) -> Array:
+        return np.array([term.size for term in self.terms])
+
+
+def solve(A: Sequence[Series], F: Sequence[Series], units: Array) -> Segment:
+    """The flow of ``sum_k A_k x^k`` and ``sum_k F_k x^k`` for ``x`` from 0 to 1; ``units (d,)`` are those of the
+    states, in which the system is small."""
+    terms = guess(A, F, units)
+    return Segment(terms, verify(A, F, terms, units))
+
+
+def guess(A: Sequence[Series], F: Sequence[Series], units: Array) -> list[Series]:
+    """The first terms of the flow's power series, rounded."""
+    d, w = A[0].shape[0], F[0].shape[1]
+    terms = [_begin(A[0], w)]
+    scale = np.concatenate([1.0 / units, np.ones(w)]) * units[:, None]
+    largest, last = np.concatenate([np.ones(d), np.zeros(w)]), np.inf
+    while len(terms) <= TERMS:
+        n = len(terms) - 1
+        terms.append(_slope(A, F, terms, n).scaled(_inverse(n + 1)).middle)
+        size = (terms[-1].size / scale).max(axis=0)
+        largest = np.maximum(largest, size)
+        if n >= len(F) and max(last, float((size / np.where(largest > 0.0, largest, 1.0)).max())) <= SHARP:
+            break
+        last = float((size / np.where(largest > 0.0, largest, 1.0)).max())
+    return terms
+
+
+def verify(A: Sequence[Series], F: Sequence[Series], terms: Sequence[Series], units: Array) -> Array:
+    """By how much a polynomial is off from the flow at most, ``(d, d + w)``; infinite where that is not known."""
+    last, begin = len(terms) - 1, _begin(A[0], F[0].shape[1])
+    missed = (terms[0] - begin).size
+    for n in range(last):
+        missed = missed + (terms[n + 1].scaled(_exact(n + 1)) - _slope(A, F, terms, n)).size / (n + 1)
+    sizes, d = [term.size for term in terms], A[0].shape[0]
+    for n in range(last, last + max(len(A), len(F))):
+        for k in range(max(0, n - last), min(n + 1, len(A))):
+            missed = missed + A[k].size @ sizes[n - k] / (n + 1)
+        if n < len(F):
+            missed[:, d:] += F[n].size / (n + 1)
+    paces = [(one.size * units / units[:, None]).sum(axis=1).max(initial=0.0) / (k + 1) for k, one in enumerate(A)]
+    growth = float(sum(paces)) * OUTWARD
+    if not growth <= FAR:
+        raise Unchecked("the system is too fast for a part of its horizon")
+    worst = (missed / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * OUTWARD)
+    return np.asarray(units[:, None] * worst * OUTWARD)
+
+
+def _begin(A: Series, inputs: int) -> Series:
+    """The flow in no time."""
+    d = A.shape[0]
+    return Series.constant(A.monomials, identity(d)).beside(Series.constant(A.monomials, zeros(d, inputs)))
+
+
+def _slope(A: Sequence[Series], F: Sequence[Series], terms: Sequence[Series], n: int) -> Series:
+    """The term of order ``n`` of ``A P + F``."""
+    found = A[0] * terms[n]
+    for k in range(1, min(n + 1, len(A))):
+        if any(A[k].there):
+            found = found + A[k] * terms[n - k]
+    if n < len(F):
+        d = A[0].shape[0]
+        found = found + Series.constant(A[0].monomials, zeros(d, d)).beside(F[n])
+    return found
+
+
+def _exact(value: float) -> arb:
+    from flint import arb
+
+    return arb(value)
+
+
+def _inverse(value: int) -> arb:
+    from flint import arb
+
+    return 1 / arb(value)

@@ -1,0 +1,36 @@
+"""What is simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+from sparserob_core.checker.reach.lasting import Lasting
+from sparserob_core.control.sets.sets import ConvexSet
+
+if TYPE_CHECKING:
+    from flint import arb_mat
+
+SAME = 1e-14  # of the horizon: durations closer than this are treated as one
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of ``x(0)`` and the set of
+    deviations from it, and the disturbance: its set and the breakpoints between which it is constant, of which some
+    components may be ``lasting`` longer."""
+
+    grid: list[float]
+    control: list[arb_mat]
+    initial_state: list[float]
+    disturbance: ConvexSet | None
+    changes: list[float]
+    initial_set: ConvexSet | None = None
+    lasting: Lasting | None = None
+
+    @cached_property
+    def tick(self) -> float:
+        """The unit in which durations are told apart."""
+        return SAME * self.grid[-1]

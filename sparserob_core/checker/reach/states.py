@@ -1,0 +1,197 @@
+"""The states that a scene reaches, at every parameter of a box: at marks of the time and between them."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.arithmetic.series import Series, identity, prefixes, stacked, zeros
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+EFFECTS_KEPT = 16  # marks, at which the effect of every piece before is remembered; cells come one after another
+
+
+@final
+@dataclass(eq=False)
+class States:
+    """What a ``flow`` makes of a ``scene``."""
+
+    flow: Flow
+    scene: Scene
+    _tables: dict[int, tuple[Series, Series]] = field(default_factory=dict, repr=False)
+    _floats: dict[int, Enclosed] = field(default_factory=dict, repr=False)
+    _numbers: dict[tuple[object, ...], int] = field(default_factory=dict, repr=False)
+    _places: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
+    _effects: dict[int, tuple[Enclosed, Enclosed]] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def marks(self) -> list[float]:
+        """The times from each of which to the next the flow is a polynomial and inputs stay the same."""
+        return self.flow.marks(self.scene.grid)
+
+    @cached_property
+    def pieces(self) -> list[int]:
+        """The piece of the scene that every interval between marks is in."""
+        return [bisect_right(self.scene.grid, t) - 1 for t in self.marks[:-1]]
+
+    def place(self, piece: int, time: float) -> int:
+        """The interval between marks that holds a time in a piece of the scene."""
+        last = bisect_right(self.pieces, piece) - 1
+        return min(bisect_right(self.marks, time) - 1, last)
+
+    @cached_property
+    def _steps(self) -> list[Series]:
+        return [self.flow.step(*ends) for ends in pairwise(self.marks)]
+
+    @cached_property
+    def nodes(self) -> list[Series]:
+        """The undisturbed state at every mark, ``(d, 1)``."""
+        d, m, steps = self.flow.states, self.flow.driven, []
+        last = stacked([balls([*np.zeros(d), 1.0])])
+        for step, piece in zip(self._steps, self.pieces, strict=True):
+            pushed = step.columns(d, d + m).applied(self.scene.control[piece])
+            steps.append(step.columns(0, d).beside(pushed).above(last))
+        first = stacked([[v] for v in balls([*self.scene.initial_state, 1.0])])
+        return [step.applied(first).rows(d) for step in prefixes(steps)]
+
+    def effect(self, mark: int) -> tuple[Enclosed, Enclosed]:
+        """What the state at 0, ``(M, d, d)``, and the disturbance on every interval before a mark, ``(M, d, mark mw)``,
+        made of the state there: by blocks of 1, 2, 4, ... intervals, each carried on by those that follow it."""
+        if mark not in self._effects:
+            d, blocks, begin = self.flow.states, [], 0
+            for level in range(mark.bit_length() - 1, -1, -1):
+                if mark >> level & 1:
+                    blocks.append(self._block(level, begin >> level))
+                    begin += 1 << level
+            monomials = self.flow.monomials
+            after, found = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
+            for block in reversed(blocks):
+                found.insert(1, ring(monomials, single(after), self._floats[block]))
+                after = after * self._tables[block][0]
+            mid, rad = (np.concatenate([getattr(one, name) for one in found], axis=2) for name in ("mid", "rad"))
+            if len(self._effects) >= EFFECTS_KEPT:
+                self._effects.clear()
+            self._effects[mark] = single(after), Enclosed(mid, rad)
+        return self._effects[mark]
+
+    def _block(self, level: int, number: int) -> int:
+        """The number of what ``2^level`` intervals in a row make of the state before them, and of the disturbances on
+        them, side by side; those that are alike share one."""
+        if (level, number) in self._places:
+            return self._places[level, number]
+        if not level:
+            name: tuple[object, ...] = self.flow.kind(self.marks[number], self.marks[number + 1])
+        else:
+            name = (level, *(self._block(level - 1, 2 * number + i) for i in range(2)))
+        if name not in self._numbers:
+            mine = self._numbers[name] = len(self._numbers)
+            if not level:
+                d, step = self.flow.states, self._steps[number]
+                pushed = step.columns(d + self.flow.driven, None) if self._is_pushed else step.columns(0, 0)
+                self._tables[mine] = step.columns(0, d), pushed
+            else:
+                (Phi, early), (onward, late) = (self._tables[self._block(level - 1, 2 * number + i)] for i in range(2))
+                self._tables[mine] = onward * Phi, (onward * early).beside(late)
+            self._floats[mine] = single(self._tables[mine][1])
+        self._places[level, number] = self._numbers[name]
+        return self._places[level, number]
+
+    @property
+    def _is_pushed(self) -> bool:
+        return self.scene.disturbance is not None
+
+    def seen(
+        self, basis: Array, place: int, start: float, stop: float, order: int
+    ) -> tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]:
+        """Rows ``basis (b, d)`` on ``[start, stop]`` between two marks, as so many terms in the share of it: on the
+        undisturbed state, ``(J, M, b)``; and the sets of what is uncertain, with what each of their members adds per
+        unit, ``(blocks, J, M, w, b)``."""
+        flow, scene, d, m = self.flow, self.scene, self.flow.states, self.flow.driven
+        ends = self.marks[place], self.marks[place + 1]
+        terms, off = flow.within(*ends, start, stop, 1 if start == stop else order)
+        rows = stacked([balls(row) for row in basis])
+        lines = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in terms])
+        missed = np.abs(basis) @ off  # (b, d + w)
+        control = scene.control[min(self.pieces[place], len(scene.control) - 1)]
+        x = self.nodes[place].above(control)
+        state = enclosed([
+            Series(one.monomials, [rows * part for part in (one.columns(0, d + m) * x).parts]) for one in terms
+        ])  # fmt: skip
+        state.rad[0, 0] += (missed[:, : d + m] @ x.size) * OUTWARD
+        lines.rad[0, 0] += missed * OUTWARD
+        carried, found = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
+        if scene.disturbance is not None and stop > 0.0:
+            past = ring(flow.monomials, carried, self.effect(place)[1])
+            shape = (*past.mid.shape[:3], place, -1) if place else (*past.mid.shape[:3], 0, lines.mid.shape[-1] - d - m)
+            mid, rad = (
+                np.moveaxis(np.concatenate([one.reshape(shape), two[:, :, :, None, d + m :]], axis=3), (3, 4), (0, 3))
+                for one, two in ((past.mid, lines.mid), (past.rad, lines.rad))
+            )
+            block = np.searchsorted(np.array(scene.changes), np.array(self.marks[: place + 1]), side="right")
+            firsts = np.flatnonzero(np.diff(block, prepend=-1))
+            rad = (rad + rounding(len(mid)) * np.abs(mid)) * OUTWARD
+            mid, rad = (np.add.reduceat(part, firsts, axis=0) for part in (mid, rad))
+            if scene.lasting is not None:
+                mid, rad = scene.lasting.gathered(mid, rad)
+            found.append((scene.disturbance, Enclosed(mid, rad)))
+        if scene.initial_set is not None:
+            begun = ring(flow.monomials, carried, self.effect(place)[0])
+            found.append((scene.initial_set, Enclosed(*(np.swapaxes(p, 2, 3)[None] for p in (begun.mid, begun.rad)))))
+        return Enclosed(state.mid[..., 0], state.rad[..., 0]), found
+
+    def blur(self, place: int) -> Array:
+        """About how much of the state at a mark, ``(d,)``, is due to the size of the box of parameters and unknown."""
+        if not self.flow.monomials.degree:
+            return np.zeros(self.flow.states)
+        found = np.array([float(x.rad()) for x in self.nodes[place].parts[0].entries()])
+        for convex, number in ((self.scene.initial_set, 0), (self.scene.disturbance, 1)):
+            if convex is not None:
+                rad = self.effect(place)[number].rad[0]
+                found += rad.reshape(*rad.shape[:1], -1, convex.dimension).sum(axis=1) @ np.array(known(convex).radius)
+        return found
+
+
+def enclosed(series: Sequence[Series]) -> Enclosed:
+    """The entries of series of one shape, ``(J, M, rows, columns)``."""
+    first = series[0]
+    shape = len(series), len(first.parts), *first.shape
+    return Enclosed.all([part for one in series for part in one.parts], shape)
+
+
+def single(series: Series) -> Enclosed:
+    """The entries of one series, ``(M, rows, columns)``."""
+    found = enclosed([series])
+    return Enclosed(found.mid[0], found.rad[0])
+
+
+def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
+    """Products of polynomials in the parameters ``(..., M, a, d)`` with others ``(M, d, n)``, what is beyond the degree
+    in the radii of the constants."""
+    shape = (*left.mid.shape[:-1], right.mid.shape[-1])
+    mid, rad = np.zeros(shape), np.zeros(shape)
+    size, there = np.abs(left.mid), np.abs(right.mid)
+    wide = right.rad + rounding(left.mid.shape[-1] * monomials.size) * there
+    for i, j, k in monomials.products:
+        mid[..., k, :, :] += left.mid[..., i, :, :] @ right.mid[j]
+        rad[..., k, :, :] += size[..., i, :, :] @ wide[j] + left.rad[..., i, :, :] @ (there[j] + right.rad[j])
+    if monomials.degree:
+        degrees = np.array(monomials.degrees)
+        sums = [
+            np.stack([part[..., degrees == n, :, :].sum(axis=-3) for n in range(monomials.degree + 1)])
+            for part in (size + left.rad, there + right.rad)
+        ]
+        later = np.cumsum(sums[1][:0:-1], axis=0)
+        rad[..., 0, :, :] += sum(sums[0][n] @ later[n - 1] for n in range(1, monomials.degree + 1))
+    return Enclosed(mid, rad * OUTWARD)
