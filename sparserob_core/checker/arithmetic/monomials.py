@@ -46,6 +46,11 @@ class Monomials:
         """The degree of every monomial."""
         return [sum(e) for e in self.exponents]
 
+    @property
+    def firsts(self) -> list[int]:
+        """The place of the first monomial of every degree."""
+        return [self.degrees.index(n) for n in range(self.degree + 1)]
+
     def linear(self, variable: int) -> int:
         """The place of a variable alone."""
         return self.number[tuple(int(i == variable) for i in range(self.count))]

@@ -59,11 +59,11 @@ class Series:
     def sizes(self) -> Array:
         """Of every degree how large the entries of its coefficients are together at most, ``(D + 1, rows,
         columns)``."""
-        found = np.zeros((self.monomials.degree + 1, *self.shape))
-        for degree, part, here in zip(self.monomials.degrees, self.parts, self.there, strict=True):
-            if here:
-                found[degree] += largest(part)
-        return found * OUTWARD
+        there = [part for part, here in zip(self.parts, self.there, strict=True) if here]
+        entries = np.array([float(x.abs_upper()) for part in there for x in part.entries()])
+        found = np.zeros((self.monomials.size, *self.shape))
+        found[self.there] = entries.reshape(len(there), *self.shape) + TINY
+        return np.add.reduceat(found, self.monomials.firsts, axis=0) * OUTWARD
 
     @property
     def size(self) -> Array:
@@ -140,6 +140,15 @@ class Series:
         return Series(self.monomials, [part.transpose() for part in self.parts])
 
 
+def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
+    """The sum of the products of some series with others."""
+    found = left[0] * right[0]
+    for a, b in zip(left[1:], right[1:], strict=True):
+        if any(a.there):
+            found = found + a * b
+    return found
+
+
 def identity(count: int) -> arb_mat:
     """The matrix of ones on the diagonal."""
     from flint import arb_mat
@@ -168,12 +177,6 @@ def around(off: Array) -> arb_mat:
     if not np.isfinite(off).all():
         raise Unchecked("the response grows beyond what numbers can hold")
     return arb_mat(*off.shape, [arb(0, float(x)) for x in off.ravel()])
-
-
-def largest(matrix: arb_mat) -> Array:
-    """The largest absolute values of the entries."""
-    found = [0.0 if x.is_zero() else float(x.abs_upper()) + TINY for x in matrix.entries()]
-    return np.asarray(np.array(found).reshape(matrix.nrows(), matrix.ncols()) * OUTWARD)
 
 
 def middles(matrix: arb_mat) -> Array:
@@ -210,13 +213,3 @@ def products(steps: Sequence[Series]) -> list[Series]:
         else:
             found.append(coarse[place + 1] * steps[k])
     return found
-
-
-def prefixes(steps: Sequence[Series]) -> list[Series]:
-    """``Phi_k ... Phi_1`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``, as `products`."""
-    unit = Series.constant(steps[0].monomials, identity(steps[0].shape[0]))
-    if len(steps) == 1:
-        return [unit, steps[0]]
-    pairs = [second * first for first, second in zip(steps[:-1:2], steps[1::2], strict=False)]
-    coarse = prefixes([*pairs, *([steps[-1]] if len(steps) % 2 else [])])
-    return [coarse[k // 2] if k % 2 == 0 else steps[k - 1] * coarse[k // 2] for k in range(len(steps))] + [coarse[-1]]

@@ -444,7 +444,7 @@ def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
     if case.changing is not None:  # over many orbits, in units that follow them
-        return list(States(case.changing.at(case.nominal_parameter), scene).nodes[-1].matrix.tolist())
+        return list(States(case.changing.at(case.nominal_parameter), scene).last.matrix.tolist())
     return case.nominal_states[-1].tolist()
 
 

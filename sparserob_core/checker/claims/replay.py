@@ -3,6 +3,7 @@ witness exceeds there, and by how much the worst one does."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -57,9 +58,9 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     for k, start in enumerate(case.grid[:-1]):
         if start >= time:
             break
-        leg = case.scene.leg(k)
-        Phi, Gamma = held_for(every[leg]["A"][0], both[leg], arb(min(case.grid[k + 1], time)) - arb(start))
-        pushed = [arb(0)] * every[leg]["E"][0].ncols() if w is None else balls(w[:, k])
+        leg = bisect_right(case.problem.system.switches, start)
+        Phi, Gamma = held_for(every[leg]["A"], both[leg], arb(min(case.grid[k + 1], time)) - arb(start))
+        pushed = [arb(0)] * every[leg]["E"].ncols() if w is None else balls(w[:, k])
         x = Phi * x + Gamma * arb_mat([[v] for v in case.scene.control[k].entries() + pushed])
     state: list[arb] = x.entries()
     return state

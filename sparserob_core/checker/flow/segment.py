@@ -9,14 +9,14 @@ defect adds up to, times ``e^(int |A|)``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import comb
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.series import OUTWARD, Series, identity, zeros
+from sparserob_core.checker.arithmetic.series import OUTWARD, Series, dot, identity, zeros
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 
@@ -78,63 +78,80 @@ class Segment:
 def solve(A: Sequence[Series], F: Sequence[Series], units: Array) -> Segment:
     """The flow of ``sum_k A_k x^k`` and ``sum_k F_k x^k`` for ``x`` from 0 to 1; ``units (d,)`` are those of the
     states, in which the system is small."""
-    terms = guess(A, F, units)
-    return Segment(terms, verify(A, F, terms, units))
+    equation = Equation(A, F)
+    terms = guess(equation, units)
+    return Segment(terms, verify(equation, terms, units))
 
 
-def guess(A: Sequence[Series], F: Sequence[Series], units: Array) -> list[Series]:
+def guess(equation: Equation, units: Array) -> list[Series]:
     """The first terms of the flow's power series, rounded."""
-    d, w = A[0].shape[0], F[0].shape[1]
-    terms = [_begin(A[0], w)]
+    d, w = len(units), equation.F[0].shape[1]
+    terms = [equation.begin]
     scale = np.concatenate([1.0 / units, np.ones(w)]) * units[:, None]
     largest, last = np.concatenate([np.ones(d), np.zeros(w)]), np.inf
     while len(terms) <= TERMS:
         n = len(terms) - 1
-        terms.append(_slope(A, F, terms, n).scaled(_inverse(n + 1)).middle)
+        terms.append(equation.slope(terms, n).scaled(_inverse(n + 1)).middle)
         size = (terms[-1].size / scale).max(axis=0)
         largest = np.maximum(largest, size)
-        if n >= len(F) and max(last, float((size / np.where(largest > 0.0, largest, 1.0)).max())) <= SHARP:
+        share = float((size / np.where(largest > 0.0, largest, 1.0)).max())
+        if n >= len(equation.F) and max(last, share) <= SHARP:
             break
-        last = float((size / np.where(largest > 0.0, largest, 1.0)).max())
+        last = share
     return terms
 
 
-def verify(A: Sequence[Series], F: Sequence[Series], terms: Sequence[Series], units: Array) -> Array:
-    """By how much a polynomial is off from the flow at most, ``(d, d + w)``; infinite where that is not known."""
-    last, begin = len(terms) - 1, _begin(A[0], F[0].shape[1])
-    missed = (terms[0] - begin).size
+def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
+    """By how much a polynomial is off from the flow at most, ``(d, d + w)``; raises `Unchecked` where that is not
+    known."""
+    A, F, last, d = equation.A, equation.F, len(terms) - 1, len(units)
+    missed = (terms[0] - equation.begin).size
     for n in range(last):
-        missed = missed + (terms[n + 1].scaled(_exact(n + 1)) - _slope(A, F, terms, n)).size / (n + 1)
-    sizes, d = [term.size for term in terms], A[0].shape[0]
+        missed = missed + (terms[n + 1].scaled(_exact(n + 1)) - equation.slope(terms, n)).size / (n + 1)
+    sizes, paces, drives = ([one.size for one in every] for every in (terms, A, F))
     for n in range(last, last + max(len(A), len(F))):
         for k in range(max(0, n - last), min(n + 1, len(A))):
-            missed = missed + A[k].size @ sizes[n - k] / (n + 1)
+            missed = missed + paces[k] @ sizes[n - k] / (n + 1)
         if n < len(F):
-            missed[:, d:] += F[n].size / (n + 1)
-    paces = [(one.size * units / units[:, None]).sum(axis=1).max(initial=0.0) / (k + 1) for k, one in enumerate(A)]
-    growth = float(sum(paces)) * OUTWARD
+            missed[:, d:] += drives[n] / (n + 1)
+    rates = [(one * units / units[:, None]).sum(axis=1).max(initial=0.0) / (k + 1) for k, one in enumerate(paces)]
+    growth = float(sum(rates)) * OUTWARD
     if not growth <= FAR:
         raise Unchecked("the system is too fast for a part of its horizon")
     worst = (missed / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * OUTWARD)
     return np.asarray(units[:, None] * worst * OUTWARD)
 
 
-def _begin(A: Series, inputs: int) -> Series:
-    """The flow in no time."""
-    d = A.shape[0]
-    return Series.constant(A.monomials, identity(d)).beside(Series.constant(A.monomials, zeros(d, inputs)))
+@final
+@dataclass(frozen=True, eq=False)
+class Equation:
+    """``P' = A P + [0 F]``, ``P(0) = [1 0]``, with polynomials ``A`` and ``F`` of the share of time."""
 
+    A: Sequence[Series]
+    F: Sequence[Series]
+    _known: dict[int, tuple[list[Series], Series]] = field(default_factory=dict, repr=False)
 
-def _slope(A: Sequence[Series], F: Sequence[Series], terms: Sequence[Series], n: int) -> Series:
-    """The term of order ``n`` of ``A P + F``."""
-    found = A[0] * terms[n]
-    for k in range(1, min(n + 1, len(A))):
-        if any(A[k].there):
-            found = found + A[k] * terms[n - k]
-    if n < len(F):
-        d = A[0].shape[0]
-        found = found + Series.constant(A[0].monomials, zeros(d, d)).beside(F[n])
-    return found
+    @cached_property
+    def begin(self) -> Series:
+        """The flow in no time."""
+        d, monomials = self.A[0].shape[0], self.A[0].monomials
+        return Series.constant(monomials, identity(d)).beside(Series.constant(monomials, zeros(d, self.F[0].shape[1])))
+
+    @cached_property
+    def _inputs(self) -> list[Series]:
+        d = self.A[0].shape[0]
+        none = Series.constant(self.A[0].monomials, zeros(d, d))
+        return [none.beside(one) for one in self.F]
+
+    def slope(self, terms: Sequence[Series], n: int) -> Series:
+        """The term of order ``n`` of ``A P + [0 F]``; of the same terms of ``P`` it is remembered."""
+        count = min(n + 1, len(self.A))
+        factors = [terms[n - k] for k in range(count)]
+        known = self._known.get(n)
+        if known is None or not all(a is b for a, b in zip(known[0], factors, strict=True)):
+            found = dot(self.A[:count], factors)
+            known = self._known[n] = factors, found + self._inputs[n] if n < len(self.F) else found
+        return known[1]
 
 
 def _exact(value: float) -> arb:

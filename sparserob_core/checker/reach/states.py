@@ -13,7 +13,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
-from sparserob_core.checker.arithmetic.series import Series, identity, prefixes, stacked, zeros
+from sparserob_core.checker.arithmetic.series import Series, identity, stacked
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.sets.known import known
@@ -34,6 +34,8 @@ class States:
     _floats: dict[int, Enclosed] = field(default_factory=dict, repr=False)
     _numbers: dict[tuple[object, ...], int] = field(default_factory=dict, repr=False)
     _places: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
+    _nodes: dict[int, Series] = field(default_factory=dict, repr=False)
+    _driven: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
     _effects: dict[int, tuple[Enclosed, Enclosed]] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -55,26 +57,37 @@ class States:
     def _steps(self) -> list[Series]:
         return [self.flow.step(*ends) for ends in pairwise(self.marks)]
 
-    @cached_property
-    def nodes(self) -> list[Series]:
-        """The undisturbed state at every mark, ``(d, 1)``."""
-        d, m, steps = self.flow.states, self.flow.driven, []
-        last = stacked([balls([*np.zeros(d), 1.0])])
-        for step, piece in zip(self._steps, self.pieces, strict=True):
-            pushed = step.columns(d, d + m).applied(self.scene.control[piece])
-            steps.append(step.columns(0, d).beside(pushed).above(last))
-        first = stacked([[v] for v in balls([*self.scene.initial_state, 1.0])])
-        return [step.applied(first).rows(d) for step in prefixes(steps)]
+    @property
+    def last(self) -> Series:
+        """The undisturbed state at the end, ``(d, 1)``."""
+        return self.node(len(self.marks) - 1)
+
+    def node(self, mark: int) -> Series:
+        """The undisturbed state at a mark, ``(d, 1)``: block by block, as `effect`."""
+        if mark not in self._nodes:
+            x = Series.constant(self.flow.monomials, stacked([[v] for v in balls(self.scene.initial_state)]))
+            for level, number in _blocks(mark):
+                x = self._tables[self._block(level, number)][0] * x + self._controlled(level, number)
+            self._nodes[mark] = x
+        return self._nodes[mark]
+
+    def _controlled(self, level: int, number: int) -> Series:
+        """What the control does on ``2^level`` intervals in a row, ``(d, 1)``."""
+        if (level, number) not in self._driven:
+            if not level:
+                d, u = self.flow.states, self.scene.control[self.pieces[number]]
+                found = self._steps[number].columns(d, d + self.flow.driven).applied(u)
+            else:
+                before, after = (self._controlled(level - 1, 2 * number + i) for i in range(2))
+                found = self._tables[self._block(level - 1, 2 * number + 1)][0] * before + after
+            self._driven[level, number] = found
+        return self._driven[level, number]
 
     def effect(self, mark: int) -> tuple[Enclosed, Enclosed]:
         """What the state at 0, ``(M, d, d)``, and the disturbance on every interval before a mark, ``(M, d, mark mw)``,
         made of the state there: by blocks of 1, 2, 4, ... intervals, each carried on by those that follow it."""
         if mark not in self._effects:
-            d, blocks, begin = self.flow.states, [], 0
-            for level in range(mark.bit_length() - 1, -1, -1):
-                if mark >> level & 1:
-                    blocks.append(self._block(level, begin >> level))
-                    begin += 1 << level
+            d, blocks = self.flow.states, [self._block(*one) for one in _blocks(mark)]
             monomials = self.flow.monomials
             after, found = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
             for block in reversed(blocks):
@@ -125,7 +138,7 @@ class States:
         lines = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in terms])
         missed = np.abs(basis) @ off  # (b, d + w)
         control = scene.control[min(self.pieces[place], len(scene.control) - 1)]
-        x = self.nodes[place].above(control)
+        x = self.node(place).above(control)
         state = enclosed([
             Series(one.monomials, [rows * part for part in (one.columns(0, d + m) * x).parts]) for one in terms
         ])  # fmt: skip
@@ -155,12 +168,22 @@ class States:
         """About how much of the state at a mark, ``(d,)``, is due to the size of the box of parameters and unknown."""
         if not self.flow.monomials.degree:
             return np.zeros(self.flow.states)
-        found = np.array([float(x.rad()) for x in self.nodes[place].parts[0].entries()])
+        found = np.array([float(x.rad()) for x in self.node(place).parts[0].entries()])
         for convex, number in ((self.scene.initial_set, 0), (self.scene.disturbance, 1)):
             if convex is not None:
                 rad = self.effect(place)[number].rad[0]
                 found += rad.reshape(*rad.shape[:1], -1, convex.dimension).sum(axis=1) @ np.array(known(convex).radius)
         return found
+
+
+def _blocks(mark: int) -> list[tuple[int, int]]:
+    """The intervals before a mark in blocks of ``2^level``, the longest first: level and number of each."""
+    found, begin = [], 0
+    for level in range(mark.bit_length() - 1, -1, -1):
+        if mark >> level & 1:
+            found.append((level, begin >> level))
+            begin += 1 << level
+    return found
 
 
 def enclosed(series: Sequence[Series]) -> Enclosed:
