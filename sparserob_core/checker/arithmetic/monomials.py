@@ -44,12 +44,12 @@ class Monomials:
     @property
     def degrees(self) -> list[int]:
         """The degree of every monomial."""
-        return [sum(e) for e in self.exponents]
+        return _degrees(self.count, self.degree)
 
     @property
     def firsts(self) -> list[int]:
         """The place of the first monomial of every degree."""
-        return [self.degrees.index(n) for n in range(self.degree + 1)]
+        return _firsts(self.count, self.degree)
 
     def linear(self, variable: int) -> int:
         """The place of a variable alone."""
@@ -63,6 +63,16 @@ NONE = Monomials(0, 0)
 def _exponents(count: int, degree: int) -> list[tuple[int, ...]]:
     every = [e for e in product(range(degree + 1), repeat=count) if sum(e) <= degree]
     return sorted(every, key=lambda e: (sum(e), e))
+
+
+@lru_cache(maxsize=64)
+def _degrees(count: int, degree: int) -> list[int]:
+    return [sum(e) for e in _exponents(count, degree)]
+
+
+@lru_cache(maxsize=64)
+def _firsts(count: int, degree: int) -> list[int]:
+    return [_degrees(count, degree).index(n) for n in range(degree + 1)]
 
 
 @lru_cache(maxsize=64)

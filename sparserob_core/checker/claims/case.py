@@ -444,7 +444,7 @@ class Case:
     def _missing(self, *errors: Any, **more: Any) -> VaryingExecution | SpreadExecution:
         """Errors in a system that changes with time, over all of its parameters."""
         law = self.varying
-        if law.degree:
+        if law.box.middle:
             return SpreadExecution(law, *errors, **more)
         return VaryingExecution(law.at(()), *errors, **more)
 

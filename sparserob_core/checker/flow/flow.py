@@ -16,7 +16,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, products, zeros
-from sparserob_core.checker.flow.law import Box, Law
+from sparserob_core.checker.flow.law import Box, Law, Stretch
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.segment import Segment, solve
 from sparserob_core.checker.outcome import Unchecked
@@ -119,20 +119,17 @@ class Flow:
         """The flow from ``start`` on, and which share of it has passed at ``stop``."""
         from flint import arb
 
-        place = self._place(start, stop)
-        stretch = self.law.stretches[place]
-        key, length = (start, stop), arb(1)
-        if stretch.is_still:  # of all lengths one flow
-            key = (-1.0, stretch.start)
-            length = (arb(stop) - arb(start)) / arb(stretch.stride * LONGER)
+        stretch, key = self.law.stretches[self._place(start, stop)], (start, stop)
+        if stretch.is_still:
+            share = (arb(stop) - arb(start)) / arb(stretch.stride * LONGER)
+            if not share <= 1:
+                raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
+            return self._still(stretch), share
         if key not in self._segments:
             if len(self._segments) >= KEPT:
                 self._segments.clear()
-            ends = (0.0, stretch.stride * LONGER) if stretch.is_still else key
-            self._segments[key] = solve(*stretch.between(*ends), stretch.units)
-        if not length <= 1:
-            raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
-        return self._segments[key], length
+            self._segments[key] = solve(*stretch.between(*key), stretch.units)
+        return self._segments[key], arb(1)
 
     def kind(self, start: float, stop: float) -> tuple[int, tuple[float, float]]:
         """Intervals of one kind have one flow."""
@@ -154,10 +151,11 @@ class Flow:
         """What an interval makes of a state, of controls that stay the same (a drift among them), and of such
         disturbances."""
         if (start, stop) not in self._over:
+            if not 0.0 <= start <= stop <= self.until:
+                raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
             whole: tuple[Series, Series] | None = None
-            for a, b in pairwise(self.marks([start, stop])):
-                part = self.step(a, b)
-                Phi, pushed = part.columns(0, self.states), part.columns(self.states, None)
+            for a, b in pairwise([start, *(one for one in self._begins if start < one < stop), stop]):
+                Phi, pushed = self._through(a, b)
                 whole = (Phi, pushed) if whole is None else (Phi * whole[0], Phi * whole[1] + pushed)
             assert whole is not None
             if len(self._over) >= KEPT:
@@ -165,6 +163,31 @@ class Flow:
             self._over[start, stop] = whole
         Phi, pushed = self._over[start, stop]
         return Phi, pushed.columns(0, self.driven), pushed.columns(self.driven, None)
+
+    def _through(self, start: float, stop: float) -> tuple[Series, Series]:
+        """What an interval within one stretch makes of states, and of inputs: of what does not change with time by
+        what half of it, a quarter, ... makes."""
+        from flint import arb
+
+        stretch, halvings = self.law.stretches[self._place(start, stop)], 0
+        if not stretch.is_still:
+            part = self.step(start, stop)
+            return part.columns(0, self.states), part.columns(self.states, None)
+        share = (arb(stop) - arb(start)) / arb(stretch.stride * LONGER)
+        while not share <= 1:
+            share, halvings = share / 2, halvings + 1
+        part = self._still(stretch).at(share)
+        Phi, pushed = part.columns(0, self.states), part.columns(self.states, None)
+        for _ in range(halvings):
+            Phi, pushed = Phi * Phi, Phi * pushed + pushed
+        return Phi, pushed
+
+    def _still(self, stretch: Stretch) -> Segment:
+        """The flow of a stretch on which nothing changes with time."""
+        key = (-1.0, stretch.start)
+        if key not in self._segments:
+            self._segments[key] = solve(*stretch.between(0.0, stretch.stride * LONGER), stretch.units)
+        return self._segments[key]
 
     def within(
         self, begin: float, end: float, start: float, stop: float, order: int

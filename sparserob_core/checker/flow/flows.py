@@ -14,7 +14,8 @@ from sparserob_core.checker.flow.law import Box, Law
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Unchecked
 
-DEGREES = {0: 0, 1: 12, 2: 7, 3: 5, 4: 3}  # of expansions in so many parameters; 2 beyond
+DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of expansions in so many parameters; 2 beyond
+WIDE = {1: 16, 2: 8, 3: 5, 4: 3}  # of those that are to serve many boxes
 CLOSE = 1e-11  # of transitions over the horizon, what an expansion may leave out that serves smaller boxes too
 HALVINGS = 10  # of the box of all parameters, until a box has a flow of its own
 KEPT = 64  # flows over boxes
@@ -28,8 +29,8 @@ class Flows:
     plant: Plant
     until: float
     box: Box = Box()  # noqa: RUF009  immutable
-    _made: dict[Box, Flow] = field(default_factory=dict, repr=False)
-    _close: dict[Box, bool] = field(default_factory=dict, repr=False)
+    _made: dict[tuple[Box, int], Flow] = field(default_factory=dict, repr=False)
+    _close: dict[tuple[Box, int], bool] = field(default_factory=dict, repr=False)
 
     def at(self, parameter: Sequence[float]) -> Flow:
         """The flow at one parameter, of which there may be none."""
@@ -44,15 +45,15 @@ class Flows:
         """That of expansions over boxes."""
         return DEGREES.get(len(self.box.middle), 2)
 
-    def over(self, box: Box) -> Flow:
-        """The flow over a box."""
-        if not self.degree:
+    def over(self, box: Box, degree: int) -> Flow:
+        """The flow over a box, to a degree."""
+        if not degree:
             return self.at(())
-        if box not in self._made:
+        if (box, degree) not in self._made:
             if len(self._made) >= KEPT:
                 self._made.pop(next(iter(self._made)))
-            self._made[box] = Flow(self.plant, self.until, box, self.degree, self.timing)
-        return self._made[box]
+            self._made[box, degree] = Flow(self.plant, self.until, box, degree, self.timing)
+        return self._made[box, degree]
 
     @cached_property
     def timing(self) -> Law:
@@ -61,27 +62,32 @@ class Flows:
 
     def holding(self, box: Box) -> Flow:
         """A flow over a box, or over a larger one where the expansion is close over all of that."""
-        part = self.box
-        for _ in range(HALVINGS if self.degree else 0):
+        part, most = self.box, WIDE.get(len(box.middle), 2)
+        for _ in range(0 if self._is_still else HALVINGS):
             if part == box or not part.holds(box):
                 break
-            if self._is_close(part):
-                return self.over(part)
+            if self._is_close(part, most):
+                return self.over(part, most)
             part = next((half for half in part.halved(self._axis(part)) if half.holds(box)), box)
-        return self.over(box)
+        return self.over(box, self.degree)
 
-    def _is_close(self, box: Box) -> bool:
-        """Whether little is left out over a box."""
-        if box not in self._close:
+    @cached_property
+    def _is_still(self) -> bool:
+        """Whether nothing changes with time, or nothing is uncertain: then flows are cheap."""
+        return not self.box.middle or all(one.is_still for one in self.timing.stretches)
+
+    def _is_close(self, box: Box, degree: int) -> bool:
+        """Whether little is left out over a box, to a degree."""
+        if (box, degree) not in self._close:
             try:
-                flow = self.over(box)
+                flow = self.over(box, degree)
                 Phi, units = flow.over(0.0, self.until)[0], flow.law.units
                 off = np.array([[float(x.rad()) for x in row] for row in Phi.parts[0].tolist()])
                 size, lost = ((one * units / units[:, None]).max() for one in (Phi.size, off))
-                self._close[box] = bool(lost <= CLOSE * max(1.0, size))
+                self._close[box, degree] = bool(lost <= CLOSE * max(1.0, size))
             except Unchecked:
-                self._close[box] = False
-        return self._close[box]
+                self._close[box, degree] = False
+        return self._close[box, degree]
 
     def _axis(self, box: Box) -> int:
         """The parameter that moves the system most across a box."""
@@ -109,7 +115,7 @@ class Flows:
             there.append(one.sizes[0] > 0.0)
             moved.append([[any(part[i][j].length() for part in others) or _is_wide(first[i][j])
                            for j in range(len(first[0]))] for i in range(len(first))])  # fmt: skip
-        return np.any(there, axis=0), np.any(moved, axis=0) & (self.degree > 0)
+        return np.any(there, axis=0), np.any(moved, axis=0) & bool(self.box.middle)
 
 
 def _is_wide(entry: object) -> bool:

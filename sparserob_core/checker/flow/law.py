@@ -170,6 +170,15 @@ class Law:
         cut = [(phase.begin, min(phase.until, self.until), phase) for phase in self.plant.phases]
         return [one for begin, until, phase in cut if begin < until for one in self._on(begin, until, phase)]
 
+    @cached_property
+    def weights(self) -> Array:
+        """How much every monomial of the parameters has to do with the law, ``(M,)``, about."""
+        found = np.zeros(self.monomials.size)
+        for one in self.stretches:
+            for k, part in enumerate(one.table):
+                found[k] += sum(float(c.abs_upper()) for row in part for entry in row for c in entry.coeffs())
+        return found
+
     def _on_same(self, other: Stretch) -> Stretch:
         phase = next(one for one in reversed(self.plant.phases) if one.begin <= other.start)
         return replace(other, **dict(zip(("frame", "table"), self._table(other.start, other.stop, phase, self.monomials), strict=True)))

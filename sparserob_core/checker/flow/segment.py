@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 SHARP = 2.0**-100  # of the system's numbers, what a guess leaves out; 2^-10 would show in what states miss
+ROUGH = 2.0**-70  # over a box of parameters, where less is known of the flow anyway
 TERMS = 64  # of a guess, at most
 FAR = 300.0  # of the exponent in Gronwall's inequality: beyond, nothing is known
 
@@ -89,6 +90,7 @@ def guess(equation: Equation, units: Array) -> list[Series]:
     terms = [equation.begin]
     scale = np.concatenate([1.0 / units, np.ones(w)]) * units[:, None]
     largest, last = np.concatenate([np.ones(d), np.zeros(w)]), np.inf
+    sharp = ROUGH if terms[0].monomials.degree else SHARP
     while len(terms) <= TERMS:
         n = len(terms) - 1
         terms.append(equation.slope(terms, n).scaled(_inverse(n + 1)).middle)

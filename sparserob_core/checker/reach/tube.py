@@ -43,11 +43,12 @@ class Polynomial:
 
 class Around(NamedTuple):
     """The ``monomials`` of parameters about the ``centre (nu,)`` of a box, in units of its ``radius (nu,)``; there may
-    be none that anything depends on."""
+    be none that anything depends on. ``sizes (M,)``: how much each has to do with the system."""
 
     monomials: Monomials = NONE
     centre: tuple[float, ...] = ()
     radius: tuple[float, ...] = ()
+    sizes: Array = np.ones(1)
 
 
 @final
@@ -83,7 +84,8 @@ class Tube:
     @cached_property
     def flow(self) -> Around:
         """The monomials on the box."""
-        return Around(self.rows.states.flow.monomials, self.box.middle, self.box.halves)
+        flow = self.rows.states.flow
+        return Around(flow.monomials, self.box.middle, self.box.halves, flow.law.weights)
 
     @cached_property
     def _recentred(self) -> Enclosed | None:
