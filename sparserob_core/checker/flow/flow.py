@@ -115,7 +115,7 @@ class Flow:
                 found += [float(t) for t in np.linspace(a, b, max(1, count) + 1)[1:-1]] + [b]
         return found
 
-    def _segment(self, start: float, stop: float) -> tuple[Segment, arb]:
+    def segment(self, start: float, stop: float) -> tuple[Segment, arb]:
         """The flow from ``start`` on, and which share of it has passed at ``stop``."""
         from flint import arb
 
@@ -143,7 +143,7 @@ class Flow:
         if key not in self._ends:
             if len(self._ends) >= KEPT:
                 self._ends.clear()
-            segment, share = self._segment(start, stop)
+            segment, share = self.segment(start, stop)
             self._ends[key] = segment.at(share)
         return self._ends[key]
 
@@ -197,7 +197,7 @@ class Flow:
         each, and by how much they are off at most."""
         from flint import arb
 
-        segment, share = self._segment(begin, end)
+        segment, share = self.segment(begin, end)
         if begin == end:
             return segment.within(arb(0), arb(0), order)
         length = arb(end) - arb(begin)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import comb
 from typing import TYPE_CHECKING, final
 
@@ -58,11 +58,12 @@ class Segment:
         for row in table.tolist():
             parts = [arb_mat(d, columns, row[k : k + size]) for k in range(0, len(row), size)]
             moved.append(Series(first.monomials, parts))
-        beyond = [
-            float(sum((a[n - j] * b[j] * comb(n, j) for j in range(kept, n + 1)), arb(0)).abs_upper())
-            for n in range(count)
-        ]
-        return moved, np.einsum("n,nij->ij", beyond, self._sizes) * OUTWARD + self.off
+        beyond = shifted(float(start.abs_upper()), float(width.abs_upper()), count)[kept:].sum(axis=0)
+        return moved, np.einsum("n,nij->ij", beyond, self.sizes) * OUTWARD + self.off
+
+    def applied(self, columns: Series) -> Segment:
+        """The flow of some columns of states and inputs."""
+        return Segment([term * columns for term in self.terms], self.off @ columns.size * OUTWARD)
 
     @cached_property
     def _table(self) -> arb_mat:
@@ -72,8 +73,22 @@ class Segment:
         return arb_mat([[x for part in term.parts for x in part.entries()] for term in self.terms])
 
     @cached_property
-    def _sizes(self) -> Array:
+    def sizes(self) -> Array:
+        """How large the entries of every term are at most, ``(N, d, d + w)``."""
         return np.array([term.size for term in self.terms])
+
+
+def shifted(start: float, width: float, count: int) -> Array:
+    """What makes of the first ``count`` powers of ``start + width y`` those of ``y``, numbers from 0 on, ``(power of y,
+    power)``, each up to rounding of ``4 count`` terms."""
+    n = np.arange(count)
+    table = _binomials(count) * np.power(start, np.maximum(n[None] - n[:, None], 0)) * np.power(width, n)[:, None]
+    return np.asarray(table * (1.0 + 8.0 * count * 2.0**-53))
+
+
+@lru_cache(maxsize=16)
+def _binomials(count: int) -> Array:
+    return np.array([[float(comb(n, j)) for n in range(count)] for j in range(count)])
 
 
 def solve(A: Sequence[Series], F: Sequence[Series], units: Array) -> Segment:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -15,11 +15,16 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import Series, identity, stacked
 from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.segment import Segment, shifted
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
+if TYPE_CHECKING:
+    from flint import arb
+
+PATHS_KEPT = 256  # intervals of which the states are remembered
 EFFECTS_KEPT = 16  # marks, at which the effect of every piece before is remembered; cells come one after another
 
 
@@ -36,6 +41,8 @@ class States:
     _places: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
     _nodes: dict[int, Series] = field(default_factory=dict, repr=False)
     _driven: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
+    _paths: dict[int, Segment] = field(default_factory=dict, repr=False)
+    _rows: dict[tuple[int, bytes], tuple[Lines, Segment]] = field(default_factory=dict, repr=False)
     _effects: dict[int, tuple[Enclosed, Enclosed]] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -132,18 +139,15 @@ class States:
         undisturbed state, ``(J, M, b)``; and the sets of what is uncertain, with what each of their members adds per
         unit, ``(blocks, J, M, w, b)``."""
         flow, scene, d, m = self.flow, self.scene, self.flow.states, self.flow.driven
-        ends = self.marks[place], self.marks[place + 1]
-        terms, off = flow.within(*ends, start, stop, 1 if start == stop else order)
+        begin, end, order = self.marks[place], self.marks[place + 1], 1 if start == stop else order
+        segment, share = flow.segment(begin, end)
+        first, width = ((_exact(b) - _exact(a)) / (_exact(end) - _exact(begin)) * share
+                        for a, b in ((begin, start), (start, stop)))  # fmt: skip
+        terms, off = self._path(place).within(first, width, order)
         rows = stacked([balls(row) for row in basis])
-        lines = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in terms])
-        missed = np.abs(basis) @ off  # (b, d + w)
-        control = scene.control[min(self.pieces[place], len(scene.control) - 1)]
-        x = self.node(place).above(control)
-        state = enclosed([
-            Series(one.monomials, [rows * part for part in (one.columns(0, d + m) * x).parts]) for one in terms
-        ])  # fmt: skip
-        state.rad[0, 0] += (missed[:, : d + m] @ x.size) * OUTWARD
-        lines.rad[0, 0] += missed * OUTWARD
+        state = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in terms])
+        state.rad[0, 0] += np.abs(basis) @ off * OUTWARD
+        lines = self._lines(segment, basis).shifted(float(first.mid()), float(width.mid()), order)
         carried, found = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
         if scene.disturbance is not None and stop > 0.0:
             past = ring(flow.monomials, carried, self.effect(place)[1])
@@ -164,6 +168,27 @@ class States:
             found.append((scene.initial_set, Enclosed(*(np.swapaxes(p, 2, 3)[None] for p in (begun.mid, begun.rad)))))
         return Enclosed(state.mid[..., 0], state.rad[..., 0]), found
 
+    def _path(self, place: int) -> Segment:
+        """The undisturbed state from one mark to the next, ``(d, 1)``."""
+        if place not in self._paths:
+            if len(self._paths) >= PATHS_KEPT:
+                self._paths.clear()
+            d, m = self.flow.states, self.flow.driven
+            segment, _ = self.flow.segment(self.marks[place], self.marks[place + 1])
+            inputs = Segment([one.columns(0, d + m) for one in segment.terms], segment.off[:, : d + m])
+            control = self.scene.control[min(self.pieces[place], len(self.scene.control) - 1)]
+            self._paths[place] = inputs.applied(self.node(place).above(control))
+        return self._paths[place]
+
+    def _lines(self, segment: Segment, basis: Array) -> Lines:
+        """Rows of a segment."""
+        key = id(segment), basis.tobytes()
+        if key not in self._rows:
+            if len(self._rows) >= PATHS_KEPT:
+                self._rows.clear()
+            self._rows[key] = Lines.of(segment, basis), segment  # which is kept with its number
+        return self._rows[key][0]
+
     def blur(self, place: int) -> Array:
         """About how much of the state at a mark, ``(d,)``, is due to the size of the box of parameters and unknown."""
         if not self.flow.monomials.degree:
@@ -174,6 +199,40 @@ class States:
                 rad = self.effect(place)[number].rad[0]
                 found += rad.reshape(*rad.shape[:1], -1, convex.dimension).sum(axis=1) @ np.array(known(convex).radius)
         return found
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Rows of the terms of a segment, ``(N, M, b, d + w)``, and by how much they are ``off`` at any share of it, ``(b,
+    d + w)``; ``sizes (N, b, d + w)``: how large the terms are at every parameter."""
+
+    terms: Enclosed
+    off: Array
+    sizes: Array
+
+    @staticmethod
+    def of(segment: Segment, basis: Array) -> Lines:
+        """Those of a ``basis (b, d)``."""
+        rows = stacked([balls(row) for row in basis])
+        terms = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in segment.terms])
+        return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.sizes * OUTWARD)
+
+    def shifted(self, first: float, width: float, order: int) -> Enclosed:
+        """So many terms in the share of a part of the segment, ``(J, M, b, d + w)``."""
+        count = len(self.terms.mid)
+        table = shifted(first, width, count)
+        kept, size = table[:order], np.abs(self.terms.mid)
+        mid = np.tensordot(kept, self.terms.mid, axes=1)
+        rad = np.tensordot(kept, self.terms.rad + rounding(20 * count) * size, axes=1)
+        rad[0, 0] += self.off + np.tensordot(table[order:].sum(axis=0), self.sizes, axes=1)
+        return Enclosed(mid, rad * OUTWARD)
+
+
+def _exact(value: float) -> arb:
+    from flint import arb
+
+    return arb(value)
 
 
 def _blocks(mark: int) -> list[tuple[int, int]]:
