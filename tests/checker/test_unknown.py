@@ -17,10 +17,10 @@ from sparserob_core.checker.claims.answers import _chords, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost import effort
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
-from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
+from sparserob_core.checker.problem.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.reach.varying.flow import VaryingFlow
-from sparserob_core.checker.reach.varying.turns import in_turns
+from sparserob_core.checker.problem.turns import in_turns
 from sparserob_core.checker.sets import flat
 from sparserob_core.control.policies import policy
 from sparserob_core.control.policies.affine import AffinePolicy

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 import sparserob_core as sr
-from sparserob_core.checker.reach.integrals import DERIVED, Rows
+from sparserob_core.checker.problem.integrals import DERIVED, Rows
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.problem.terms.windows import Setting, Window, coefficients

@@ -68,6 +68,14 @@ class Model:
         return found
 
     @property
+    def constant(self) -> arb:
+        """What does not depend on anything."""
+        from flint import arb
+
+        first = self.parts[0]
+        return arb(0) if first is None else first[0]
+
+    @property
     def size(self) -> arb:
         """The most that it can be."""
         from flint import arb
@@ -103,7 +111,9 @@ class Model:
         right, monomials = self._other(other).parts, self.frame.monomials
         found: list[Part] = [None] * monomials.size
         for a, pairs in zip(self.parts, monomials.products_with, strict=True):
-            for j, k in () if a is None else pairs:
+            if a is None:
+                continue
+            for j, k in pairs:
                 b, total = right[j], found[k]
                 if b is not None:
                     found[k] = a * b if total is None else total + a * b
@@ -148,8 +158,7 @@ class Model:
         """A function of it: its Taylor polynomial at an exact number in the middle, with Lagrange's remainder."""
         from flint import arb, arb_series, ctx
 
-        first = self.parts[0]
-        c = arb(first[0].mid()) if first is not None and first.length() else arb(0)
+        c = arb(self.constant.mid())
         away = self - Model.number(self.frame, c)
         far, count = away.size.upper(), self.frame.order + self.frame.monomials.degree + 1
         before, ctx.cap = ctx.cap, count + 1

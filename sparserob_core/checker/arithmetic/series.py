@@ -176,7 +176,8 @@ def around(off: Array) -> arb_mat:
 
     if not np.isfinite(off).all():
         raise Unchecked("the response grows beyond what numbers can hold")
-    return arb_mat(*off.shape, [arb(0, float(x)) for x in off.ravel()])
+    rows, columns = off.shape
+    return arb_mat(rows, columns, [arb(0, float(x)) for x in off.ravel()])
 
 
 def middles(matrix: arb_mat) -> Array:

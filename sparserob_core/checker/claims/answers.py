@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, below, rational
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers
 from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
 from sparserob_core.checker.cost.effort import at_most
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
-from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.reach.measurable import LoopBeside, MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.reach.varying.loop import VaryingLoop

@@ -24,19 +24,18 @@ from sparserob_core.checker.flow.law import Box as ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+from sparserob_core.checker.problem.integrals import Running, integrating, spelt
+from sparserob_core.checker.problem.lasting import Lasting, on_one_grid
+from sparserob_core.checker.problem.superposition import parted
+from sparserob_core.checker.problem.turns import in_turns
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.closed_loop import middle
-from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.integrals import Running, integrating, spelt
-from sparserob_core.checker.reach.lasting import Lasting, on_one_grid
 from sparserob_core.checker.reach.measurable import Side, Together
-from sparserob_core.checker.reach.superposition import parted
-from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
+from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.varying.turns import in_turns
+from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -283,7 +282,11 @@ class Case:
         """The flows of the system, over boxes of its parameters and at single ones."""
         bound, until = self.problem.system.parameters, self.grid[-1]
         plant, box = Plant.of(self.problem.system, until), None if bound is None else bound.bounding_box()
-        return Flows(plant, until, ParameterBox() if box is None else ParameterBox.between(box.lower, box.upper))
+        return Flows(
+            plant,
+            until,
+            ParameterBox() if box is None else ParameterBox.between(box.lower.tolist(), box.upper.tolist()),
+        )
 
     @property
     def varying(self) -> Flows:
@@ -300,7 +303,11 @@ class Case:
     @cached_property
     def marks(self) -> list[float]:
         """The times from each of which to the next the state is a polynomial of the time."""
-        return self.grid if self.looped and self.changing is None else self.flows.at(self.flows.box.middle).marks(self.grid)
+        return (
+            self.grid
+            if self.looped and self.changing is None
+            else self.flows.at(self.flows.box.middle).marks(self.grid)
+        )
 
     def states(self, box: ParameterBox) -> States:
         """The states that are reached over a box of parameters, or over a larger one."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import below
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case, listed, number, numbers, written_policy
@@ -20,7 +21,6 @@ from sparserob_core.checker.claims.replay import excused, witnessed
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.reach.loop_tube import Still
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from itertools import groupby, pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -457,10 +457,11 @@ def of_fixed(case: Case) -> str:
 def _reached(case: Case, state: int) -> bool:
     """Whether an uncertain entry, a disturbance or the choice of an initial state may reach a state: follow the entries
     of ``A`` that are not 0 at every parameter."""
-    reaching, rows = _linked(case, state), sorted(_linked(case, state))
-    there, moved = case.flows.links
+    reaching = _linked(case, state)
+    rows = sorted(reaching)
+    there, changed = case.flows.links
     d, m = case.problem.system.states, case.flows.plant.driven
-    uncertain = bool(moved[rows, : d + m].any())
+    uncertain = bool(changed[rows, : d + m].any())
     bound = case.problem.disturbance
     free = [] if bound is None else [w for w, size in enumerate(known(bound).radius) if size > math.ulp(0.0)]
     pushed = bool(there[np.ix_(rows, [d + m + w for w in free])].any())

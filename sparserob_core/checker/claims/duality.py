@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import difference
-from sparserob_core.checker.cost.price import Price, Tangent
-from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.cost.price import Price, Tangent
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.flows import Flows
 from sparserob_core.checker.flow.still import modes_at
-from sparserob_core.checker.reach.lasting import Lasting, summed
+from sparserob_core.checker.outcome import Broken
+from sparserob_core.checker.problem.lasting import Lasting, summed
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.answers import Named, answers_of, commanded
 from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
 from sparserob_core.checker.claims.cells import Reached
 from sparserob_core.checker.claims.constraints import beside, erring_at, followed, follows, missed
 from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
-from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.still import held as held_for
 from sparserob_core.checker.flow.still import modes_at
+from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
+from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube

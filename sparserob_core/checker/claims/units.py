@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
-from sparserob_core.checker.claims.duality import before
-from sparserob_core.checker.outcome import RESOLVED, THIN, TOLERANCE, Unchecked
-from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.claims.duality import before
 from sparserob_core.checker.flow.flows import Flows
 from sparserob_core.checker.flow.still import held, modes_at
+from sparserob_core.checker.outcome import RESOLVED, THIN, TOLERANCE, Unchecked
+from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -208,7 +208,9 @@ class RowUnits:
         for k in range(count - 1, -1, -1):
             first = int(np.searchsorted(places, k, side="right"))
             if first < len(places):
-                Phi, Gamma, Delta = step.over(nodes[k], nodes[k + 1], bisect_right(self.problem.system.switches, nodes[k]))
+                Phi, Gamma, Delta = step.over(
+                    nodes[k], nodes[k + 1], bisect_right(self.problem.system.switches, nodes[k])
+                )
                 driven[k, first:], pushed[k, first:] = v[first:] @ Gamma, v[first:] @ Delta
                 v[first:] = v[first:] @ Phi
         start = np.asarray(self.problem.initial_state, dtype=float)
@@ -293,8 +295,7 @@ class _Steps:
             if both.nrows() >= COARSE:
                 flow, table = _held(_floats(parts["A"]), _floats(both), stop - start)
             else:
-                Phi, Gamma = held(parts["A"], both, arb(stop - start))
-                flow, table = _floats(Phi), _floats(Gamma)
+                flow, table = map(_floats, held(parts["A"], both, arb(stop - start)))
             self._known[key] = (flow, table[:, : self.controls], table[:, self.controls :])
         return self._known[key]
 

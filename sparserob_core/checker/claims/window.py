@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.sets.known import known

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:

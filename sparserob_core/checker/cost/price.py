@@ -15,8 +15,8 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm, stacked
-from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.cost.nominal import Changing, Walk, ball_of, nominal_states, walked
+from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic

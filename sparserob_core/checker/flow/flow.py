@@ -189,9 +189,7 @@ class Flow:
             self._segments[key] = solve(*stretch.between(0.0, stretch.stride * LONGER), stretch.units)
         return self._segments[key]
 
-    def within(
-        self, begin: float, end: float, start: float, stop: float, order: int
-    ) -> tuple[list[Series], Array]:
+    def within(self, begin: float, end: float, start: float, stop: float, order: int) -> tuple[list[Series], Array]:
         """What the time from ``begin`` on makes of states and of inputs that stay the same, on ``[start, stop]`` within
         ``[begin, end]``, on which the flow is a polynomial: so many terms in the share of the interval, ``(d, d + w)``
         each, and by how much they are off at most."""

@@ -50,7 +50,9 @@ class Box:
     def wider(self, extra: Sequence[float] | Array) -> Box:
         """The box with so much more at either side."""
         more = [h + float(x) for h, x in zip(self.halves, extra, strict=True)]
-        return Box(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more)) if any(extra) else self
+        return (
+            Box(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more)) if any(extra) else self
+        )
 
     def holds(self, other: Box) -> bool:
         """Whether another box is in this one; exactly, where sums of two floats are rounded."""
@@ -180,8 +182,10 @@ class Law:
         return found
 
     def _on_same(self, other: Stretch) -> Stretch:
+        """The law on a stretch of the timing."""
         phase = next(one for one in reversed(self.plant.phases) if one.begin <= other.start)
-        return replace(other, **dict(zip(("frame", "table"), self._table(other.start, other.stop, phase, self.monomials), strict=True)))
+        frame, table = self._table(other.start, other.stop, phase, self.monomials)
+        return replace(other, frame=frame, table=table)
 
     def _on(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
         whole = self._still(begin, until, phase)
@@ -217,7 +221,7 @@ class Law:
         """The law from ``start`` to ``stop``; ``None`` where that is too long: by what it is in the middle of the
         box."""
         try:
-            frame, middle = self._table(start, stop, phase, NONE)
+            _, middle = self._table(start, stop, phase, NONE)
             d, u = len(middle[0]), self.units
             size = np.array([[sum(float(c.abs_upper()) for c in e.coeffs()) for e in row] for row in middle[0]])
             lost = np.array([[sum(float(c.rad()) for c in e.coeffs()) for e in row] for row in middle[0]])
@@ -245,7 +249,9 @@ class Law:
         p[0] = Model.time(frame, (arb(start) + arb(stop)) / 2, (arb(stop) - arb(start)) / 2)
         for j, (middle, half) in enumerate(zip(self.box.middle, self.box.halves, strict=True)):
             wide = arb(half) if monomials.count else arb(0)
-            p[1 + j] = Model.number(frame, arb(middle)) if wide.is_zero() else Model.parameter(frame, j, arb(middle), wide)
+            p[1 + j] = (
+                Model.number(frame, arb(middle)) if wide.is_zero() else Model.parameter(frame, j, arb(middle), wide)
+            )
         values = phase.called(p)
         found = [[[arb_poly([])] * values.shape[1] for _ in range(values.shape[0])] for _ in range(monomials.size)]
         for (i, j), value in np.ndenumerate(values):

@@ -1,5 +1,5 @@
-"""The flow of ``x' = A x + F u`` over a share of time from 0 to 1, and at every parameter: a polynomial that is guessed,
-and then verified.
+"""The flow of ``x' = A x + F u`` over a share of time from 0 to 1, and at every parameter: a polynomial that is
+guessed, and then verified.
 
 Nothing about the guess is believed. The *defect* of a polynomial ``P`` is ``P' - A P - F``: what it leaves of the
 equation. It is bounded in balls, and by Gronwall's inequality the polynomial is off from the flow by at most what the
@@ -51,9 +51,7 @@ class Segment:
         count, (d, columns), first = len(self.terms), self.terms[0].shape, self.terms[0]
         a, b = ([one**n for n in range(count)] for one in (start, width))
         kept = min(order, count)
-        weights = [
-            [a[n - j] * b[j] * comb(n, j) if n >= j else arb(0) for n in range(count)] for j in range(kept)
-        ]
+        weights = [[a[n - j] * b[j] * comb(n, j) if n >= j else arb(0) for n in range(count)] for j in range(kept)]
         size, table, moved = d * columns, arb_mat(weights) * self._table, []
         for row in table.tolist():
             parts = [arb_mat(d, columns, row[k : k + size]) for k in range(0, len(row), size)]
@@ -112,7 +110,7 @@ def guess(equation: Equation, units: Array) -> list[Series]:
         size = (terms[-1].size / scale).max(axis=0)
         largest = np.maximum(largest, size)
         share = float((size / np.where(largest > 0.0, largest, 1.0)).max())
-        if n >= len(equation.F) and max(last, share) <= SHARP:
+        if n >= len(equation.F) and max(last, share) <= sharp:
             break
         last = share
     return terms

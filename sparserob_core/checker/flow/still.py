@@ -28,7 +28,7 @@ def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_m
     found = []
     for mode in system.modes:
         table = [
-            [value.parts[0][0] if isinstance(value, Model) else arb(float(value)) for value in row]
+            [value.constant if isinstance(value, Model) else arb(float(value)) for value in row]
             for row in Phase(0.0, 0.0, mode, timed=False).called(p)
         ]
         d, m = mode.states, mode.controls + (mode.c is not None)

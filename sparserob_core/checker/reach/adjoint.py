@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.outcome import Clock, Unchecked
-from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.arithmetic.series import middles, stacked
 from sparserob_core.checker.flow.units import OwnUnits
+from sparserob_core.checker.outcome import Clock, Unchecked
+from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.along import Curve
 from sparserob_core.checker.sets.known import known

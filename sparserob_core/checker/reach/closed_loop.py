@@ -22,9 +22,9 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import middles, norm, stacked
-from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.flow.still import held, modes_at
 from sparserob_core.checker.flow.units import OwnUnits
+from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.outcome import Clock
-from sparserob_core.checker.reach.adjoint import CENTRED, ORDER, Adjoint, Motion, subtract_times
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.still import modes_at
+from sparserob_core.checker.outcome import Clock
+from sparserob_core.checker.reach.adjoint import CENTRED, ORDER, Adjoint, Motion, subtract_times
 from sparserob_core.checker.reach.measurable import signed, swept
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
 from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
 from sparserob_core.checker.reach.tube import Around, Polynomial
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array

@@ -18,10 +18,10 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import middles, norm, stacked
-from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
 from sparserob_core.checker.flow.still import column, held
 from sparserob_core.checker.flow.units import OwnUnits
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
 from sparserob_core.checker.sets.along import Curve
 from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
 from sparserob_core.checker.sets.known import known

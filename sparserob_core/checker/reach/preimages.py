@@ -19,9 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.checker.arithmetic.balls import spanning
-from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.arithmetic.series import middles, stacked
 from sparserob_core.checker.flow.units import scaled
+from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
-from sparserob_core.checker.reach.lasting import Lasting
+from sparserob_core.checker.problem.lasting import Lasting
 from sparserob_core.control.sets.sets import ConvexSet
 
 if TYPE_CHECKING:
@@ -18,8 +18,8 @@ SAME = 1e-14  # of the horizon: durations closer than this are treated as one
 @final
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of ``x(0)`` and the set of
-    deviations from it, and the disturbance: its set and the breakpoints between which it is constant, of which some
+    """The ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of ``x(0)`` and the set
+    of deviations from it, and the disturbance: its set and the breakpoints between which it is constant, of which some
     components may be ``lasting`` longer."""
 
     grid: list[float]

@@ -16,7 +16,7 @@ import sparserob_core as sr
 from sparserob_core.checker.claims import constraints
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken
-from sparserob_core.checker.reach.integrals import integrating
+from sparserob_core.checker.problem.integrals import integrating
 from sparserob_core.control.transcription.terms.accumulated import accumulated
 
 TOO_MUCH, NOTHING = 5e-9, 3e-10

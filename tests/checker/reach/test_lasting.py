@@ -10,7 +10,7 @@ import pytest
 from flint import arb
 
 import sparserob_core as sr
-from sparserob_core.checker.reach.lasting import Lasting, on_one_grid, summed
+from sparserob_core.checker.problem.lasting import Lasting, on_one_grid, summed
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Product
 

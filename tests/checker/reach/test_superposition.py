@@ -11,7 +11,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.superposition import Parts, parted
+from sparserob_core.checker.problem.superposition import Parts, parted
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem

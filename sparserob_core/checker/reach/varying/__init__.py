@@ -1,1 +1,1 @@
-"""Known systems that change with time, as power series of it."""
+"""Systems that change with time: their loops, and what is missed in them."""

@@ -218,9 +218,7 @@ def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:
     return Enclosed(found.mid[..., columns], found.rad[..., columns])
 
 
-def above_chord(
-    law: Flow, rows: Array, start: float, stop: float, begun: Array, size: Array, first: int
-) -> Array:
+def above_chord(law: Flow, rows: Array, start: float, stop: float, begun: Array, size: Array, first: int) -> Array:
     """How far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to the time may be above their chords on ``[start,
     stop]``, which lies between two marks, for ``rows (r, d)``: ``(r,)``, at every parameter. Of every state they are at
     most ``begun (d,)`` at the start, and ``size (m,)`` is what drives them through the columns of ``[B E]`` from the
@@ -270,7 +268,7 @@ class SpreadExecution:
     numb: Sequence[int] = ()
     side: Side | Curve | Together | None = None
     _at: dict[tuple[float, ...], VaryingExecution] = field(default_factory=dict, repr=False)
-    _onward: dict[tuple[Box, float], tuple[Enclosed, Enclosed, np.ndarray]] = field(default_factory=dict, repr=False)
+    _known: dict[tuple[Flow, float], tuple[Enclosed, Enclosed, np.ndarray]] = field(default_factory=dict, repr=False)
 
     def at(self, parameter: Sequence[float]) -> VaryingExecution:
         """That at one parameter."""
@@ -311,48 +309,45 @@ class SpreadExecution:
         """How far integrals may be above what is linear between the corners of a box, by each parameter, but for what
         is beyond the degree; how much that is; and in the time above a chord between ``times``."""
         flow = self.flows.holding(box)
-        shares = np.array(box.halves) / np.where(np.array(flow.box.halves) > 0.0, flow.box.halves, 1.0)
-        shares, exponents = shares * (1.0 + rounding(4)), np.array(flow.monomials.exponents, dtype=float)
-        felt = np.where(np.isin(np.arange(c.size), list(self.numb)), 0.0, c)
-        wide, lost, curved = np.zeros(len(shares)), 0.0, exponents * (exponents - 1.0)
+        halves = np.array(flow.box.halves)
+        shares = np.array(box.halves) / np.where(halves > 0.0, halves, 1.0) * (1.0 + rounding(4))
+        exponents = np.array(flow.monomials.exponents, dtype=float)
+        reached = np.where(np.isin(np.arange(c.size), list(self.numb)), 0.0, 1.0)
+        wide, lost, bent = np.zeros(len(shares)), 0.0, 0.0
         for time in times:
-            size, off = self._summed(flow, felt[None], time)
-            wide = np.maximum(wide, (size[0] @ curved) * shares**2 / 2.0)
+            size, off = self._summed(flow, (c * reached)[None], time)
+            wide = np.maximum(wide, (size[0] @ (exponents * (exponents - 1.0))) * shares**2 / 2.0)
             lost = max(lost, float(off[0]))
-        bent = 0.0
         if times[-1] > times[0]:
-            size, off = self._summed(flow, np.where(np.isin(np.arange(c.size), list(self.numb)), 0.0, np.eye(c.size)), times[0])
-            sizes = self._sizes
-            place = min(max(0, int(np.searchsorted(self.breakpoints, times[0], side="right")) - 1), len(sizes) - 1)
-            begun = size.sum(axis=1) + off
-            bent = float(above_chord(flow, felt[None], times[0], times[-1], begun, sizes[place], self.first)[0])
+            size, off = self._summed(flow, np.diag(reached), times[0])
+            place = int(np.searchsorted(self.breakpoints, times[0], side="right")) - 1
+            entering = self._sizes[min(max(0, place), len(self._sizes) - 1)]
+            begun = (size.sum(axis=1) + off) * OUTWARD
+            bent = float(above_chord(flow, (c * reached)[None], times[0], times[-1], begun, entering, self.first)[0])
         return wide * OUTWARD, lost * OUTWARD, bent * OUTWARD
 
     def _summed(self, flow: Flow, rows: Array, time: float) -> tuple[Array, Array]:
         """What errors add along ``rows (n, d)`` by a time, at most, and in absolute values: every coefficient in the
         parameters ``(n, M)``, and what is beyond these ``(n,)``."""
-        key = flow.box, time
-        if key not in self._onward:
-            if len(self._onward) >= KEPT:
-                self._onward.clear()
-            self._onward[key] = self._reaching(flow, time)
-        onward, kernels, owner = self._onward[key]
+        key = flow, time
+        if key not in self._known:
+            if len(self._known) >= KEPT:
+                self._known.clear()
+            self._known[key] = self._reaching(flow, time)
+        onward, kernels, owner = self._known[key]
         size, off = np.zeros((len(rows), flow.monomials.size)), np.zeros(len(rows))
-        for q in range(len(owner)):
-            along = Enclosed(
-                *(np.einsum("nd,mde->mne", one, part[q])
-                  for one, part in ((rows, onward.mid), (np.abs(rows), onward.rad + rounding(rows.shape[1]) * np.abs(onward.mid))))
-            )  # fmt: skip
-            found = ring(flow.monomials, Enclosed(kernels.mid[q].swapaxes(-1, -2), kernels.rad[q].swapaxes(-1, -2)),
-                         Enclosed(along.mid.swapaxes(-1, -2), along.rad.swapaxes(-1, -2)))  # fmt: skip
-            entering = self._sizes[owner[q]]  # of u from -1 to 1, half of the interval
-            size += np.einsum("pmjn,j,p->nm", np.abs(found.mid), entering, MEANS[: len(found.mid)])
-            off += np.einsum("pmjn,j->n", found.rad, entering)
+        lost = onward.rad + rounding(rows.shape[1]) * np.abs(onward.mid)
+        for q, piece in enumerate(owner):
+            along = Enclosed(np.swapaxes(rows @ onward.mid[q], 1, 2), np.swapaxes(np.abs(rows) @ lost[q], 1, 2))
+            kernel = Enclosed(np.swapaxes(kernels.mid[q], 2, 3), np.swapaxes(kernels.rad[q], 2, 3))
+            found, entering = ring(flow.monomials, kernel, along), self._sizes[piece]  # (p + 1, M, m, n)
+            size += np.einsum("pkjn,j,p->nk", np.abs(found.mid), entering, MEANS[: len(found.mid)])
+            off += np.einsum("pkjn,j->n", found.rad, entering)
         return size * OUTWARD, off * OUTWARD
 
     def _reaching(self, flow: Flow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
-        """The transitions from the end of every interval between marks to a time, ``(q, M, d, d)``; the kernels of these
-        intervals, ``(q, p + 1, M, d, m)``; and the piece of the command that each is in."""
+        """The transitions from the end of every interval between marks to a time, ``(q, M, d, d)``; the kernels of
+        these intervals, ``(q, p + 1, M, d, m)``; and the piece of the command that each is in."""
         ends = [t for t in self.breakpoints.tolist() if t < time]
         marks = flow.marks([*ends, time]) if ends else [time]
         steps = [flow.over(*pair)[0] for pair in pairwise(marks)]
