@@ -62,14 +62,14 @@ class Flows:
 
     def holding(self, box: Box) -> Flow:
         """A flow over a box, or over a larger one where the expansion is close over all of that."""
+        if self._is_still:
+            return self.over(box, self.degree)
         part, most = self.box, WIDE.get(len(box.middle), 2)
-        for _ in range(0 if self._is_still else HALVINGS):
-            if part == box or not part.holds(box):
+        for _ in range(HALVINGS):
+            if not part.holds(box) or part == box or self._is_close(part, most):
                 break
-            if self._is_close(part, most):
-                return self.over(part, most)
             part = next((half for half in part.halved(self._axis(part)) if half.holds(box)), box)
-        return self.over(box, self.degree)
+        return self.over(part if part.holds(box) else box, most)
 
     @cached_property
     def _is_still(self) -> bool:

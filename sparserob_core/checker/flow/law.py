@@ -211,11 +211,22 @@ class Law:
             found = Stretch(begin, until, *self._table(begin, until, phase, self.monomials), self.units)
         except Unchecked:
             return None
-        if not found.is_still:
+        if not found.is_still or (phase.timed and self._hides(found, phase)):
             return None
         d, u, longest = len(self.units), self.units, 2.0 ** ceil(log2(until - begin))
         pace = float((found.sizes[0][:, :d] * u / u[:, None]).sum(axis=1).max(initial=0.0))
         return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / pace))) if pace > 0.0 else longest)
+
+    def _hides(self, found: Stretch, phase: Phase) -> bool:
+        """Whether the balls of a law hold what changes with the time: those of one time are less wide."""
+        time = (found.start + found.stop) / 2
+        _, table = self._table(time, time, phase, self.monomials)
+        return any(
+            a.length() and float(a[0].rad()) > 2.0 * float(b[0].rad())
+            for part, other in zip(found.table, table, strict=True)
+            for row, beside in zip(part, other, strict=True)
+            for a, b in zip(row, beside, strict=True)
+        )
 
     def _stretch(self, start: float, stop: float, phase: Phase) -> Stretch | None:
         """The law from ``start`` to ``stop``; ``None`` where that is too long: by what it is in the middle of the

@@ -31,12 +31,52 @@ FAR = 300.0  # of the exponent in Gronwall's inequality: beyond, nothing is know
 
 @final
 @dataclass(frozen=True, eq=False)
+class Powers:
+    """A matrix ``(d, n)`` that is a polynomial in a share of time, with ``count`` coefficients, one above the other in
+    a ``stack``, and off by at most ``off (d, n)`` at every share and parameter."""
+
+    stack: Series
+    count: int
+    off: Array
+
+    def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
+        """The matrix on shares from ``start`` on, as so many terms of a polynomial in the share of the ``width``; and
+        by how much that is off at most."""
+        from flint import arb, arb_mat
+
+        (d, columns), count, kept = self.off.shape, self.count, min(order, self.count)
+        a, b = ([one**n for n in range(count)] for one in (start, width))
+        weights = [[a[n - j] * b[j] * comb(n, j) if n >= j else arb(0) for n in range(count)] for j in range(kept)]
+        size, moved = d * columns, []
+        for row in (arb_mat(weights) * self._table).tolist():
+            parts = [arb_mat(d, columns, row[k : k + size]) for k in range(0, len(row), size)]
+            moved.append(Series(self.stack.monomials, parts))
+        beyond = shifted(float(start.abs_upper()), float(width.abs_upper()), count)[kept:].sum(axis=0)
+        return moved, np.einsum("n,nij->ij", beyond, self.sizes) * OUTWARD + self.off
+
+    @cached_property
+    def _table(self) -> arb_mat:
+        """Every entry of every coefficient, a row for each power."""
+        from flint import arb_mat
+
+        entries, size = [part.entries() for part in self.stack.parts], self.off.size
+        return arb_mat([[x for part in entries for x in part[n * size : (n + 1) * size]] for n in range(self.count)])
+
+    @cached_property
+    def sizes(self) -> Array:
+        """How large the entries of every coefficient are at most, ``(N, d, n)``."""
+        return self.stack.size.reshape(self.count, *self.off.shape)
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Segment:
     """``[Phi Gamma]``, what a share ``x`` of the time makes of the states at its beginning and of inputs that stay the
     same: ``sum_n terms_n x^n``, off by at most ``off (d, d + w)`` at every share and parameter."""
 
     terms: list[Series]
     off: Array
+    _stacks: dict[int, Series] = field(default_factory=dict, repr=False)
 
     def at(self, share: arb) -> Series:
         """The flow at a share of the time."""
@@ -44,36 +84,28 @@ class Segment:
         return value.within(off)
 
     def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
-        """The flow on shares from ``start`` on, as so many terms of a polynomial in the share of the ``width``; and by
-        how much that is off at most."""
-        from flint import arb, arb_mat
-
-        count, (d, columns), first = len(self.terms), self.terms[0].shape, self.terms[0]
-        a, b = ([one**n for n in range(count)] for one in (start, width))
-        kept = min(order, count)
-        weights = [[a[n - j] * b[j] * comb(n, j) if n >= j else arb(0) for n in range(count)] for j in range(kept)]
-        size, table, moved = d * columns, arb_mat(weights) * self._table, []
-        for row in table.tolist():
-            parts = [arb_mat(d, columns, row[k : k + size]) for k in range(0, len(row), size)]
-            moved.append(Series(first.monomials, parts))
-        beyond = shifted(float(start.abs_upper()), float(width.abs_upper()), count)[kept:].sum(axis=0)
-        return moved, np.einsum("n,nij->ij", beyond, self.sizes) * OUTWARD + self.off
-
-    def applied(self, columns: Series) -> Segment:
-        """The flow of some columns of states and inputs."""
-        return Segment([term * columns for term in self.terms], self.off @ columns.size * OUTWARD)
+        """`Powers.within` of the flow."""
+        return self.powers.within(start, width, order)
 
     @cached_property
-    def _table(self) -> arb_mat:
-        """Every entry of every coefficient, a row for each term."""
+    def powers(self) -> Powers:
+        """The flow as a polynomial."""
         from flint import arb_mat
 
-        return arb_mat([[x for part in term.parts for x in part.entries()] for term in self.terms])
+        (rows, columns), first = self.terms[0].shape, self.terms[0]
+        parts = [
+            arb_mat(rows * len(self.terms), columns, [x for term in self.terms for x in term.parts[k].entries()])
+            for k in range(first.monomials.size)
+        ]
+        return Powers(Series(first.monomials, parts), len(self.terms), self.off)
 
-    @cached_property
-    def sizes(self) -> Array:
-        """How large the entries of every term are at most, ``(N, d, d + w)``."""
-        return np.array([term.size for term in self.terms])
+    def applied(self, columns: Series) -> Powers:
+        """The flow of some columns of states and of the first inputs."""
+        used = columns.shape[0]
+        if used not in self._stacks:
+            self._stacks[used] = self.powers.stack.columns(0, used)
+        off = self.off[:, :used] @ columns.size * OUTWARD
+        return Powers(self._stacks[used] * columns, self.powers.count, off)
 
 
 def shifted(start: float, width: float, count: int) -> Array:
@@ -110,7 +142,7 @@ def guess(equation: Equation, units: Array) -> list[Series]:
         size = (terms[-1].size / scale).max(axis=0)
         largest = np.maximum(largest, size)
         share = float((size / np.where(largest > 0.0, largest, 1.0)).max())
-        if n >= len(equation.F) and max(last, share) <= sharp:
+        if n >= max(len(equation.A), len(equation.F)) and max(last, share) <= sharp:  # a state may be a polynomial
             break
         last = share
     return terms

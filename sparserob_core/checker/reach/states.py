@@ -15,7 +15,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import Series, identity, stacked
 from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.segment import Segment, shifted
+from sparserob_core.checker.flow.segment import Powers, Segment, shifted
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
@@ -41,7 +41,7 @@ class States:
     _places: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
     _nodes: dict[int, Series] = field(default_factory=dict, repr=False)
     _driven: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
-    _paths: dict[int, Segment] = field(default_factory=dict, repr=False)
+    _paths: dict[int, Powers] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[int, bytes], tuple[Lines, Segment]] = field(default_factory=dict, repr=False)
     _effects: dict[int, tuple[Enclosed, Enclosed]] = field(default_factory=dict, repr=False)
 
@@ -168,16 +168,14 @@ class States:
             found.append((scene.initial_set, Enclosed(*(np.swapaxes(p, 2, 3)[None] for p in (begun.mid, begun.rad)))))
         return Enclosed(state.mid[..., 0], state.rad[..., 0]), found
 
-    def _path(self, place: int) -> Segment:
+    def _path(self, place: int) -> Powers:
         """The undisturbed state from one mark to the next, ``(d, 1)``."""
         if place not in self._paths:
             if len(self._paths) >= PATHS_KEPT:
                 self._paths.clear()
-            d, m = self.flow.states, self.flow.driven
             segment, _ = self.flow.segment(self.marks[place], self.marks[place + 1])
-            inputs = Segment([one.columns(0, d + m) for one in segment.terms], segment.off[:, : d + m])
             control = self.scene.control[min(self.pieces[place], len(self.scene.control) - 1)]
-            self._paths[place] = inputs.applied(self.node(place).above(control))
+            self._paths[place] = segment.applied(self.node(place).above(control))
         return self._paths[place]
 
     def _lines(self, segment: Segment, basis: Array) -> Lines:
@@ -216,7 +214,7 @@ class Lines:
         """Those of a ``basis (b, d)``."""
         rows = stacked([balls(row) for row in basis])
         terms = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in segment.terms])
-        return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.sizes * OUTWARD)
+        return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.powers.sizes * OUTWARD)
 
     def shifted(self, first: float, width: float, order: int) -> Enclosed:
         """So many terms in the share of a part of the segment, ``(J, M, b, d + w)``."""
