@@ -11,16 +11,17 @@ import pytest
 from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.arithmetic.jets import kepler_root
+from sparserob_core.checker.arithmetic.models import kepler_root
 from sparserob_core.checker.claims import case, cells, constraints
 from sparserob_core.checker.claims.answers import _chords, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost import effort
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.problem.lasting import Lasting, on_one_grid
-from sparserob_core.checker.reach.preimages import Pushed
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.problem.turns import in_turns
+from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets import flat
 from sparserob_core.control.policies import policy
 from sparserob_core.control.policies.affine import AffinePolicy
@@ -142,12 +143,12 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "the numbers of the system are not exact",
     ),
     "a time before the system begins": (
-        lambda: VaryingFlow(ROOT, 1.0)._segment_of(-0.5, 0.0),
+        lambda: Flow(Plant.of(ROOT, 1.0), 1.0).step(-0.5, 0.0),
         Unchecked,
         "not known from -0.5 to 0",
     ),
     "from one polynomial to the next": (
-        lambda: VaryingFlow(ROOT, 1.0)._segment_of(0.0, 1.0),
+        lambda: Flow(Plant.of(ROOT, 1.0), 1.0).step(0.0, 1.0),
         Unchecked,
         "no polynomial from 0.0 to 1.0",
     ),

@@ -15,13 +15,13 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.reach.varying.execution import SpreadExecution
-from sparserob_core.checker.reach.varying.spread import SpreadTube
 from sparserob_core.experiment.assemble import ControlExperiment, assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
 from tests.known_answers.test_checks import pieces, verified
 from tests.known_answers.test_execution_beside import FINE, HORIZON, PIECES, PROBLEM, TIME
 from tests.support import tampering
+from tests.support.tubes import tube_of
 
 Config = dict[str, Any]
 B = [[0.0, 0.4], [1.0, 0.0]]
@@ -234,7 +234,7 @@ def test_the_checker_bounds_errors_over_boxes_and_cells_of_time_from_above_and_b
     case = Case(experiment.problem, experiment.control, experiment.disturbance, {"decision": CONTROL})
     delivered, c, box = case.execution, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
     assert isinstance(delivered, SpreadExecution)
-    tube = SpreadTube(case.spread(box), np.eye(2), box)
+    tube = tube_of(case, box)
     start, stop = 1.52, 1.53
     found = delivered.over(c, [start, stop], box, tube.flow)
     powers = np.array(tube.flow.monomials.exponents)
@@ -248,7 +248,7 @@ def test_the_checker_bounds_errors_over_boxes_and_cells_of_time_from_above_and_b
             assert over - low < found.off + found.over + 1e-5
     assert found.off < 2e-3
     half = ((-0.0175, 0.0025), (-0.0125, 0.0075))
-    smaller = delivered.over(c, [start, start + 0.005], half, SpreadTube(case.spread(half), np.eye(2), half).flow)
+    smaller = delivered.over(c, [start, start + 0.005], half, tube_of(case, half).flow)
     assert smaller.off < 0.26 * found.off  # of second order in the widths and in the time
     middle = delivered.at(tube.flow.centre).added(c, start)[0]
     assert found.ends[0, 0] - found.off - found.over <= middle

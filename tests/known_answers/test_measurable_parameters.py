@@ -16,7 +16,6 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.reach.varying.execution import SpreadExecution
-from sparserob_core.checker.reach.varying.spread import SpreadTube
 from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal
 from sparserob_core.experiment.assemble import ControlExperiment, assemble
@@ -24,6 +23,7 @@ from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
 from tests.known_answers.test_checks import pieces, verified
 from tests.support import tampering
+from tests.support.tubes import tube_of
 
 Config = dict[str, Any]
 Matrix = list[list[float]]
@@ -300,7 +300,7 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
     case = Case(experiment.problem, experiment.control, experiment.disturbance, {"decision": control})
     strayed, c, box = case.strayed, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
     assert isinstance(strayed, SpreadExecution)
-    tube = SpreadTube(case.spread(box), np.eye(2), box)
+    tube = tube_of(case, box)
     start, stop = 1.52, 1.53
     found = strayed.over(c, [start, stop], box, tube.flow)
     powers = np.array(tube.flow.monomials.exponents)
@@ -314,7 +314,7 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
             assert over - low < found.off + found.over + 1e-5
     assert found.off < 2e-3
     whole = ((-0.05, -0.03), (0.1, 0.05))
-    flow = SpreadTube(case.spread(whole), np.eye(2), whole).flow
+    flow = tube_of(case, whole).flow
     wide, truth = strayed.over(c, [1.5], whole, flow), strayed.at(flow.centre).added(c, 1.5)[0]
     assert wide.ends[0, 0] + 1e-6 < truth < wide.ends[0, 0] + wide.off  # there it is concave
     step, n = 1.5 / 900, 900
@@ -324,5 +324,5 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
     heights = PLANTS["two" if bound is BOX else "triangle"][2](np.array(rows)) - np.array(rows) @ about
     assert truth == pytest.approx(float(heights.sum()) * step, rel=1e-5)
     half = ((-0.0175, 0.0025), (-0.0125, 0.0075))
-    smaller = strayed.over(c, [start, start + 0.005], half, SpreadTube(case.spread(half), np.eye(2), half).flow)
+    smaller = strayed.over(c, [start, start + 0.005], half, tube_of(case, half).flow)
     assert smaller.off < 0.26 * found.off  # of second order in the widths and in the time

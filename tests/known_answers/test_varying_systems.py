@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flint import ctx
 from scipy.optimize import linprog
 
 import sparserob_core as sr
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.experiment.check.check import check
 from tests.known_answers.test_checks import pieces, verified
@@ -408,8 +410,9 @@ def test_random_analytic_coefficients_are_integrated_in_any_unit_of_time_and_len
     allowed = flow.error[0] * np.hstack([np.ones((d, d)), flow.sizes[0, :, :1]])
     assert missed.max() <= 1e-14 * max(1.0, float((np.abs(again) / u[:, None]).max()))
     assert (off <= allowed + 2 * missed).all()
-    Phi, Gamma, _ = VaryingFlow(system, horizon).over(0.0, horizon)
-    for i, row in enumerate([*one, *more] for one, more in zip(Phi.tolist(), Gamma.tolist(), strict=True)):
+    with ctx.workprec(192):
+        Phi, Gamma, _ = Flow(Plant.of(system, horizon), horizon).over(0.0, horizon)
+    for i, row in enumerate(Phi.beside(Gamma).matrix.tolist()):
         for j, ball in enumerate(row):
             far = abs(np.longdouble(float(ball.mid())) - again[i, j])
             assert far <= float(ball.rad()) + 2 * abs(found[i, j] - again[i, j]) + 1e-15 * abs(again[i, j])

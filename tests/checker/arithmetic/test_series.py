@@ -1,177 +1,118 @@
-"""Guards checker/arithmetic/series: exponentials of series hold the exact ones, and what is left out of them is
-bounded."""
+"""Guards checker/arithmetic/series: products of matrices that depend on parameters hold the products at every
+parameter, whatever is beyond the degree."""
 
 from __future__ import annotations
 
-import math
+from itertools import product as every
 
 import numpy as np
 import pytest
-import scipy.linalg
 from flint import arb, arb_mat, ctx
 
-from sparserob_core.checker.arithmetic import series
-from sparserob_core.checker.arithmetic.jets import Monomials
-from sparserob_core.checker.arithmetic.series import Exponentials, Series, _tail, norm
+from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
+from sparserob_core.checker.arithmetic.series import Series, around, dot, identity, norm, products, stacked, upper
+from sparserob_core.checker.outcome import Unchecked
 
 
 def matrix(values):
     return arb_mat([[arb(float(v)) for v in row] for row in np.atleast_2d(values)])
 
 
-@pytest.mark.parametrize("size", [0.1, 0.2, 0.249, 0.25, 0.4])
-@pytest.mark.parametrize("terms", [0, 1, 4, 8])
-def test_what_the_exponential_leaves_out_is_at_most_its_tail_and_not_much_less(size, terms):
-    with ctx.workprec(200):
-        missing = arb(size).exp() - sum((arb(size) ** k / arb(k).fac() for k in range(terms + 1)), arb(0))
-        bound = _tail(arb(size), terms)
-        assert missing < bound
-        assert bound < 2.0 * missing
-        assert _tail(arb(0.99), 0) > arb(0.99).exp() - 1
+def values_of(series):
+    return np.array([[[float(x.mid()) for x in row] for row in part.tolist()] for part in series.parts])
 
 
-def test_the_exponential_of_a_number_that_depends_on_a_parameter_is_held_to_all_digits():
-    """``exp((a + b delta) s)`` has the coefficients ``e^(a s) (b s)^k / k!``."""
-    known = Monomials(1, 6)
-    for a, b in ((0.094, 1e-30), (0.2, 1e-30), (0.3, 0.1), (-2.0, 0.7), (5.0, -3.0), (-40.0, 2.0)):
-        for precision in (64, 96, 160):
-            with ctx.workprec(precision):
-                parts = [matrix([[a]]), matrix([[b]]), *[matrix([[0.0]])] * 5]
-                found = [part[0, 0] for part in Series(known, parts).exp().parts]
-            with ctx.workprec(600):
-                for k, ball in enumerate(found):
-                    truth = arb(a).exp() * arb(b) ** k / arb(k).fac()
-                    assert ball.contains(truth.mid()), (a, b, precision, k)
-                    # squaring back is exact but for rounding: relative to the first coefficient
-                    assert float(ball.rad()) < 2.0 ** (40 - precision) * math.exp(max(a, 0.0) + abs(b))
+def at(series, point):
+    """The matrix at parameters from -1 to 1."""
+    powers = [np.prod(np.asarray(point) ** np.array(e, dtype=int)) for e in series.monomials.exponents]
+    return sum((part * arb(float(p)) for part, p in zip(series.parts, powers, strict=True)), series.parts[0] * 0)
 
 
-def test_exponentials_that_are_products_of_one_another_hold_the_exact_ones_and_hardly_grow():
-    """``exp((a + b delta) s)`` at ticks in any order, and up to a tick beside them."""
-    known, (a, b), tick = Monomials(1, 4), (-1.7, 0.3), 2.0**-40
-    rng = np.random.default_rng(3)
+def random(rng, monomials, shape, wide=0.0):
+    """One whose balls are wide, and matrices within it as a function of the parameters."""
+    mid = rng.normal(size=(monomials.size, *shape))
+    rad = wide * rng.uniform(size=mid.shape)
+    parts = [arb_mat([[arb(float(a), float(b)) for a, b in zip(*rows, strict=True)]
+                      for rows in zip(*one, strict=True)]) for one in zip(mid, rad, strict=True)]  # fmt: skip
+    return Series(monomials, parts), mid
+
+
+@pytest.mark.parametrize(("count", "degree"), [(0, 0), (1, 1), (1, 3), (2, 1), (2, 2), (3, 2)])
+def test_a_product_holds_that_of_the_matrices_at_every_parameter(count, degree):
+    rng, known = np.random.default_rng(count + 10 * degree), Monomials(count, degree)
+    points = [*rng.choice([-1.0, 1.0], size=(8, count)), *rng.uniform(-1, 1, size=(8, count))]
     with ctx.workprec(96):
-        every = Exponentials(Series(known, [matrix([[a]]), matrix([[b]]), *[matrix([[0.0]])] * 3]), tick)
-        for ticks in (
-            *(2**38 * k for k in (2, 1, 3)),
-            *(2**36 * k + 1 for k in range(12)),
-            *rng.integers(1, 2**41, 20),
-        ):
-            at, near = every.at(int(ticks)), every.at(int(ticks)) * every.around(1)
-            for part, beside, k in zip(at.parts, near.parts, range(5), strict=True):
-                with ctx.workprec(300):
-                    for found, off in ((part, 0.0), (beside, 0.99), (beside, -0.99)):
-                        time = arb(tick) * (arb(int(ticks)) + arb(off))
-                        assert found[0, 0].contains((arb(a) * time).exp() * (arb(b) * time) ** k / arb(k).fac())
-                assert float(part[0, 0].rad()) < 2.0**-70
-                assert float(beside[0, 0].rad()) < 2.0**-34
+        for _ in range(5):
+            (left, _), (right, _) = random(rng, known, (3, 2)), random(rng, known, (2, 4))
+            found = left * right
+            for point in points:
+                for ball, truth in zip(at(found, point).entries(), (at(left, point) * at(right, point)).entries(),
+                                       strict=True):  # fmt: skip
+                    assert ball.overlaps(truth)
+                    assert abs(ball.mid() - truth.mid()) <= ball.rad() + truth.rad()
 
 
-def test_exponentials_hold_those_of_every_time_of_a_ball_in_any_units_and_in_many_strides():
-    """A rotation whose speed depends on a parameter, in units that are 2^40 apart: ``exp`` of ``(a + b delta) J t``."""
-    known, (a, b), c = Monomials(1, 3), (3.0, 0.5), 2.0**40
-    turn, order = np.array([[0.0, 1.0 / c], [-c, 0.0]]), range(4)
+@pytest.mark.parametrize(("count", "degree"), [(1, 1), (1, 4), (2, 2), (2, 3)])
+def test_all_that_is_beyond_the_degree_is_needed_at_a_corner_and_no_more_is_added(count, degree):
+    """With positive numbers, for which nothing cancels."""
+    rng, known = np.random.default_rng(1), Monomials(count, degree)
+    A, B = rng.uniform(0.5, 1.0, size=(2, known.size, 2, 2))
     with ctx.workprec(96):
-        parts = [matrix(a * turn), matrix(b * turn), matrix(0 * turn), matrix(0 * turn)]
-        every = Exponentials(Series(known, parts), 2.0**-20, [1.0, c])
-        for centre, rad in ((0.0, 2.0**-30), (0.25, 0.0), (7.0, 2.0**-50), (37.7, 2.0**-40), (300.0, 0.0)):
-            found = every.of(arb(centre, rad))
-            for time in (arb(centre) - arb(rad), arb(centre), arb(centre) + arb(rad)):
-                for part, k in zip(found.parts, order, strict=True):
-                    with ctx.workprec(400):
-                        angle, scale = arb(a) * time, (arb(b) * time) ** k / arb(k).fac()
-                        # the k-th derivative of cosine and sine
-                        waves = [angle.cos(), -angle.sin(), -angle.cos(), angle.sin()]
-                        cosine, sine = scale * waves[k % 4], -scale * waves[(k + 1) % 4]
-                        assert part[0, 0].contains(cosine.mid()) and part[1, 1].contains(cosine.mid())
-                        assert part[0, 1].contains((sine / arb(c)).mid()) and part[1, 0].contains((-sine * c).mid())
-            most = 2.0**-60 + 4.0 * rad * (1.0 + b * centre) ** 3
-            for part in found.parts:
-                sizes = np.array([[float(x.rad()) for x in row] for row in part.tolist()])
-                assert (sizes * [[1.0, c], [1.0 / c, 1.0]]).max() < most * (1.0 + centre**3)
-        for length in (2.0**-9, 0.3, 2.0):
-            inside = every.within(arb(length))
-            for time in np.linspace(0.0, length, 5):
-                assert inside.parts[0][0, 1].contains(arb(a * time).sin() / c)
-            assert float(inside.parts[0][0, 0].rad()) < 3.0 * (np.exp(3.5 * length) - 1.0)
+        left, right = (Series(known, [matrix(one) for one in two]) for two in (A, B))
+        (first, *_) = (left * right).parts
+        kept = sum(A[i] @ B[j] for i, j, _ in known.products)
+        beyond = A.sum(axis=0) @ B.sum(axis=0) - kept
+        radii = np.array([[float(x.rad()) for x in row] for row in first.tolist()])
+    assert (radii >= beyond * (1 - 1e-12)).all()
+    assert (radii <= beyond * (1 + 1e-6)).all()
 
 
-def test_what_is_left_out_of_a_sum_of_powers_is_in_every_entry():
-    """With as few terms as one, the first entries are off by the whole tail, in their units."""
-    with ctx.workprec(64):
-        every = Exponentials(Series(Monomials(0, 0), [matrix([[0.0, 8.0], [0.0, 0.0]])]), 1.0, [8.0, 1.0])
-        every.__dict__["_terms"] = 1
-        (found,) = every.of(arb(0.125)).parts
-        for (i, j), unit in {(0, 0): 1.0, (0, 1): 8.0, (1, 0): 0.125, (1, 1): 1.0}.items():
-            assert float(found[i, j].rad()) >= unit * 0.125**2 / 2.0
-            assert float(found[i, j].rad()) < unit * 0.125**2 * 1.1
-
-
-def test_whole_strides_are_remembered_and_no_more_than_are_kept(monkeypatch):
-    monkeypatch.setattr(series, "STRIDES_KEPT", 8)
-    with ctx.workprec(96):
-        every = Exponentials(Series(Monomials(1, 1), [matrix([[0.2]]), matrix([[0.01]])]), 1.0)
-        for ticks in range(1, 200):
-            assert every.at(ticks).parts[0][0, 0].contains((arb(0.2) * ticks).exp())
-            assert every.at(ticks) is every.at(ticks)
-        assert len(every._strides) < 8 + 9
-
-
-def test_an_exponential_in_too_many_strides_is_no_number():
-    for value in (1e30, float("inf"), float("nan")):
-        every = Exponentials(Series(Monomials(1, 1), [matrix([[value]]), matrix([[1.0]])]), 1.0)
-        for found in (every.of(arb(1)), every.within(arb(1))):
-            assert not found.parts[0][0, 0].is_finite()
-    every = Exponentials(Series(Monomials(1, 1), [matrix([[1.0]]), matrix([[1.0]])]), 1.0)
-    assert not every.of(arb(0, 0.6)).parts[0][0, 0].is_finite()  # wider than a stride: 1.2 times the norm
-    none = Exponentials(Series(Monomials(1, 1), [matrix([[0.0]]), matrix([[0.0]])]), 1.0)
-    assert float(none.of(arb(1e6)).parts[0][0, 0].mid()) == 1.0
-
-
-def test_the_exponential_of_a_matrix_that_depends_on_two_parameters_is_that_at_each_of_them():
-    rng, known = np.random.default_rng(1), Monomials(2, 9)
-    A = rng.normal(size=(known.size, 3, 3)) * 0.02 ** np.array([sum(e) for e in known.exponents])[:, None, None]
-    A[3:] = 0.0
-    with ctx.workprec(96):
-        found = Series(known, [matrix(a) for a in A]).exp()
-        values = np.array([[[float(x.mid()) for x in row] for row in part.tolist()] for part in found.parts])
-    for delta in rng.uniform(-1, 1, size=(10, 2)):
-        powers = np.prod(delta[None] ** np.array(known.exponents), axis=1)
-        truth = scipy.linalg.expm(np.einsum("m,mij->ij", powers, A))
-        assert np.abs(np.einsum("m,mij->ij", powers, values) - truth).max() < 1e-12
-
-
-def test_coefficients_in_variables_that_do_not_appear_have_no_tail():
+def test_factors_of_which_most_is_nothing_lose_nothing_either():
     known = Monomials(2, 2)
-    with ctx.workprec(64):
-        parts = [matrix([[0.1]]), matrix([[0.0]]), matrix([[0.2]]), *[matrix([[0.0]])] * 3]
-        exponents = known.exponents
-        assert exponents[2] == (1, 0)
-        for e, part in zip(exponents, Series(known, parts).exp().parts, strict=True):
-            assert part[0, 0].is_zero() == (e[1] > 0)
-
-
-def test_an_exponential_that_is_too_large_is_no_number():
-    known = Monomials(1, 1)
-    with ctx.workprec(64):
-        parts = Series(known, [matrix([[1e19]]), matrix([[1.0]])]).exp().parts
-        assert not any(part[0, 0].is_finite() for part in parts)
-        assert Series(known, [matrix([[-1e9]]), matrix([[1.0]])]).exp().parts[0][0, 0].is_finite()
-
-
-def test_the_state_and_its_integral_are_those_of_a_constant_input():
-    rng = np.random.default_rng(2)
-    A, B, time = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), 0.8
-    known = Monomials(1, 3)
     with ctx.workprec(96):
-        zeros = [matrix(np.zeros((3, 3)))] * 3, [matrix(np.zeros((3, 2)))] * 3
-        Phi, Gamma = Series(known, [matrix(A), *zeros[0]]).held(Series(known, [matrix(B), *zeros[1]]), arb(time))
-        plain = Series(Monomials(0, 0), [matrix(A)]).held(Series(Monomials(0, 0), [matrix(B)]), arb(time))
-    for found in ((Phi, Gamma), plain):
-        values = [np.array([[float(x.mid()) for x in row] for row in one.parts[0].tolist()]) for one in found]
-        assert values[0] == pytest.approx(scipy.linalg.expm(A * time), abs=1e-12)
-        assert values[1] == pytest.approx(np.linalg.solve(A, values[0] - np.eye(3)) @ B, abs=1e-11)
-    assert all(x.contains(0) for part in (*Phi.parts[1:], *Gamma.parts[1:]) for x in part.entries())
+        for i, j in every(range(known.size), repeat=2):
+            parts = [[matrix([[0.0]]) for _ in range(known.size)] for _ in range(2)]
+            parts[0][i], parts[1][j] = matrix([[2.0]]), matrix([[3.0]])
+            left, right = (Series(known, one) for one in parts)
+            assert left.there == [k == i for k in range(known.size)]
+            e = tuple(a + b for a, b in zip(known.exponents[i], known.exponents[j], strict=True))
+            found = left * right
+            if e in known.number:
+                assert found.parts[known.number[e]][0, 0] == 6
+                assert sum(found.there) == 1
+            else:
+                assert float(found.parts[0][0, 0].rad()) >= 6.0
+
+
+def test_the_balls_of_factors_are_in_products_and_sizes():
+    rng, known = np.random.default_rng(4), Monomials(1, 2)
+    with ctx.workprec(96):
+        (left, A), (right, _) = (random(rng, known, (2, 2), wide=0.25) for _ in range(2))
+        found = left * right
+        for _ in range(40):
+            a, b = (np.array([[[float(x.mid()) + float(x.rad()) * rng.choice([-0.99, 0.99]) for x in row]
+                               for row in part.tolist()] for part in one.parts]) for one in (left, right))  # fmt: skip
+            s = float(rng.choice([-1.0, 1.0, 0.3]))
+            powers = s ** np.arange(3)
+            truth = np.einsum("m,mij->ij", powers, a) @ np.einsum("m,mij->ij", powers, b)
+            assert all(x.contains(float(v)) for x, v in zip(at(found, [s]).entries(), truth.ravel(), strict=True))
+            assert (np.abs(np.einsum("m,mij->ij", powers, a)) <= left.size).all()
+            assert (np.abs(a) <= left.sizes).all()
+        most = np.array([[[float(x.abs_upper()) for x in row] for row in part.tolist()] for part in left.parts])
+    assert (left.size <= most.sum(axis=0) * (1 + 1e-9)).all()
+    assert np.allclose(values_of(left.middle), A)
+    assert all(x.is_exact() for part in left.middle.parts for x in part.entries())
+
+
+def test_what_a_series_is_off_by_is_in_the_balls_of_its_constant():
+    known = Monomials(1, 1)
+    with ctx.workprec(96):
+        found = Series.constant(known, matrix([[1.0, 2.0]])).within(np.array([[0.5, 0.0]]))
+        assert found.parts[0][0, 0].contains(1.4999) and not found.parts[0][0, 0].contains(1.51)
+        assert found.parts[0][0, 1] == 2 and found.parts[1][0, 0] == 0
+    for bad in (np.inf, np.nan):
+        with pytest.raises(Unchecked, match="beyond what numbers can hold"):
+            around(np.array([[bad]]))
 
 
 def test_products_and_sums_of_series_are_those_of_polynomials():
@@ -180,18 +121,13 @@ def test_products_and_sums_of_series_are_those_of_polynomials():
     A[1] = 0.0
     with ctx.workprec(96):
         left, right = (Series(known, [matrix(m) for m in one]) for one in (A, B))
-        product, total = left * right, left + right
+        product, total, less = left * right, left + right, left - right
         scaled, applied = left.scaled(arb(-0.5)), left.applied(matrix(B[0]))
         truth = np.zeros_like(A)
         for i, j, k in known.products:
             truth[k] += A[i] @ B[j]
-        for one, expected in ((product, truth), (total, A + B), (scaled, -A / 2), (applied, A @ B[0])):
-            values = np.array([[[float(x.mid()) for x in row] for row in part.tolist()] for part in one.parts])
-            assert values == pytest.approx(expected, abs=1e-14)
-        size = left.size()
-    sizes = [float(np.linalg.norm(a)) for a in A]
-    assert float(size.mid()) == pytest.approx(sum(sizes))
-    assert size.is_exact() or float(size.lower()) >= sum(sizes) * (1 - 1e-15)
+        for one, expected in ((product, truth), (total, A + B), (less, A - B), (scaled, -A / 2), (applied, A @ B[0])):
+            assert values_of(one) == pytest.approx(expected, abs=1e-14)
 
 
 def test_the_norm_of_a_ball_matrix_holds_frobenius_norms():
@@ -201,3 +137,45 @@ def test_the_norm_of_a_ball_matrix_holds_frobenius_norms():
         wide = arb_mat([[arb(1, 0.5), arb(0, 0.25)]])
         assert norm(wide).contains(arb(1.5**2 + 0.25**2).sqrt().mid()) and norm(wide).contains(0.5)
         assert norm(matrix(np.zeros((2, 2)))) == 0
+
+
+def test_parts_of_matrices_are_put_together_and_taken_apart():
+    rng, known = np.random.default_rng(5), Monomials(1, 1)
+    A, B = rng.normal(size=(2, 2, 2, 3))
+    with ctx.workprec(96):
+        left, right = (Series(known, [matrix(m) for m in one]) for one in (A, B))
+        both, below = left.beside(right), left.above(matrix([[7.0, 8.0, 9.0]]))
+        assert (values_of(both) == np.concatenate([A, B], axis=2)).all()
+        assert (values_of(both.columns(1, 4)) == np.concatenate([A, B], axis=2)[:, :, 1:4]).all()
+        assert both.columns(2, 2).shape == (2, 0)
+        assert (values_of(below)[:, :2] == A).all() and values_of(below)[:, 2].tolist() == [[7, 8, 9], [0, 0, 0]]
+        assert (values_of(below.rows(2)) == A).all()
+        assert (values_of(left.transpose()) == A.transpose(0, 2, 1)).all()
+        assert left.beside(left.columns(0, 0)).shape == (2, 3)
+        total = dot([left, right], [left.transpose(), right.transpose()])
+        truth = left * left.transpose() + right * right.transpose()
+        assert (values_of(total) == values_of(truth)).all()
+        assert Series.known(matrix(A[0])).matrix == matrix(A[0])
+        assert identity(2) == matrix(np.eye(2))
+        assert upper(arb(1, 0.5)) >= 1.5 and upper(arb(1, 0.5)).is_exact()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 13])
+def test_products_of_steps_are_what_the_later_ones_make_of_every_state(count):
+    rng = np.random.default_rng(6)
+    steps = rng.normal(size=(count, 2, 2))
+    with ctx.workprec(96):
+        found = products([Series.known(matrix(one)) for one in steps])
+    assert len(found) == count + 1
+    for k, one in enumerate(found):
+        truth = np.linalg.multi_dot([np.eye(2), *steps[k:][::-1], np.eye(2)])
+        assert values_of(one)[0] == pytest.approx(truth, abs=1e-12)
+
+
+def test_a_coefficient_that_is_only_close_to_nothing_is_kept():
+    known = Monomials(1, 2)
+    with ctx.workprec(96):
+        near = Series(known, [stacked([[arb(1)]]), stacked([[arb(0, 1e-20)]]), stacked([[arb(0)]])])
+        assert near.there == [True, True, False]
+        assert (near * near).parts[1][0, 0].contains(arb(2e-20))
+        assert NONE.size == 1

@@ -32,18 +32,6 @@ class Erring:
         return 0.01 * float(FAR @ np.abs(c))
 
 
-class Ticking:
-    """A clock that is that of the times."""
-
-    def duration(self, ticks: float) -> Any:
-        from flint import arb
-
-        return arb(ticks)
-
-    def ticks(self, start: float, stop: float) -> float:
-        return stop - start
-
-
 @pytest.fixture(autouse=True)
 def precision():
     with ctx.workprec(96):
@@ -52,7 +40,7 @@ def precision():
 
 def beside(basis: np.ndarray) -> Beside:
     window = Window("path", Ellipsoid(np.zeros(3), np.eye(3)), 0.0, 1.0, 3)
-    return Beside(window, basis, np.zeros((len(basis), 0)), cast(Any, Ticking()), [0.0, 1.0], [], cast(Any, [Erring()]))
+    return Beside(window, basis, np.zeros((len(basis), 0)), cast(Any, None), [0.0, 1.0], [], cast(Any, [Erring()]))
 
 
 def test_a_direction_is_the_nearest_float_and_off_by_what_is_left() -> None:

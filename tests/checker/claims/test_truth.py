@@ -16,8 +16,8 @@ from sparserob_core.checker.claims import cells, claims, constraints, multiplier
 from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Duality, Row
+from sparserob_core.checker.flow.still import held
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.reach.flow import held
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.sets.sets import Box

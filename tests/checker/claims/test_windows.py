@@ -18,7 +18,8 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.jets import Monomials
+from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims import claims, constraints, multipliers, replay
 from sparserob_core.checker.claims.case import Case, numbers
 from sparserob_core.checker.claims.causal import _shared, causal_bound
@@ -26,7 +27,6 @@ from sparserob_core.checker.claims.cells import Place, _cut
 from sparserob_core.checker.cost.nominal import integrated
 from sparserob_core.checker.cost.price import _semidefinite
 from sparserob_core.checker.outcome import RESOLVED, Broken, Clock, Finding, Unchecked
-from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters

@@ -1,4 +1,4 @@
-"""Guards checker/reach/integrals.py by a plant whose integrals are known by hand, and beside the states that a
+"""Guards checker/problem/integrals.py by a plant whose integrals are known by hand, and beside the states that a
 transcription makes of the same records.
 
 ``x' = u + w``, ``x(0) = 1``, two pieces of length 1, ``u = (0.5, -0.5)``, ``|w| <= 0.25``: ``int x = 2.5 +- 0.5``.

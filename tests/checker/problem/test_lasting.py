@@ -1,4 +1,4 @@
-"""Guards checker/reach/lasting.py: what components give that have one value on several pieces is their sum, with the
+"""Guards checker/problem/lasting.py: what components give that have one value on several pieces is their sum, with the
 first of these, no more certain than the parts; and where they may jump."""
 
 from __future__ import annotations

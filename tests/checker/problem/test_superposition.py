@@ -1,4 +1,4 @@
-"""Guards checker/reach/superposition: seen at the deviations of any parameters, the larger system is the problem's at
+"""Guards checker/problem/superposition: seen at the deviations of any parameters, the larger system is the problem's at
 these parameters, corners hold the box exactly, and what is not affine is refused."""
 
 from __future__ import annotations

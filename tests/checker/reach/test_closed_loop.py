@@ -3,6 +3,7 @@ what a cell adds to its chord is what its curvature owes, in balls."""
 
 from __future__ import annotations
 
+import itertools
 from fractions import Fraction
 from functools import cache, partial
 from types import SimpleNamespace
@@ -13,11 +14,12 @@ from flint import arb_mat, ctx
 
 import sparserob_core.checker.reach.varying.loop as varying_loop
 from sparserob_core.checker.claims.cells import prove
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
 from sparserob_core.checker.reach.loop_tube import LoopTube, Still
 from sparserob_core.checker.reach.measurable import MeasurableLoop
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 from sparserob_core.checker.sets.known import known
@@ -39,7 +41,8 @@ def made(name):
     kind = MeasurableLoop if case.measurable else ClosedLoop
     if name in CHANGING:
         kind = VaryingMeasurableLoop if case.measurable else VaryingLoop
-        kind = partial(kind, law=VaryingFlow(case.system, float(case.grid[-1])))
+        until = float(case.grid[-1])
+        kind = partial(kind, law=Flow(Plant.of(case.system, until), until))
     loop = kind(
         case.system,
         case.start.tolist(),
@@ -69,8 +72,8 @@ def places(case):
 
 def parts(loop):
     """The pieces of the grid, cut where a system in t becomes another power series of it."""
-    cuts = np.unique([*loop.grid, *(loop.law.ends if isinstance(loop, VaryingLoop) else ())])
-    for a, b in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
+    cuts = loop.law.marks(loop.grid) if isinstance(loop, VaryingLoop) else loop.grid
+    for a, b in itertools.pairwise(cuts):
         yield int(np.searchsorted(loop.grid, a, side="right")) - 1, a, b
 
 
@@ -79,7 +82,7 @@ def test_the_state_in_balls_is_that_of_a_loop_that_measures(name):
     case, loop, v, M = made(name)
     times = np.array([time for _, time in places(case)])
     states, _, controls = case.states(v, M, times)
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for (piece, time), truth in zip(places(case), states, strict=True):
             found = loop.state(piece, time)
             assert table(found) == pytest.approx(truth, abs=1e-10)
@@ -103,7 +106,7 @@ def test_what_a_cell_adds_is_an_eighth_of_its_square_times_the_curvature_of_all_
     case, loop, v, M = made(name)
     rng = np.random.default_rng(2)
     sizes = np.concatenate([[1.0], loop.radii])
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
             for share in (1.0, 0.6, 0.1, 0.004):
                 low = float(a + rng.uniform(0.0, 1.0 - share) * (b - a))
@@ -121,7 +124,7 @@ def test_what_a_cell_adds_is_an_eighth_of_its_square_times_the_curvature_of_all_
 def test_no_time_of_a_cell_is_above_its_chord_by_more_than_that(name):
     case, loop, v, M = made(name)
     rng = np.random.default_rng(5)
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for piece, a, b in parts(loop):
             low, high = sorted(rng.uniform(a, b, size=2).tolist())
             ends = np.array([[float(h.upper()) for h in loop.highest(piece, t, H)] for t in (low, high)])
@@ -134,7 +137,7 @@ def test_no_time_of_a_cell_is_above_its_chord_by_more_than_that(name):
 def test_a_parabola_is_an_eighth_of_its_acceleration_above_its_chord_and_no_more_in_a_system_in_t():
     """The double integrator, written as one that changes with time."""
     loop = made("level")[1]
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for piece, (low, high) in ((0, (0.25, 0.5)), (1, (0.75, 1.0))):
             (bent,) = loop.bent(piece, low, high, np.array([[1.0, 0.0]]))
             answers = np.array([[float(x.mid()) for x in row] for row in loop.inputs(piece).tolist()])[0]
@@ -147,17 +150,17 @@ def test_what_a_power_series_on_a_cell_leaves_out_is_added(monkeypatch):
     monkeypatch.setattr(varying_loop, "ORDER", 2)
     case, loop, v, M = made("turning")
     share, most = np.linspace(0.0, 1.0 - 1e-12, 31), 0.0
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for piece, low, high in parts(loop):
             ends = np.array([[float(h.upper()) for h in loop.highest(piece, t, H)] for t in (low, high)])
             states, _, _ = case.states(v, M, low + share * (high - low))
             over = case.height(H @ states) - ((1.0 - share)[:, None] * ends[0] + share[:, None] * ends[1])
             assert (over.max(axis=0) <= loop.bent(piece, low, high, H) + 1e-12).all()
             # of a term of the third power, which is left out, a chord leaves this much at most
-            terms, _ = loop.law.within(low, high, 3)
+            terms, _ = loop.law.within(low, high, low, high, 4)
             both = arb_mat([*loop.state(piece, low).tolist(), *loop.drives[piece].tolist()])
-            third = np.abs(H @ table(terms[3] * both)) @ np.concatenate([[1.0], loop.radii])
-            second = np.abs(H @ table(terms[2] * both)) @ np.concatenate([[1.0], loop.radii])
+            third = np.abs(H @ table(terms[3].matrix * both)) @ np.concatenate([[1.0], loop.radii])
+            second = np.abs(H @ table(terms[2].matrix * both)) @ np.concatenate([[1.0], loop.radii])
             bent = loop.bent(piece, low, high, H)
             assert (bent >= second / 4.0 + third * 2.0 / 3.0**1.5).all()
             most = max(most, float(third.max()))
@@ -169,7 +172,7 @@ def test_measurable_disturbances_reach_what_signals_that_jump_often_reach_and_li
     """A signal that jumps at given times only reaches less, by the square of how far these are apart."""
     case, loop, v, M = made(name)
     rng = np.random.default_rng(6)
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
             for time in (a + (b - a) * 10 / case.fine, b) if piece in (0, case.grid.size - 2) else (b,):
                 truth = case.height(H @ case.states(v, M, np.array([time - 1e-13]))[0][0])
@@ -198,7 +201,7 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
     rng = np.random.default_rng(7)
     a = rng.normal(size=(4, 2))
     middle = case.bound.middle()
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for piece in (0, len(case.grid) - 2):
             length, kernel = float(case.grid[piece + 1] - case.grid[piece]), loop.kernel(piece)
             for share in (1.0, 0.37):
@@ -244,7 +247,7 @@ def test_no_deviation_comes_beyond_the_chords_of_a_cell_and_what_they_may_miss(n
     case, loop, v, M = made(name)
     rng = np.random.default_rng(8)
     normals, weights = np.array([[1.0, 0.2], [-0.3, 1.0]]), rng.uniform(-1.0, 1.0, (2, M.shape[2]))
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         alone, both = LoopTube(loop, normals, np.zeros((2, 0))), LoopTube(loop, normals, weights)
         for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
             for width in (0.5, 0.02):
@@ -285,7 +288,7 @@ def test_an_excess_of_a_set_is_judged_in_the_unit_of_how_far_it_reaches():
     state = case.states(v, M, np.array([0.25]))[0]
     height = case.height(np.array([[-1.0, 0.0]]) @ state)[0, 0]
     z = np.array([-1.0, 0.0])
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for excess, left in ((5e-9, True), (2e-9, True), (5e-10, False), (-1e-9, False)):
             radius = float(height) / (1.0 + excess)
             if left:
@@ -298,7 +301,7 @@ def test_an_excess_of_a_set_is_judged_in_the_unit_of_how_far_it_reaches():
 
 
 def test_what_has_no_times_is_as_far_out_as_at_its_place():
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         still = Still(
             lambda place, rows: [x * (place + 1) for x in (rows * exactly(np.ones((2, 1)))).entries()], np.eye(2)
         )
@@ -311,7 +314,7 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
     """``x' = w`` on a grid that divides the pieces of the control: 1 after the first, nothing of it later."""
     plant = LinearSystem(np.zeros((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)))
     grid, pieces = [0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0], [0.0, 1.0, 2.0, 3.0]
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         for changes, seen in (
             ([0.0, 1.0, 2.0], [{}, {0: 1.0}, {1: 1.0}]),
             ([0.0, 0.5, 1.5], [{}, {0: 0.5, 1: 0.5}, {1: 0.5, 2: 0.5}]),
@@ -347,7 +350,8 @@ def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_z
             while more := {i for j in reached for i in np.flatnonzero(A[:, j]).tolist()} - reached:
                 reached |= more
             seen[list(reached), place] = True
-        flow = SimpleNamespace(links={"A": (arb_mat(A.tolist()),), "E": (arb_mat(E.tolist()),)})
+        stretch = SimpleNamespace(sizes=(np.hstack([A, E]),))
+        flow = SimpleNamespace(states=d, driven=0, law=SimpleNamespace(stretches=[stretch]))
         found = VaryingLoop.pushed(SimpleNamespace(_flow=flow), np.eye(mw, dtype=int)[entries].tolist())
         assert found.pattern.tolist() == seen.tolist()
         assert (found.states, found.entries) == (seen.any(axis=1).sum(), seen.any(axis=0).sum())

@@ -11,8 +11,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 import sparserob_core as sr
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.flow import stacked
 
 A = np.array([[0.0, 1.0], [-4.0, -0.3]])
 B = np.array([[0.2, 0.0], [1.0, -0.7]])

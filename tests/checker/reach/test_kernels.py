@@ -1,4 +1,4 @@
-"""Guards checker/reach/measurable and the products of disturbance_support: integrals of the largest of polynomials, and
+"""Guards checker/reach/measurable and products of checker/sets/polynomials: integrals of the largest of polynomials, and
 products of matrices that are known to a radius, in exact arithmetic and by hand."""
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import pytest
 from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.reach.disturbance_support import Operator
-from sparserob_core.checker.reach.flow import OwnUnits, stacked
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.units import OwnUnits
 from sparserob_core.checker.reach.measurable import APART, Kernel, Side, Together, _equal, _valued, swept
-from sparserob_core.checker.sets.polynomials import Enclosed
+from sparserob_core.checker.sets.polynomials import Enclosed, product
 from sparserob_core.control.sets.sets import Box, NormBall, Zonotope
 
 
@@ -140,9 +140,9 @@ def exact(values):
 def test_a_product_with_a_matrix_that_is_known_to_a_radius_holds_every_product(left, right):
     rng = np.random.default_rng(2)
     mid, rows = rng.normal(size=(4, 30)), rng.normal(size=(30, 5))
-    A = Operator(mid, left * rng.uniform(0.5, 1.0, size=mid.shape))
+    A = Enclosed(mid, left * rng.uniform(0.5, 1.0, size=mid.shape))
     B = Enclosed(rows, right * rng.uniform(0.5, 1.0, size=rows.shape))
-    found = A.applied(B)
+    found = product(A, B)
     corners = []
     for sign in (1.0, -1.0):  # as far from the middle as the radii let them, all in one direction
         for i in range(4):

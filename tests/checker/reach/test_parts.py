@@ -4,10 +4,8 @@ that solves."""
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import replace
 from time import sleep
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -16,16 +14,18 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.bernstein import highest
-from sparserob_core.checker.arithmetic.jets import Monomials, expanded
-from sparserob_core.checker.arithmetic.series import Series
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.cells import _to_blame
 from sparserob_core.checker.claims.duality import Duality
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.law import Box as ParameterBox
+from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.flow.units import OwnUnits
 from sparserob_core.checker.outcome import LOOKED, Broken, Clock, Unchecked
-from sparserob_core.checker.reach import disturbance_support
-from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.flow import Flow, OwnUnits, balanced, flows, held, stacked
 from sparserob_core.checker.reach.measurable import Kernel
-from sparserob_core.checker.reach.tube import Polynomial, Tube
+from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.reach.states import States
+from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -200,32 +200,29 @@ def plant(nu, spread):
     return LinearSystem(A, B, E, parameters=Box(np.full(nu, -spread), np.full(nu, spread)), names=names)
 
 
-def tube_of(system, control, disturbance, bound, degree, theta, start):
+def tube_of(system, control, disturbance, bound, degree, theta, start, initial_set=None):
     grid = merge_grids(control.breakpoints, disturbance.breakpoints)
     held = theta[
         np.clip(np.searchsorted(control.breakpoints, grid.breakpoints[:-1], side="right") - 1, 0, control.pieces - 1)
     ]
-    nu = system.parameter_count
-    box = system.parameters
-    centre, radius = (
-        (np.zeros(0), np.zeros(0)) if box is None else ((box.lower + box.upper) / 2, (box.upper - box.lower) / 2)
-    )
+    box, until = system.parameters, float(grid.breakpoints[-1])
+    around = ParameterBox() if box is None else ParameterBox.between(box.lower.tolist(), box.upper.tolist())
     scene = Scene(
         grid.breakpoints.tolist(),
         [stacked([[arb(float(u))]]) for u in held],
         start.tolist(),
         bound,
         disturbance.breakpoints[:-1].tolist(),
+        initial_set,
     )
-    return (
-        Tube(
-            [Flow(system, tuple(centre.tolist()), tuple(radius.tolist()), degree if nu else 0)],
-            scene,
-            np.eye(system.states),
-        ),
-        centre,
-        radius,
-    )
+    flow = Flow(Plant.of(system, until), until, around, degree if around.middle else 0)
+    tube = Tube(Rows(States(flow, scene), np.eye(system.states)), flow.box)
+    return tube, np.array(around.middle), np.array(around.halves)
+
+
+def until(tube, start, stop):
+    """The end of a cell from ``start`` on across which the flow is one polynomial."""
+    return min([stop, *(mark for mark in tube.rows.states.marks if mark > start)])
 
 
 @pytest.mark.first(16)
@@ -242,8 +239,9 @@ def test_tubes_are_above_the_worst_case_and_not_far_above(nu, spread, degree, ne
     true = worst_case(system, control, disturbance, bound, initial_state=start)
     with ctx.workprec(96):
         tube, centre, radius = tube_of(system, control, disturbance, bound, degree, theta, start)
-        for piece, (a, b) in enumerate(itertools.pairwise(tube.scene.grid)):
+        for piece, (a, b) in enumerate(itertools.pairwise(tube.rows.states.scene.grid)):
             a, b = a + 0.1 * (b - a), b - 0.75 * (b - a)
+            b = until(tube, a, b)
             directions = rng.normal(size=(3, 2))
             for direction, poly in zip(directions, tube.cells(piece, a, b, directions, sharp), strict=True):
                 share, delta = rng.uniform(size=50), rng.uniform(-1, 1, size=(50, nu))
@@ -275,8 +273,8 @@ def test_what_initial_states_lose_while_they_switch_is_laid_to_what_it_depends_o
         )
         system = LinearSystem(A, B, parameters=Box(np.array([-0.2]), np.array([0.2])))
         with ctx.workprec(96):
-            tube, *_ = tube_of(system, control, control, None, 6, np.array([1.0, -1.0]), start)
-            tube.scene = replace(tube.scene, initial_set=NormBall(p=1.0, radius=0.1, centre=np.zeros(2)))
+            corners = NormBall(p=1.0, radius=0.1, centre=np.zeros(2))
+            tube, *_ = tube_of(system, control, control, None, 6, np.array([1.0, -1.0]), start, corners)
             (poly,) = tube.cells(0, 0.0, 0.5, np.array([[1.0, 0.3]]))
         assert poly.kinks > 1e-3
         assert (poly.turning > 0.2 * poly.kinks) if because else poly.turning == 0.0
@@ -320,32 +318,6 @@ def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor)
         assert (np.abs(value - truth) <= kernel.off[part] + 1e-13 * size[:, None]).all()
 
 
-def test_a_drive_of_nothing_but_rounding_does_not_choose_the_units():
-    A, speed = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([np.nextafter(0.0, 1.0), 0.5])
-    assert (balanced(A, 4.0, speed) == balanced(A, 4.0, np.array([0.0, 0.5]))).all()
-
-
-def test_ages_hold_wherever_one_looks_from_or_equal_pieces_are_not_taken_for_it():
-    """`_uneven` promises for all places at once what is otherwise looked at for each of them."""
-    rng, bound, start = np.random.default_rng(4), SETS["box"], np.array([-1.0, 0.5])
-    for off, promised in ((0.0, True), (1e-13, False), (1e-4, False)):
-        ends = np.linspace(0.0, 3.0, 61)
-        ends[1:-1] += off * rng.uniform(-1, 1, size=59)
-        control = sr.Dictionary.indicators(ends)
-        with ctx.workprec(96):
-            tube, _, _ = tube_of(plant(0, 0.0), control, control, bound, 0, np.zeros(60), start)
-            sigmas = tube.sigmas[0]
-            jumps, tick = sigmas._jumps, tube.scene.tick
-            off_by = [
-                np.abs((node - jumps[k::-1]) / tick - sigmas._ages[: k + 1]).max() for k, node in enumerate(jumps)
-            ]
-            assert (sigmas._uneven <= 1.0) == promised
-            assert max(off_by) <= sigmas._uneven
-            found = sigmas._of_equal_pieces(known(bound), float(jumps[40]), 0, np.eye(2))
-            assert (found is None) == (off_by[40] > 1.0)
-            assert (found is None) == (not promised)
-
-
 def test_a_lag_is_the_exponential_of_the_whole_way_whatever_it_was_carried_on_from():
     """`_lags` goes from time to time; on pieces of many lengths, over many of them, it holds what one step gives."""
     ends = np.concatenate([np.linspace(0.0, 1.0, 150), 1.0 + np.sort(np.random.default_rng(5).uniform(0.0, 2.0, 40))])
@@ -355,36 +327,12 @@ def test_a_lag_is_the_exponential_of_the_whole_way_whatever_it_was_carried_on_fr
     )
     with ctx.workprec(96):
         duality, time = Duality(problem, sr.Dictionary.indicators(ends), None), float(ends[-3])
-        lags = duality._lags(flows(stiff, ()), np.array([1.0, 2.0]), time, {float(s) for s in ends[:-3]})
+        lags = duality._lags((), np.array([1.0, 2.0]), time, {float(s) for s in ends[:-3]})
         assert len(lags) == ends.size - 3
         for s, lag in lags.items():
             exact = scipy.linalg.expm(stiff.A.T * (time - s)) @ [1.0, 2.0]
             assert [float(x.mid()) for x in lag[:2]] == pytest.approx(exact.tolist(), abs=1e-11)
             assert max(float(x.rad()) for x in lag) < 1e-15
-
-
-@pytest.mark.parametrize("name", ["box", "polytope", "zonotope"])
-def test_sums_over_equal_pieces_are_those_piece_by_piece_and_no_further_off(name):
-    rng, bound, control = np.random.default_rng(2), SETS[name], uniform(41, 2.0)
-    start, z = np.array([-1.0, 0.5]), rng.normal(size=(3, 2))
-    with ctx.workprec(96):
-        tubes = [
-            tube_of(plant(0, 0.0), control, control, bound, 0, rng.uniform(-1, 1, size=41), start)[0] for _ in range(2)
-        ]
-        for piece in (0, 7, 8, 40):
-            a, b = tubes[0].scene.grid[piece], tubes[0].scene.grid[piece + 1]
-            for begin, end in ((a, b), (a + 0.25 * (b - a), b), (b, b)):
-                ticks = tubes[0].scene.ticks(begin, end)
-                with patch.object(disturbance_support, "FEWEST_SUMMED", (1, 1)):
-                    sums = tubes[0].sigmas[0]._of_equal_pieces(known(bound), begin, ticks, z)
-                    assert sums is not None
-                    moved, error, kinks, box = sums
-                with patch.object(disturbance_support, "FEWEST_SUMMED", (1_000, 1_000)):
-                    plain, off, *_ = tubes[1].sigmas[0].bounds(begin, ticks, z, False)
-                assert (np.abs(moved - plain).sum(axis=(1, 2)) <= error + off).all()
-                assert (error <= 1.01 * off + 1e-14).all()
-                assert (kinks <= error).all()
-                assert not box.any()
 
 
 def test_the_remainder_is_needed_and_enough_on_a_wide_box():
@@ -398,7 +346,7 @@ def test_the_remainder_is_needed_and_enough_on_a_wide_box():
         tube, _, _ = tube_of(system, control, control, None, 2, np.zeros(2), np.array([1.0]))
         (poly,) = tube.cells(1, 1.0, 1.0, np.eye(1))
     assert poly.coefficients[0] == pytest.approx([1.0, 1.0, 0.5])
-    assert np.e - 2.5 <= poly.expansion < 1.0
+    assert np.e - 2.5 <= poly.error < 2.0  # Gronwall's factor is e
 
 
 def test_the_remainder_is_enough_for_initial_states_in_a_set():
@@ -408,11 +356,11 @@ def test_the_remainder_is_enough_for_initial_states_in_a_set():
     )
     control = uniform(2, 1.0)
     with ctx.workprec(96):
-        known_start, _, _ = tube_of(system, control, control, None, 2, np.zeros(2), np.array([0.0]))
-        scene = replace(known_start.scene, initial_set=Box(-np.ones(1), np.ones(1)))
-        (poly,) = Tube(known_start.flows, scene, known_start.basis).cells(1, 1.0, 1.0, np.eye(1))
+        anywhere = Box(-np.ones(1), np.ones(1))
+        tube, _, _ = tube_of(system, control, control, None, 2, np.zeros(2), np.array([0.0]), anywhere)
+        (poly,) = tube.cells(1, 1.0, 1.0, np.eye(1))
     assert poly.coefficients[0] == pytest.approx([1.0, 1.0, 0.5])
-    assert np.e - 2.5 <= poly.expansion < 1.0
+    assert np.e - 2.5 <= poly.error - poly.kinks < 2.0
 
 
 @pytest.mark.parametrize("second", [1.0, 100.0, 2.0**20])
@@ -432,26 +380,7 @@ def test_the_remainder_is_a_small_share_of_the_states_in_any_units(second, metre
         tube, _, _ = tube_of(system, control, control, None, 8, np.full(10, 1e-3), start)
         found = tube.cells(9, horizon, horizon, np.eye(4))
     sizes = metre * np.array([1e3, 1e3, 1.0 / second, 1.0 / second])
-    assert (np.array([poly.expansion for poly in found]) < 1e-9 * sizes).all()
-
-
-def test_a_coefficient_that_is_only_close_to_nothing_is_kept():
-    known = Monomials(1, 2)
-    with ctx.workprec(96):
-        near = Series(known, [stacked([[arb(1)]]), stacked([[arb(0, 1e-20)]]), stacked([[arb(0)]])])
-        assert near.there == [True, True, False]
-        assert (near * near).parts[1][0, 0].contains(arb(2e-20))
-        assert near.scaled(arb(1e-9)).exp().parts[0][0, 0].contains(arb(1e-9).exp())
-
-
-def test_a_series_keeps_to_the_variables_that_appear():
-    known = Monomials(2, 3)
-    with ctx.workprec(96):
-        parts = [stacked([[arb(0.5 if e == (0, 1) else 0)]]) for e in known.exponents]
-        found = Series(known, parts).exp().parts
-    for e, part in zip(known.exponents, found, strict=True):
-        truth = 0.5 ** e[1] / math.factorial(e[1]) if e[0] == 0 else 0.0
-        assert part[0, 0].is_zero() if e[0] else abs(float(part[0, 0].mid()) - truth) < 1e-15
+    assert (np.array([poly.error for poly in found]) < 1e-9 * sizes).all()
 
 
 @pytest.mark.parametrize("nu", [0, 1, 2])
@@ -487,53 +416,6 @@ def test_rows_of_the_dual_are_those_of_the_transcription(nu):
             assert 0 <= mine < 4, row
 
 
-FUNCTIONS = [
-    "sin(p1)",
-    "cos(p1)",
-    "tan(p1)",
-    "exp(p1)",
-    "log(p1)",
-    "sqrt(p1)",
-    "tanh(p1)",
-    "1 / p1",
-    "p1 / (1 + p1**2)",
-    "p1**3",
-    "p1**2.5",
-    "2**p1",
-    "p1**p1",
-    "-p1 + 3*p1 - 1",
-    "1 / (2 - p1)**2",
-    "exp(-p1) * sin(3*p1)",
-    "p1**-2",
-]
-
-
-@pytest.mark.parametrize("text", FUNCTIONS)
-def test_jets_are_taylor_series_of_the_functions_of_expressions(text):
-    matrix = parse_matrix("A", [[text]], ("p1",))
-    system = LinearSystem(matrix, np.array([[1.0]]), parameters=Box(np.array([0.6]), np.array([0.8])), names=("p1",))
-    monomials, delta = Monomials(1, 8), np.linspace(-1, 1, 21)
-    with ctx.workprec(96):
-        series = [float(part[0, 0].mid()) for part in expanded(system, monomials, exact([0.7]), [0.01])["A"]]
-        wide = expanded(system, monomials, [arb(0.7, 0.1)], [0.1])["A"]
-        narrow = [expanded(system, monomials, exact([p]), [0.1])["A"] for p in (0.6001, 0.65, 0.7999)]
-    truth = matrix.evaluate((0.7 + 0.01 * delta)[:, None])[:, 0, 0]
-    assert np.abs(np.polyval(series[::-1], delta) - truth).max() < 1e-14 * max(1.0, np.abs(truth).max())
-    assert all(
-        wide[k][0, 0].overlaps(point[k][0, 0]) and wide[k][0, 0].rad() >= 0 for point in narrow for k in range(9)
-    )
-
-
-@pytest.mark.parametrize("text", ["1 / p1", "log(p1)", "sqrt(p1)", "tan(p1 + pi/2)", "p1**-1"])
-def test_a_singularity_on_a_cell_is_left_unchecked(text):
-    system = LinearSystem(
-        parse_matrix("A", [[text]], ("p1",)),
-        np.array([[1.0]]),
-        parameters=Box(np.array([0.6]), np.array([0.8])),
-        names=("p1",),
-    )
-    with ctx.workprec(96), pytest.raises(Unchecked):
-        expanded(system, Monomials(1, 2), [arb(0.1, 0.2)], [0.2])
 
 
 def test_the_remainder_is_as_small_as_the_last_coefficients_of_the_state():
@@ -549,56 +431,6 @@ def test_the_remainder_is_as_small_as_the_last_coefficients_of_the_state():
         tube, _, _ = tube_of(system, control, control, None, 3, (-1.0) ** np.arange(80), none)
         found = tube.cells(79, 10.0, 10.0, np.eye(2))
         coefficients = np.abs(np.array([poly.coefficients[0] for poly in found]))
-    assert max(poly.expansion for poly in found) < 0.2 * coefficients[:, 3].max()
+    assert max(poly.error for poly in found) < 0.2 * coefficients[:, 3].max()
 
 
-def test_a_series_leaves_out_no_more_than_its_precision_resolves():
-    """Entries of a matrix in units that are far apart: a small one beside a large one is known to many digits."""
-    known = Monomials(1, 1)
-    with ctx.workprec(200):
-        matrix = stacked([[arb(-0.5), arb(2.0**40)], [arb(2.0**-45), arb(-0.25)]])
-        found = Series(known, [matrix, matrix * 0]).exp().parts[0]
-        truth = matrix.exp()
-        assert all(
-            float(a.rad()) < 1e-30 * abs(float(b.mid())) for a, b in zip(found.entries(), truth.entries(), strict=True)
-        )
-        assert all(a.overlaps(b) for a, b in zip(found.entries(), truth.entries(), strict=True))
-
-
-def test_parts_of_pieces_hold_what_a_system_does_wherever_it_is_within_a_tick():
-    """``x' = p x + u``, with a tick of a hundredth: a part of a piece is a whole number of them, give or take one."""
-    system = LinearSystem(
-        parse_matrix("A", [["p1"]], ("p1",)), np.ones((1, 1)), parameters=Box([0.9], [1.1]), names=("p1",)
-    )
-    control, none = indicators([0.0, 1.0, 2.0]), uniform(1, 2.0)
-    with ctx.workprec(96):
-        tube, centre, _ = tube_of(system, control, none, None, 3, np.ones(2), np.ones(1))
-        tube.scene.__dict__["tick"] = 0.01
-        for start in (0.3, 0.304, 0.2961):
-            moved, driven = tube._since(0, start)
-            for time in (start - 0.0049, start, start + 0.0049):
-                growth = (arb(float(centre[0])) * time).exp()
-                assert moved.parts[0][0, 0].contains(growth.mid())
-                assert driven.parts[0][0, 0].contains(((growth - 1) / arb(float(centre[0]))).mid())
-            assert float(moved.parts[0][0, 0].rad()) < 0.03
-
-
-def test_norms_within_a_piece_are_those_of_no_earlier_time():
-    """``x' = p x``: norms grow by ``e^{mu t}``; what is kept for a sixteenth of a piece holds every time in it."""
-    names = ("p1",)
-    system = LinearSystem(
-        parse_matrix("A", [["p1"]], names), np.ones((1, 1)), parameters=Box([0.5], [1.5]), names=names
-    )
-    control, none = indicators([0.0, 0.7, 2.0]), uniform(1, 2.0)
-    with ctx.workprec(96):
-        tube, *_ = tube_of(system, control, none, None, 2, np.ones(2), np.ones(1))
-        tube.nodes  # noqa: B018  # every duration is known
-        rest = tube.remainders[0]
-        for piece, end in itertools.product((0, 1), (1e-9, 0.1, 0.7 / 16, 0.35, 0.7)):
-            growth, driven = tube._grown_by(0, tube._spans[piece], arb(end))
-            there, pushed = held(rest.growth, rest.control, arb(end))
-            length, last = float(np.diff(tube.scene.grid)[piece]), rest.growth.nrows() - 1
-            later, more = held(rest.growth, rest.control, arb(end + length / 16))
-            assert there[last, last].upper() <= growth[last, last].upper() <= later[last, last].upper() * 1.001
-            assert pushed[last, 0].upper() <= driven[last, 0].upper() <= more[last, 0].upper() * 1.001
-        assert len(tube._grown) < 10

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparserob_core.checker.arithmetic.jets import Monomials
-from sparserob_core.checker.reach.disturbance_support import bounded
+from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.reach.supports import bounded
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
 

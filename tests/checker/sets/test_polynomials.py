@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx
 
-from sparserob_core.checker.arithmetic.jets import Monomials
+from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.polynomials import HALF_ULP, NEAR, Enclosed, Truncated, lengths, rounding
 

@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 
 import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
@@ -184,11 +185,11 @@ def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_
             state, low = solve_ivp(slope, (low, end), state, rtol=1e-11, atol=1e-13).y[:, -1], end
         return state
 
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         still, none = [arb_mat(1, 1)] * 2, np.zeros((2, 2, 1, 2))
-        law = VaryingFlow(system, 2.0)
+        law = Flow(Plant.of(system, 2.0), 2.0)
         both = VaryingMeasurableLoop(system, [0.0, 0.0], still, none, grid, grid, [], bound, law=law)
-        assert len([end for end in law.ends if end < 1.1]) > 2
+        assert len(law.marks([0.0, 1.1])) > 4
         for piece, (low, high) in enumerate(pairwise(grid)):
             zonoid, (_, outward) = pieces.zonoids[piece], pieces.at(piece)
             for a in np.array([[1.0, 0.2], [-0.7, 1.0]]):

@@ -8,7 +8,8 @@ import pytest
 from flint import arb, ctx
 from scipy.linalg import expm
 
-from sparserob_core.checker.reach.flow import OwnUnits, stacked
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.units import OwnUnits
 from sparserob_core.checker.reach.measurable import Kernel, Side
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.feedback.zonoid import Arc, Pushes, Zonoid, _apart, _shares

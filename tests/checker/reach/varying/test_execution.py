@@ -4,6 +4,7 @@ values between closed forms, and their bends."""
 from __future__ import annotations
 
 from itertools import pairwise
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,12 +13,16 @@ pytest.importorskip("flint")
 from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
-import sparserob_core.checker.reach.varying.flow as varying
+import sparserob_core.checker.arithmetic.models as models
+import sparserob_core.checker.flow.flow as flows
+import sparserob_core.checker.flow.law as laws
+import sparserob_core.checker.flow.segment as segments
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.reach.varying.execution import VaryingExecution
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
 
@@ -33,11 +38,11 @@ C = np.array([1.0, -0.4])
 
 def made(system: VaryingSystem, control: Array = CONTROL) -> VaryingExecution:
     pieces = [stacked([[arb(float(v))] for v in u]) for u in control.T]
-    return VaryingExecution(VaryingFlow(system, 3.0), SHARES, POINTS, pieces)
+    return VaryingExecution(Flow(Plant.of(system, 3.0), 3.0), SHARES, POINTS, pieces)
 
 
 def test_a_constant_that_is_dressed_is_the_constant() -> None:
-    with ctx.workprec(128):
+    with ctx.workprec(192):
         known = sr.OptimalControlProblem(
             system=sr.LinearSystem(A, B), horizon=3.0, initial_state=[0, 0], control=sr.Box([-1.0, -1.0], [1.0, 1.0])
         )
@@ -57,7 +62,7 @@ def primitive(time: float, s: float) -> float:
 
 @pytest.mark.parametrize("time", [0.5, 1.7, 3.0])
 def test_a_falling_mass_is_between_the_bounds_of_the_closed_form(time: float) -> None:
-    with ctx.workprec(128):
+    with ctx.workprec(192):
         found = made(ROCKET)
         least, (low, high) = found.least(C, time), found.added(C, time)
     truth = np.zeros(6)
@@ -76,44 +81,52 @@ def test_a_falling_mass_is_between_the_bounds_of_the_closed_form(time: float) ->
 def test_what_is_large_is_not_enclosed_more_coarsely_than_rounding_does(side: sr.ConvexSet | None) -> None:
     """A lower bound is written with what rounding may do to the numbers that are added up to it: bounds that are 1e-12
     of an integral apart would refute honest runs."""
-    with ctx.workprec(128):
+    with ctx.workprec(192):
         found = made(ROCKET)
         if side is not None:
             (form,), one = Side.of(side), [stacked([[arb(1)]])] * 6
-            found = VaryingExecution(VaryingFlow(ROCKET, 3.0), np.ones(1), POINTS, one, side=form)
+            found = VaryingExecution(Flow(Plant.of(ROCKET, 3.0), 3.0), np.ones(1), POINTS, one, side=form)
         low, high = found.added(np.array([1.0, 0.0]), 3.0)
     assert 0.0 < high - low <= 3e-13 * high
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [(None, 0), ("TERMS", (4,)), ("TERMS", (6,)), ("ORDER", 2), ("ENOUGH", 1e-3)]
+    ("module", "name", "value"),
+    [
+        (None, "", 0),
+        (segments, "TERMS", 4),
+        (flows, "ENOUGH", 1e-3),
+        (models, "ENOUGH", 1e-9),
+    ],
 )
 def test_balls_of_a_kernel_hold_the_closed_form(
-    name: str | None, value: object, monkeypatch: pytest.MonkeyPatch
+    module: ModuleType | None, name: str, value: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if name is not None:
-        monkeypatch.setattr(varying, "SHARP", 1.0)
-        monkeypatch.setattr(varying, "ENOUGH", 1e-30)
-        monkeypatch.setattr(varying, name, value)
-    with ctx.workprec(128):
-        flow, widest = VaryingFlow(FADING, 3.0), 0.0
-        for part in flow.segments:
-            terms, h = flow.kernel(part.start, part.stop), arb(part.stop) - arb(part.start)
+    with ctx.workprec(192):
+        flow, widest = Flow(Plant.of(FADING, 3.0), 3.0), 0.0
+        stretches = flow.law.stretches
+        if module is models:
+            monkeypatch.setattr(laws, "SHARP", 1e-6)
+            flow = Flow(Plant.of(FADING, 3.0), 3.0)
+        if module is not None:
+            monkeypatch.setattr(module, name, value)
+        for part in stretches:
+            (terms, off), h = flow.kernel(part.start, part.stop), arb(part.stop) - arb(part.start)
             for left in (arb(0), arb(3) / 10, arb(1)):
                 s = arb(part.stop) - left * h
                 exact = [h * one * (1 + s) / (1 + arb(part.stop)) for one in (s, arb(1), (-s).exp())]
                 for j, truth in enumerate(exact):
-                    ball = sum((one[0, j] * left**n for n, one in enumerate(terms)), arb(0))
+                    ball = sum((one.matrix[0, j] * left**n for n, one in enumerate(terms)), arb(0, float(off[0, j])))
                     assert ball.overlaps(truth)
                     widest = max(widest, float(ball.rad()))
-    assert widest > 1e-9 if name else widest < 1e-17
+    assert widest > 1e-12 if name else widest < 1e-17
 
 
 def test_what_the_system_is_at_most_and_how_fast_it_changes_is_not_exceeded() -> None:
-    with ctx.workprec(128):
-        flow = VaryingFlow(WILD, 3.0)
-        for part in flow.segments:
-            most, slope = flow.most(part.start, part.stop)
+    with ctx.workprec(192):
+        flow = Flow(Plant.of(WILD, 3.0), 3.0)
+        for part in flow.law.stretches:
+            most, slope, _ = flow.sizes(part.start, part.stop)
             t = np.linspace(part.start, part.stop, 9)
             for found, inside in ((most[:, :2], np.array([[t, 2 + 0 * t], [1 + 0 * t, t]])),
                                   (most[:, 2:4], np.array([[t**2, 0 * t], [np.cos(9 * t), 1 + 0 * t]])),
@@ -127,7 +140,7 @@ def test_what_the_system_is_at_most_and_how_fast_it_changes_is_not_exceeded() ->
 @pytest.mark.parametrize("system", [ROCKET, pytest.param(WILD, marks=pytest.mark.slow)], ids=["rocket", "wild"])
 def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(system: VaryingSystem) -> None:
     ratios, share = [], np.linspace(0.0, 1.0, 5)
-    with ctx.workprec(128):
+    with ctx.workprec(192):
         found = made(system)
         for begin, end in list(pairwise(found.marks))[1::4]:
             for start, stop in ((begin, end), (begin + 0.3 * (end - begin), begin + 0.4 * (end - begin))):
@@ -143,7 +156,7 @@ def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(system: Varyi
 def test_what_begins_within_a_cell_bends_it_too() -> None:
     share, control = np.linspace(0.0, 1.0, 7), np.zeros((2, 6))
     control[0, 2] = 1.0
-    with ctx.workprec(128):
+    with ctx.workprec(192):
         found = made(ROCKET, control)
         stop = min(1.5, *(one for one in found.marks if one > 1.0))
         path = np.array([found.added(C, float(t))[0] for t in 1.0 + share * (stop - 1.0)])
@@ -152,7 +165,7 @@ def test_what_begins_within_a_cell_bends_it_too() -> None:
 
 
 def test_bounds_allow_for_what_is_rounded_and_for_the_size_of_the_control() -> None:
-    with ctx.workprec(128):
+    with ctx.workprec(192):
         found = made(ROCKET)
         low, high = found.added(C, 2.9)
         assert high - low >= 1e-15 * high
@@ -168,14 +181,14 @@ def entering(system: VaryingSystem, off: float = 0.0) -> VaryingExecution:
     """A command of 1 through ``E`` that is missed by 0.25."""
     one, ends = [stacked([[arb(1)]])], np.array([0.0, 3.0])
     lost = np.array([off])
-    return VaryingExecution(VaryingFlow(system, 3.0), np.array([0.25]), ends, one, system.controls, lost)
+    return VaryingExecution(Flow(Plant.of(system, 3.0), 3.0), np.array([0.25]), ends, one, system.controls, lost)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.7, 3.0])
 def test_what_enters_by_the_last_columns_is_between_the_bounds_of_the_closed_form(time: float) -> None:
     # (1 + t) x adds up (1 + s) e^-s
     truth = 0.25 * (2.0 - (2.0 + time) * np.exp(-time)) / (1.0 + time)
-    with ctx.workprec(128):
+    with ctx.workprec(192):
         low, high = entering(FADING).added(np.array([-1.0]), time)
         assert low <= truth * (1 + 1e-15) and truth * (1 - 1e-15) <= high <= low + 1e-12
         low, high = entering(FADING, 1e-3).added(np.array([-1.0]), time)
@@ -186,7 +199,7 @@ def test_what_enters_by_the_last_columns_bends_as_it_does() -> None:
     # of the columns, the first one is 0 and would not bend
     system = VaryingSystem.of([[0, 1], [0, 0]], [[0], [0]], 3.0, [["0*t"], ["1/(4 - t)"]])
     share, ratios = np.linspace(0.0, 1.0, 7), []
-    with ctx.workprec(128):
+    with ctx.workprec(192):
         found = entering(system)
         for start, stop in pairwise(found.marks):
             path = np.array([found.added(C, float(t))[1] for t in start + share[:-1] * (stop - start)])
@@ -199,7 +212,7 @@ def test_what_enters_by_the_last_columns_bends_as_it_does() -> None:
 
 
 def test_sizes_are_those_of_absolute_values_and_what_shares_are_off_by_counts_for_either_sign() -> None:
-    law = VaryingFlow(VaryingSystem.of([["0*t"]], [["1", "1"]], 2.0), 2.0)
+    law = Flow(Plant.of(VaryingSystem.of([["0*t"]], [["1", "1"]], 2.0), 2.0), 2.0)
     pieces = [arb_mat([[arb(-1.5, 1e-3)], [arb(0.5, 1e-3)]]), arb_mat([[arb(2.0, 1e-3)], [arb(-4.0, 1e-3)]])]
     shares, off = np.array([0.1, 0.25]), np.array([1e-4, 1e-5])
     found = VaryingExecution(law, shares, np.array([0.0, 1.0, 2.0]), pieces, off=off).sizes

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from flint import arb_mat, ctx
 
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Box
@@ -23,11 +24,11 @@ def test_what_began_before_a_cell_bends_within_it() -> None:
         FAST, FORCE, GUST, np.array([0.0, 2.0]), np.array([0.0, 2.0]), np.zeros(2),
         Box([-0.1, -0.1], [0.1, 0.1]), measurable=True, rate="1 + 0*t", grown="t", factor="exp(-8*t)",
     )  # fmt: skip
-    law, most = VaryingFlow(case.system, 2.0), 0.0
-    with ctx.workprec(96):
+    law, most = Flow(Plant.of(case.system, 2.0), 2.0), 0.0
+    with ctx.workprec(192):
         still, none, ends = [arb_mat(1, 1)], np.zeros((1, 1, 1, 2)), [0.0, 2.0]
         loop = VaryingMeasurableLoop(case.system, [0.0, 0.0], still, none, ends, ends, [], case.bound, law=law)
-        for low, high in pairwise([0.5, *(end for end in law.ends if 0.5 < end <= 1.25)]):
+        for low, high in pairwise(law.marks([0.5, 1.25])):
             share = np.linspace(0.0, 1.0, 4)
             times = (low + share * (high - low)).tolist()
             values = np.array([[float(h.mid()) for h in loop.highest(0, t, H)] for t in times])
@@ -42,9 +43,9 @@ def test_what_began_before_a_cell_bends_within_it() -> None:
 def test_what_enters_less_and_less_is_above_its_chord_by_how_fast_that_falls() -> None:
     """``x' = (1 - t) w``: an eighth of the square of the cell times the slope of what enters, and no more."""
     system = VaryingSystem.of([["0*t"]], [[1.0]], 1.0, [["1 - t"]])
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         still, none, ends = [arb_mat(1, 1)], np.zeros((1, 1, 1, 1)), [0.0, 1.0]
-        law = VaryingFlow(system, 1.0)
+        law = Flow(Plant.of(system, 1.0), 1.0)
         loop = VaryingMeasurableLoop(system, [0.0], still, none, ends, ends, [], Box([-0.1], [0.1]), law=law)
         (bent,) = loop.bent(0, 0.25, 0.375, np.array([[1.0]]))
         heights = [float(loop.highest(0, t, np.array([[1.0]]))[0].mid()) for t in (0.25, 0.3125, 0.375)]

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 pytest.importorskip("flint")
-from flint import arb_mat, ctx
-
 import sparserob_core.checker.reach.varying.flow as varying
 import sparserob_core.checker.reach.varying.tube as varying_tube
-from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.tube import Polynomial
-from sparserob_core.checker.reach.varying.flow import VaryingFlow
+from flint import arb_mat, ctx
 from sparserob_core.checker.reach.varying.tube import VaryingTube
+
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Ellipsoid
@@ -57,7 +58,7 @@ def tube(noise: ConvexSet) -> VaryingTube:
     inputs = [arb_mat([[u], [1]]) for u in CONTROL]
     deviations = Box([-WIDTH], [WIDTH])
     scene = Scene(GRID, inputs, [CENTRE], noise, CHANGES, deviations)
-    return VaryingTube(VaryingFlow(FADING, 3.0), scene, np.ones((1, 1)))
+    return VaryingTube(Flow(Plant.of(FADING, 3.0), 3.0), scene, np.ones((1, 1)))
 
 
 def until(seen: VaryingTube, start: float, stop: float) -> float:
@@ -131,5 +132,5 @@ def test_entries_that_are_ever_other_than_0_are_links() -> None:
     # sin(64 pi t / 3) is 0 at 65 times that are evenly spaced
     system = VaryingSystem.of([["0*t", "sin(67.02064327658225*t)"], [0, 1]], [[0], ["t"]], 3.0, [[0], ["t - t"]])
     with ctx.workprec(128):
-        links = {name: part[0].tolist() for name, part in VaryingFlow(system, 3.0).links.items()}
+        links = {name: part[0].tolist() for name, part in Flow(Plant.of(system, 3.0), 3.0).links.items()}
     assert links == {"A": [[0, 1], [0, 1]], "B": [[0], [1]], "E": [[0], [0]]}

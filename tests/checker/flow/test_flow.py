@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 pytest.importorskip("flint")
-from flint import arb, arb_poly, arb_series, ctx
-
 import sparserob_core.checker.reach.varying.flow as varying
-from sparserob_core.checker.arithmetic.jets import kepler_root, kepler_series
+from flint import arb, arb_poly, arb_series, ctx
 from sparserob_core.checker.arithmetic.timed import Timed
-from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.varying.flow import VaryingFlow, products
+
+from sparserob_core.checker.arithmetic.models import kepler_root, kepler_series
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.varying.loop import VaryingLoop
 from sparserob_core.control.problem.system import VaryingSystem
 from tests.support.integration import mathieu
@@ -47,7 +47,7 @@ def exact(start: float, stop: float) -> list[arb]:
 @pytest.mark.parametrize(("start", "stop"), [(0.0, 0.125), (0.5, 1.75), (0.0, 3.0), (2.0, 2.25)])
 def test_balls_hold_the_closed_form_and_are_narrow(start: float, stop: float) -> None:
     with ctx.workprec(BITS):
-        Phi, B, E = VaryingFlow(FADING, 3.0).over(start, stop)
+        Phi, B, E = Flow(Plant.of(FADING, 3.0), 3.0).over(start, stop)
         for ball, truth in zip([Phi[0, 0], B[0, 0], B[0, 1], B[0, 2], E[0, 0]], exact(start, stop), strict=True):
             assert ball.overlaps(truth) and float(ball.rad()) < 1e-24
             assert abs(float((ball - truth).mid())) <= float(ball.rad()) + float(truth.rad())
@@ -60,7 +60,7 @@ def test_balls_hold_the_closed_form_where_series_are_cut_short(
     monkeypatch.setattr(varying, "SHARP", 1.0)
     monkeypatch.setattr(varying, name, value)
     with ctx.workprec(BITS):
-        flow, wide = VaryingFlow(FADING, 3.0), 0.0
+        flow, wide = Flow(Plant.of(FADING, 3.0), 3.0), 0.0
         for start in np.linspace(0.0, 2.5, 11):
             Phi, B, E = flow.over(float(start), float(start) + 0.375)
             balls = [Phi[0, 0], B[0, 0], B[0, 1], B[0, 2], E[0, 0]]
@@ -72,7 +72,7 @@ def test_balls_hold_the_closed_form_where_series_are_cut_short(
 def test_what_a_series_leaves_out_widens_every_entry_in_its_units() -> None:
     """With tails that are told: 1 of the state, 2 of what is forced, and nothing beside them."""
     with ctx.workprec(BITS):
-        flow = VaryingFlow(FADING, 3.0)
+        flow = Flow(Plant.of(FADING, 3.0), 3.0)
         (segment, *_) = flow.segments
         still = replace(segment, left=[[arb(0)] * len(row) for row in segment.left])
         table = [[(entry(arb_poly([0, 1]))).coeffs() for entry in row] for row in still.law]
@@ -89,7 +89,7 @@ def test_what_is_left_of_an_expansion_is_in_every_entry_of_what_an_interval_make
 ) -> None:
     """With rests that are told, one for each entry; what is beyond an order joins them."""
     with ctx.workprec(BITS):
-        flow = VaryingFlow(FADING, 3.0)
+        flow = Flow(Plant.of(FADING, 3.0), 3.0)
         stop = 0.5 * flow.segments[0].stop
         terms, rest = flow._series(flow.segments[0], 0.0, stop)
         sizes = [1.0 + i for i in range(rest.ncols())]
@@ -125,7 +125,7 @@ def test_a_chord_of_a_loop_is_missed_by_its_powers_and_twice_what_is_left_of_the
 
 def test_nothing_is_said_beyond_what_was_expanded() -> None:
     with ctx.workprec(BITS), pytest.raises(Unchecked, match="not known"):
-        VaryingFlow(FADING, 3.0).over(2.5, float(np.nextafter(3.0, 4.0)))
+        Flow(Plant.of(FADING, 3.0), 3.0).over(2.5, float(np.nextafter(3.0, 4.0)))
 
 
 def test_a_series_that_is_too_short_is_no_expansion() -> None:
@@ -136,7 +136,7 @@ def test_a_series_that_is_too_short_is_no_expansion() -> None:
 def test_the_weights_of_many_pieces_are_products_of_their_flows() -> None:
     grid = np.linspace(0.0, 3.0, 38).tolist()  # an odd number of pieces on some levels
     with ctx.workprec(BITS):
-        flow = VaryingFlow(FADING, 3.0)
+        flow = Flow(Plant.of(FADING, 3.0), 3.0)
         weights = flow.weights(grid)
         assert weights.free[0, 0].overlaps(exact(0.0, 3.0)[0]) and float(weights.free[0, 0].rad()) < 1e-22
         for k in (0, 1, 17, 36):
@@ -148,7 +148,7 @@ def test_the_weights_of_many_pieces_are_products_of_their_flows() -> None:
 def test_mathieus_equation_agrees_with_fifty_digits() -> None:
     system = VaryingSystem.of([[0, 1], ["-(1.5 - 0.75*cos(2*t))", 0]], [[0], [1]], 3.0)
     with ctx.workprec(BITS):
-        Phi = VaryingFlow(system, 3.0).over(0.0, 3.0)[0]
+        Phi = Flow(Plant.of(system, 3.0), 3.0).over(0.0, 3.0)[0]
         for row, truth in zip(Phi.tolist(), mathieu("1.5", "0.375", Decimal(3)), strict=True):
             for ball, value in zip(row, truth, strict=True):
                 assert abs(float(ball.mid()) - value) <= 2e-16 * max(1.0, abs(value)) and float(ball.rad()) < 1e-24
