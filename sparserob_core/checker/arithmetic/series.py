@@ -65,10 +65,10 @@ class Series:
         found[self.there] = entries.reshape(len(there), *self.shape) + TINY
         return np.add.reduceat(found, self.monomials.firsts, axis=0) * OUTWARD
 
-    @property
+    @cached_property
     def size(self) -> Array:
         """How large the entries are at most, ``(rows, columns)``."""
-        return np.asarray(self.sizes.sum(axis=0) * OUTWARD)
+        return np.asarray(sizes_of([self])[0])
 
     @property
     def middle(self) -> Series:
@@ -138,6 +138,13 @@ class Series:
     def transpose(self) -> Series:
         """The transposed one."""
         return Series(self.monomials, [part.transpose() for part in self.parts])
+
+
+def sizes_of(series: Sequence[Series]) -> Array:
+    """How large the entries of series of one shape are at most, ``(n, rows, columns)``."""
+    entries = np.array([float(x.abs_upper()) for one in series for part in one.parts for x in part.entries()])
+    found = np.where(entries > 0.0, entries + TINY, 0.0)
+    return found.reshape(len(series), len(series[0].parts), *series[0].shape).sum(axis=1) * OUTWARD
 
 
 def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:

@@ -18,7 +18,7 @@ from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, products, zeros
 from sparserob_core.checker.flow.law import Box, Law, Stretch
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.segment import Segment, solve
+from sparserob_core.checker.flow.segment import ROUGH, Segment, solve
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 
@@ -55,6 +55,7 @@ class Flow:
     degree: int = 0
     timing: Law | None = None
     _segments: dict[tuple[float, float], Segment] = field(default_factory=dict, repr=False)
+    _longest: dict[float, float] = field(default_factory=dict, repr=False)
     _over: dict[tuple[float, float], tuple[Series, Series]] = field(default_factory=dict, repr=False)
     _ends: dict[tuple[int, tuple[float, float]], Series] = field(default_factory=dict, repr=False)
     _points: dict[tuple[float, ...], Flow] = field(default_factory=dict, repr=False)
@@ -119,17 +120,22 @@ class Flow:
         """The flow from ``start`` on, and which share of it has passed at ``stop``."""
         from flint import arb
 
-        stretch, key = self.law.stretches[self._place(start, stop)], (start, stop)
+        stretch = self.law.stretches[self._place(start, stop)]
         if stretch.is_still:
             share = (arb(stop) - arb(start)) / arb(stretch.stride * LONGER)
             if not share <= 1:
                 raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
             return self._still(stretch), share
-        if key not in self._segments:
+        longest = self._longest.get(start, -1.0)
+        if stop > longest:
             if len(self._segments) >= KEPT:
                 self._segments.clear()
-            self._segments[key] = solve(*stretch.between(*key), stretch.units)
-        return self._segments[key], arb(1)
+                self._longest.clear()
+            self._segments[start, stop] = solve(*stretch.between(start, stop), stretch.units)
+            longest = self._longest[start] = stop
+        if longest == start:
+            return self._segments[start, longest], arb(1)
+        return self._segments[start, longest], (arb(stop) - arb(start)) / (arb(longest) - arb(start))
 
     def kind(self, start: float, stop: float) -> tuple[int, tuple[float, float]]:
         """Intervals of one kind have one flow."""
@@ -209,7 +215,7 @@ class Flow:
         stretch = self.law.stretches[self._place(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
         none = Series.constant(self.monomials, zeros(self.states, 0))
-        rows = solve([one.transpose() for one in A], [none], 1.0 / stretch.units)
+        rows = solve([one.transpose() for one in A], [none], 1.0 / stretch.units, ROUGH)
         back, w = [one.transpose() for one in rows.terms], F[0].shape[1]
         wanted = max(float((one.size / stretch.units[:, None]).max(initial=0.0)) for one in F) * ENOUGH
         inputs, found, off = [one.size for one in F], list[Series](), np.zeros((self.states, w))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.series import OUTWARD, Series, dot, identity, zeros
+from sparserob_core.checker.arithmetic.series import OUTWARD, Series, dot, identity, sizes_of, zeros
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 SHARP = 2.0**-100  # of the system's numbers, what a guess leaves out; 2^-10 would show in what states miss
-ROUGH = 2.0**-70  # over a box of parameters, where less is known of the flow anyway
+ROUGH = 2.0**-70  # the same over a box of parameters, where less is known anyway, and of kernels, which become floats
+AT_ONCE = 4  # terms after which it is looked whether more are needed
 TERMS = 64  # of a guess, at most
 FAR = 300.0  # of the exponent in Gronwall's inequality: beyond, nothing is known
 
@@ -121,30 +122,28 @@ def _binomials(count: int) -> Array:
     return np.array([[float(comb(n, j)) for n in range(count)] for j in range(count)])
 
 
-def solve(A: Sequence[Series], F: Sequence[Series], units: Array) -> Segment:
+def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float = SHARP) -> Segment:
     """The flow of ``sum_k A_k x^k`` and ``sum_k F_k x^k`` for ``x`` from 0 to 1; ``units (d,)`` are those of the
-    states, in which the system is small."""
+    states, in which the system is small. ``sharp``: of the states, what the guess may leave out."""
     equation = Equation(A, F)
-    terms = guess(equation, units)
+    terms = guess(equation, units, max(sharp, ROUGH) if A[0].monomials.degree else sharp)
     return Segment(terms, verify(equation, terms, units))
 
 
-def guess(equation: Equation, units: Array) -> list[Series]:
+def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series]:
     """The first terms of the flow's power series, rounded."""
     d, w = len(units), equation.F[0].shape[1]
     terms = [equation.begin]
     scale = np.concatenate([1.0 / units, np.ones(w)]) * units[:, None]
-    largest, last = np.concatenate([np.ones(d), np.zeros(w)]), np.inf
-    sharp = ROUGH if terms[0].monomials.degree else SHARP
+    largest = np.concatenate([np.ones(d), np.zeros(w)])
     while len(terms) <= TERMS:
-        n = len(terms) - 1
-        terms.append(equation.slope(terms, n).scaled(_inverse(n + 1)).middle)
-        size = (terms[-1].size / scale).max(axis=0)
-        largest = np.maximum(largest, size)
-        share = float((size / np.where(largest > 0.0, largest, 1.0)).max())
-        if n >= max(len(equation.A), len(equation.F)) and max(last, share) <= sharp:  # a state may be a polynomial
+        first = len(terms)
+        for n in range(first - 1, first - 1 + AT_ONCE):
+            terms.append(equation.slope(terms, n).scaled(_inverse(n + 1)).middle)
+        sizes = (sizes_of(terms[first:]) / scale).max(axis=1)
+        largest = np.maximum(largest, sizes.max(axis=0))
+        if len(terms) > len(equation.F) and (sizes[-2:] <= sharp * np.where(largest > 0.0, largest, 1.0)).all():
             break
-        last = share
     return terms
 
 
@@ -152,10 +151,10 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
     """By how much a polynomial is off from the flow at most, ``(d, d + w)``; raises `Unchecked` where that is not
     known."""
     A, F, last, d = equation.A, equation.F, len(terms) - 1, len(units)
-    missed = (terms[0] - equation.begin).size
-    for n in range(last):
-        missed = missed + (terms[n + 1].scaled(_exact(n + 1)) - equation.slope(terms, n)).size / (n + 1)
-    sizes, paces, drives = ([one.size for one in every] for every in (terms, A, F))
+    defects = [terms[n + 1].scaled(_exact(n + 1)) - equation.slope(terms, n) for n in range(last)]
+    orders = np.array([1.0, *range(1, last + 1)])[:, None, None]
+    missed = (sizes_of([terms[0] - equation.begin, *defects]) / orders).sum(axis=0)
+    sizes, paces, drives = map(sizes_of, (terms, A, F))
     for n in range(last, last + max(len(A), len(F))):
         for k in range(max(0, n - last), min(n + 1, len(A))):
             missed = missed + paces[k] @ sizes[n - k] / (n + 1)

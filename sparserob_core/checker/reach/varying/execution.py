@@ -268,6 +268,7 @@ class SpreadExecution:
     numb: Sequence[int] = ()
     side: Side | Curve | Together | None = None
     _at: dict[tuple[float, ...], VaryingExecution] = field(default_factory=dict, repr=False)
+    _kernels: dict[tuple[Flow, float, float], Enclosed] = field(default_factory=dict, repr=False)
     _known: dict[tuple[Flow, float], tuple[Enclosed, Enclosed, np.ndarray]] = field(default_factory=dict, repr=False)
 
     def at(self, parameter: Sequence[float]) -> VaryingExecution:
@@ -345,6 +346,15 @@ class SpreadExecution:
             off += np.einsum("pkjn,j->n", found.rad, entering)
         return size * OUTWARD, off * OUTWARD
 
+    def _kernel(self, flow: Flow, start: float, stop: float, width: int) -> Enclosed:
+        """The kernel of an interval between marks."""
+        key = flow, start, stop
+        if key not in self._kernels:
+            if len(self._kernels) >= TIMES_KEPT:
+                self._kernels.clear()
+            self._kernels[key] = pushes(flow, start, stop, slice(self.first, self.first + width))
+        return self._kernels[key]
+
     def _reaching(self, flow: Flow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
         """The transitions from the end of every interval between marks to a time, ``(q, M, d, d)``; the kernels of
         these intervals, ``(q, p + 1, M, d, m)``; and the piece of the command that each is in."""
@@ -355,7 +365,7 @@ class SpreadExecution:
         if not steps:
             none = np.zeros((2, 0, flow.monomials.size, d, d)), np.zeros((2, 0, 1, flow.monomials.size, d, m))
             return Enclosed(*none[0]), Enclosed(*none[1]), np.zeros(0, dtype=int)
-        every = [pushes(flow, *pair, slice(self.first, self.first + m)) for pair in pairwise(marks)]
+        every = [self._kernel(flow, *pair, m) for pair in pairwise(marks)]
         order = max(len(one.mid) for one in every)
         pad = [[np.pad(part, ((0, order - len(part)), *[(0, 0)] * 3)) for part in (one.mid, one.rad)] for one in every]
         owner = np.searchsorted(self.breakpoints, np.array(marks[:-1]), side="right") - 1
