@@ -149,10 +149,15 @@ def sizes_of(series: Sequence[Series]) -> Array:
 
 def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
     """The sum of the products of some series with others."""
-    found = left[0] * right[0]
-    for a, b in zip(left[1:], right[1:], strict=True):
-        if any(a.there):
-            found = found + a * b
+    pairs = [(a, b) for a, b in zip(left, right, strict=True) if any(a.there)] or [(left[0], right[0])]
+    if left[0].monomials.size == 1:  # ten times as quick as series are
+        total = pairs[0][0].parts[0] * pairs[0][1].parts[0]
+        for a, b in pairs[1:]:
+            total = total + a.parts[0] * b.parts[0]
+        return Series(left[0].monomials, [total])
+    found = pairs[0][0] * pairs[0][1]
+    for a, b in pairs[1:]:
+        found = found + a * b
     return found
 
 
