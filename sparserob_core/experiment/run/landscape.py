@@ -76,9 +76,9 @@ class Landscape:
         self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
         plain = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
         alike = bool((self.anchor[heads[0], plain] == self.anchor[heads[1], plain]).all())
-        alone = self._moving == [[head] for head in heads]
-        self._mirrored = self.first[1] == self.second[1] and alike and alone  # g is the same with the two exchanged
-        self._found: dict[tuple[float, ...], float] = {}
+        # one coordinate of two indices of which each may be the other: a value belongs to both of their orders
+        self._mirrored = self.first[1] == self.second[1] and alike and self.g.interchangeable
+        self._found: dict[tuple[float, float], float] = {}
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
 
     def _beside(self, slot: int, heads: tuple[int, int]) -> int:
@@ -142,22 +142,29 @@ class Landscape:
         return float(np.mean(values == np.inf)), float(np.ptp(known)) if known.size else 0.0
 
     def _fill(self, i: int, j: int) -> None:
-        slots = self.anchor.copy()
-        for place, moving, to in zip(
-            (self.first, self.second), self._moving, (self.axes[0][i], self.axes[1][j]), strict=True
-        ):
-            # they keep their distance: at the anchor the tuple is the anchor's own, whose value none may lie below
-            c, shift = place[1], to - self.anchor[place]
-            slots[moving, c] = np.clip(self.anchor[moving, c] + shift, self.g.slot.lower[c], self.g.slot.upper[c])
-            slots[place] = to
-            slots[np.ix_(np.array(moving), self._open)] = np.nan
-        at = (float(self.axes[0][i]), float(self.axes[1][j]))
-        key = tuple(sorted(at)) if self._mirrored else at
-        if key not in self._found:
-            self._found[key] = self.g.at(slots)
+        to = self._order(float(self.axes[0][i]), float(self.axes[1][j]))
+        if to not in self._found:
+            self._found[to] = self.g.at(self._tuple(to))
             self.spent += 1
-        value = self._found[key]
+        value = self._found[to]
         self.values[i, j] = value if not np.isnan(value) else -np.inf
+
+    def _order(self, one: float, other: float) -> tuple[float, float]:
+        """Return where the first and the second index are at a point: where g knows no order of the two, in that of the
+        anchor."""
+        ordered = (one <= other) == bool(self.anchor[self.first] <= self.anchor[self.second])
+        return (other, one) if self._mirrored and not ordered else (one, other)
+
+    def _tuple(self, to: tuple[float, float]) -> Array:
+        """Return the tuple ``(D, width)`` whose two indices are where they are to be."""
+        slots = self.anchor.copy()
+        for place, moving, end in zip((self.first, self.second), self._moving, to, strict=True):
+            # they keep their distance: at the anchor the tuple is the anchor's own, whose value none may lie below
+            c, shift = place[1], end - self.anchor[place]
+            slots[moving, c] = np.clip(self.anchor[moving, c] + shift, self.g.slot.lower[c], self.g.slot.upper[c])
+            slots[place] = end
+            slots[np.ix_(np.array(moving), self._open)] = np.nan
+        return slots
 
     @property
     def value(self) -> float:
