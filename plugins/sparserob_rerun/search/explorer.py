@@ -29,6 +29,7 @@ weight. On four times as coarse a grid what matters lies between two lines; on t
 HELD = 0.8
 """Seconds for which a new landscape may wait until it is as fine as the one that is shown, which is of the same weight
 and nearly as high. Ten times as many, and what is drawn is too old; a tenth, and fine drawings flicker."""
+VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
 
 
@@ -44,6 +45,10 @@ class Aim:
     words: str
     round: int = 0
     pair: tuple[int, ...] = ()
+
+    def exceeds(self, other: Aim) -> bool:
+        """Return whether its value is visibly above another one of the same weight, or either is not known."""
+        return self.epsilon != other.epsilon or not self.value - other.value <= VISIBLE * max(1.0, abs(self.value))
 
 
 @final
@@ -97,7 +102,7 @@ class Explorer:
         if self.left <= 0:
             return
         now = self.aimed
-        if now is not None and now.epsilon == aim.epsilon and np.array_equal(now.slots, aim.slots):
+        if now is not None and (not aim.exceeds(now) or _same(now, aim)):
             self.waiting = None
             return
         self.waiting = aim
@@ -229,6 +234,10 @@ class Explorer:
             return
         self.landscape = sr.Landscape(g, anchor, *axes.places(pair, anchor), self.options.grid, aim.epsilon, axes)
         yield from self.landscape.evaluate()
+
+
+def _same(one: Aim, other: Aim) -> bool:
+    return one.epsilon == other.epsilon and np.array_equal(one.slots, other.slots)
 
 
 def _gain(aim: Aim, before: Aim, landscape: sr.Landscape) -> float:
