@@ -20,7 +20,7 @@ class LandscapeOptions(sr.Options):
     evaluations: int = Field(default=100_000, ge=64)
     """Evaluations of g that all landscapes of a run may take; for the last quarter of them they stay coarse."""
 
-    share: float = Field(default=0.1, gt=0.0, le=1.0)
+    share: float = Field(default=0.15, gt=0.0, le=1.0)
     """Share of the processor time of one core that it may take during the run, beside a first, coarse drawing for each
     weight epsilon."""
 

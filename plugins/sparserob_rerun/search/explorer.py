@@ -29,6 +29,9 @@ weight. On four times as coarse a grid what matters lies between two lines; on t
 HELD = 0.8
 """Seconds for which a new landscape may wait until it is as fine as the one that is shown, which is of the same weight
 and nearly as high. Ten times as many, and what is drawn is too old; a tenth, and fine drawings flicker."""
+REFINING = 1 / 3
+"""Of the share of a core, what finer grids may take; the rest is kept for the coarse one after the next gain. With a
+tenth of it no map of a short search is ever fine; with all of it, what is drawn after a gain is seconds old."""
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
 
@@ -95,7 +98,11 @@ class Explorer:
     @property
     def rest(self) -> float:
         """Seconds until the share allows more work."""
-        return 0.0 if self.urgent else max(0.0, self.used / self.share - (time.monotonic() - self.began))
+        if self.urgent or (self.fresh and not self._held):
+            return 0.0
+        refines = self._coarse and (self.waiting is None or not self._better(self.waiting))
+        share = self.share * (REFINING if refines else 1.0)
+        return max(0.0, self.used / share - (time.monotonic() - self.began))
 
     def aim(self, aim: Aim) -> None:
         """Ask for the landscape through a tuple, in the middle of the coordinates that it does not say."""
