@@ -22,7 +22,7 @@ SLICES = 36
 ROOM = 2.0  # the panel is half as large as the drawing
 POINT = 8.0  # pixels: a goal that is smaller is drawn as a square of that size
 LAYERS = ("hatch", "slices", "frame", "worst", "curve", "arcs", "wall")
-LINE, ENTRY = 30.0, 300.0  # of words from one to the next, and how wide the longest are that say what is drawn
+LINE, ENTRY = 36.0, 340.0  # of words from one to the next, and how wide the longest are that say what is drawn
 
 
 def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
