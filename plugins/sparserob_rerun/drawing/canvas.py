@@ -234,8 +234,8 @@ def _apart(axes: Axes, line: float, whole: bool, lifted: float = 0.0) -> Floats:
     unit = axes.height / (axes.y[1] - axes.y[0])
     heights = [np.maximum(unit * (values - axes.y[0]), lifted) for values in choices]
     fit = (v for v, h in zip(choices, heights, strict=True) if v.size > 1 and float(np.diff(h).min()) >= line)
-    fewest = choices[-1]  # of three there is no room for the one between
-    return next(fit, fewest[[0, -1]] if fewest.size > 2 else fewest)
+    ends = [values[[0, -1]] for values in choices]  # where there is no room for one between, the two furthest apart
+    return next(fit, max(ends, key=lambda pair: float(pair[1] - pair[0])))
 
 
 def ticks(low: float, high: float, most: int = 5) -> Floats:
