@@ -197,9 +197,15 @@ def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.Fi
 def test_a_recording_has_a_name_and_says_of_what_it_is_and_how_it_ended(exchanged: sr.Outcome) -> None:
     said = properties(exchanged.directory / "recording.rrd")
     result = exchanged.result
-    assert said["name"] == said["title"] == json.loads(said["config"])["title"]
+    assert said["title"] == json.loads(said["config"])["title"] and said["name"] == f"exchange, seed 0: {said['title']}"
     assert said["status"] == "certified" and said["cost"] == result.cost and said["lower_bound"] == result.lower_bound
     assert json.loads(said["config"])["problem"]["name"] == "linear" and said["seed"] == 0
+
+
+def test_two_searches_of_one_problem_are_told_apart_by_the_first_words_of_their_names(searched: sr.Outcome) -> None:
+    said = properties(searched.directory / "recording.rrd")
+    config = json.loads(said["config"])
+    assert said["name"] == f"{config['maximiser']['name']}, seed {said['seed']}: {said['title']}"
 
 
 def test_what_is_arranged_otherwise_has_another_place_in_the_viewer() -> None:

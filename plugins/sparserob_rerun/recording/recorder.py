@@ -117,12 +117,16 @@ class Recorder:
         self._page("solving", [])
 
     def _describe(self, title: str) -> None:
-        """Give the recording its name, and say of what it is."""
-        self.stream.send_recording_name(title)
+        """Give the recording its name, and say of what it is. The name begins with what two runs of one problem differ
+        in, because a list of recordings shows its first words."""
         known: dict[str, Any] = {"title": [title]}
-        if self.inspection is not None:
+        if self.inspection is None:
+            self.stream.send_recording_name(title)
+        else:
             config = self.inspection.config
-            known |= {"config": [json.dumps(config, default=str)], "seed": [config.get("seed", 0)]}
+            by, seed = config["maximiser" if self.searches else "method"]["name"], config.get("seed", 0)
+            self.stream.send_recording_name(f"{by}, seed {seed}: {title}")
+            known |= {"config": [json.dumps(config, default=str)], "seed": [seed]}
         self.stream.send_property("run", self.rr.AnyValues(**known))
 
     def _conclude(self, event: sr.RunFinished) -> None:
