@@ -57,9 +57,9 @@ class Rules:
     value of at least ``target``, after ``patience`` evaluations in a row that gained nothing, and where ``halt`` says
     so, which is asked after every batch; its polish ends with it.
 
-    ``polish``: ``None`` is what the maximiser says of itself (`Maximiser.polished`) where the blocks of the target are
-    linear, for there `block_ascent` finds in ten evaluations what no search finds that only compares values, and 0
-    elsewhere.
+    ``polish``: ``None`` is what the maximiser says of itself (`Maximiser.polished`) where the target has a gradient, or
+    blocks that are linear: a local method finds in ten evaluations there what no search finds that only compares
+    values; and 0 elsewhere.
     """
 
     stop: Callable[[Progress], bool] | None = None
@@ -77,7 +77,7 @@ class Rules:
     def share(self, maximiser: Maximiser, target: Target) -> float:
         """The share of the budget that is kept for a polish."""
         if self.polish is None:
-            return maximiser.polished if target.linear is not None else 0.0
+            return maximiser.polished if target.linear is not None or target.gradient is not None else 0.0
         return self.polish
 
 
