@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from sparserob_core.errors import InputError, not_installed
 from sparserob_core.experiment.benchmark import functions
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.search.search import Target
+
+Formulation: TypeAlias = Literal["reduced", "literal"]
 
 SUITES = ("standard", "bbob", "g")
 BBOB_DIMENSIONS = (2, 5)
@@ -99,30 +101,38 @@ def bbob(instance: int = 1) -> Iterator[Landscape]:
             yield Landscape(name, target, -float(problem.optimum.y), number, "bbob", instance)
 
 
-def landscape_of(config: Path, number: int) -> Landscape:
-    """``g`` at tuples of reduced indices of a config, at a small weight of the regulariser; its maximum is the value
-    that the exchange certifies at that weight.
+def landscape_of(
+    config: Path,
+    number: int,
+    formulation: Formulation = "reduced",
+    indices: int = INDICES,
+    overrides: Mapping[str, Any] | None = None,
+) -> Landscape:
+    """``g`` at tuples of so many indices of a config, at a small weight of the regulariser; its maximum is the value
+    that the exchange certifies at that weight. ``overrides``: what is another in the config.
 
-    Raises `InputError` where the exchange certifies none, for then the maximum is not known.
+    Raises `InputError` where the exchange certifies none, for then the maximum is not known, and for literal indices
+    without a disturbance.
     """
     from sparserob_core.experiment.assemble import assemble, build, tools_of
     from sparserob_core.experiment.config.load import load_config
     from sparserob_core.sip.methods.own_units import solve_in_own_units
     from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
-    from sparserob_core.sip.relaxed.tuples import TupleValue
+    from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 
     fixed = {"start": EPSILON, "stop": EPSILON}
-    loaded = load_config(str(config), {"method": {"name": "exchange", "exact": False}, "continuation": fixed})
+    method = {"name": "exchange", "exact": False}
+    loaded = load_config(str(config), {**(overrides or {}), "method": method, "continuation": fixed})
     experiment, tools = assemble(loaded), tools_of(loaded)
     result = solve_in_own_units(build(loaded, "method", loaded.config.method), experiment.program, tools)
     if result.status not in ("certified", "verified") or not experiment.program.families:
         raise InputError(f"{config}: expected a config whose value is certified, got {result.status}: {result.message}")
+    program = imposed_program(experiment.program, formulation)
 
     def made() -> Landscape:
-        relaxed = RelaxedProgram(experiment.program, tools.solver, tools.regulariser)
-        g = TupleValue(experiment.program, relaxed, INDICES)
+        g = TupleValue(program, RelaxedProgram(program, tools.solver, tools.regulariser), indices)
         g.epsilon = EPSILON
-        target = Target(g, g.domain, g.gradient, g.block, g.linear)
+        target = Target(g, g.domain, g.gradient, g.block, g.linear, g.acting)
         return Landscape(f"g of {config.stem}", target, float(result.value), number, "g", fresh=made)
 
     return made()
