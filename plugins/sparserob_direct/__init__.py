@@ -14,8 +14,8 @@ import sparserob_core as sr
 MOST_SHOWN = 200  # rectangles
 NUMBERS_AT_ONCE: Final = 2**23  # coordinates of a batch: 64 MB, however many dimensions there are
 DEEPEST: Final = 33
-"""Cuts of one side, at most: 3^-33 is the spacing of doubles near 1. With ten fewer the last digits are lost; with more,
-points repeat."""
+"""Cuts of one side, at most: 3^-33 is the spacing of doubles near 1. With ten fewer the last digits are lost; with
+more, points repeat."""
 
 
 class Direct(sr.Maximiser, sr.Options):

@@ -17,7 +17,7 @@ from sparserob_core.sip.search.search import Target
 
 Formulation: TypeAlias = Literal["reduced", "literal"]
 
-SUITES = ("standard", "bbob", "g")
+SUITES = ("standard", "classic", "bbob", "g")
 BBOB_DIMENSIONS = (2, 5)
 INDICES = 8  # of a tuple of a landscape of g
 EPSILON = 1e-3  # the weight of the regulariser in a landscape of g
@@ -58,6 +58,8 @@ def landscapes(suites: Sequence[str], configs: Sequence[Path], instance: int = 1
             raise InputError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
     if "standard" in suites:
         yield from standard()
+    if "classic" in suites:
+        yield from classic()
     if "bbob" in suites:
         yield from bbob(instance)
     if "g" in suites:
@@ -77,8 +79,38 @@ def standard() -> Iterator[Landscape]:
     yield _standard("rosenbrock", functions.rosenbrock, _cube(2.048, 5), 106)
 
 
-def _standard(name: str, function: Callable[[Array], Array], box: Box, number: int, maximum: float = 0.0) -> Landscape:
-    return Landscape(name, Target(function, box), maximum, number, "standard")
+def classic() -> Iterator[Landscape]:
+    """Twelve functions more, in two to twenty coordinates: each of them defeats some searches that are good
+    elsewhere."""
+    shift = np.random.default_rng(0).uniform(-0.6, 0.6, 20)
+    unit = Box(np.zeros(6), np.ones(6))
+    rows: Sequence[tuple[str, Callable[[Array], Array], Box, float]] = (
+        ("branin", functions.branin, Box(np.array([-5.0, 0.0]), np.array([10.0, 15.0])), -0.39788735772973816),
+        ("camel", functions.camel, Box(np.array([-3.0, -2.0]), np.array([3.0, 2.0])), 1.0316284534898774),
+        ("goldstein price", functions.goldstein, Box(np.full(2, -1.9), np.full(2, 2.1)), -3.0),
+        ("needle", functions.needle, Box(unit.lower[:2], unit.upper[:2]), 1.0220692642822948),
+        ("hartmann 3", functions.hartmann, Box(unit.lower[:3], unit.upper[:3]), 3.8627797873326634),
+        ("shekel", functions.shekel, Box(np.zeros(4), np.full(4, 10.0)), 10.536409816692046),
+        ("griewank", lambda x: functions.griewank(x, 60.0 * shift[:5]), _cube(60.0, 5), 0.0),
+        ("levy", functions.levy, _cube(10.0, 5), 0.0),
+        ("michalewicz", functions.michalewicz, Box(np.zeros(5), np.full(5, np.pi)), 4.687658179088149),
+        ("schwefel", functions.schwefel, _cube(500.0, 5), 5 * 418.98288727243373),
+        ("hartmann 6", functions.hartmann, unit, 3.3223680114155156),
+        ("ellipsoid", lambda x: functions.ellipsoid(x, shift), _cube(1.0, 20), 0.0),
+    )
+    for number, (name, function, box, maximum) in enumerate(rows, 107):
+        yield _standard(name, function, box, number, maximum, "classic")
+
+
+def _standard(
+    name: str,
+    function: Callable[[Array], Array],
+    box: Box,
+    number: int,
+    maximum: float = 0.0,
+    suite: str = "standard",
+) -> Landscape:
+    return Landscape(name, Target(function, box), maximum, number, suite)
 
 
 def bbob(instance: int = 1) -> Iterator[Landscape]:
