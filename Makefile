@@ -28,7 +28,7 @@ endef
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo live paper test tests test-changed test-slow test-pythons archive mutants lint style types bench dist docs docs-pictures clean
+.PHONY: help install demo live paper test tests test-changed test-slow test-pythons archive mutants lint style types bench dist docs docs-pictures docs-tables clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
@@ -44,6 +44,7 @@ help:
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
 	@echo "make dist        sdist and wheel in dist/, tried in an environment of their own"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
+	@echo "make docs-tables  the tables of docs/maximisers.md anew: every search beside other people's (an hour)"
 	@echo "make docs-pictures  the pictures of docs/gallery.md and docs/live.md anew (minutes; needs a Vulkan driver, no display)"
 	@echo "make install     set up $(VENV) with everything, whatever is there of it"
 	@echo "make clean       remove $(VENV) and every cache"
@@ -152,6 +153,9 @@ docs: $(WRITERS)
 	$(BIN)/python docs/build_reference.py
 	$(BIN)/python -m sphinx -b html -W --keep-going -q docs site/html
 	@echo "the site is site/html/index.html"
+
+docs-tables: $(PEERS)
+	$(BIN)/python docs/build_maximisers.py
 
 docs-pictures: $(INSTALLED)
 	$(BIN)/python docs/build_gallery.py

@@ -56,9 +56,8 @@ FILES = {
     ),
     "solution.npz": (
         "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`,"
-        " `families`, `formulations`, `multipliers`; under feedback the same of the constraints that prove the lower"
-        " bound, each at its deviation, as `bound_indices`, ..., and `bound_equalities`; with fixed final values these"
-        " also of a control that answers nothing"
+        " `families`, `formulations`, `multipliers`; the same of the constraints that prove the lower bound, as"
+        " `bound_indices`, ..., under feedback each at its deviation; and `bound_equalities`"
     ),
     "evaluations.npz": (
         "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound,"

@@ -125,6 +125,7 @@ from sparserob_core.sip.search.block_ascent import block_ascent as block_ascent
 from sparserob_core.sip.search.ask_tell import AskTell as AskTell
 from sparserob_core.sip.search.foreign import from_ask_tell as from_ask_tell
 from sparserob_core.sip.search.foreign import from_minimiser as from_minimiser
+from sparserob_core.sip.search.part import SearchPart as SearchPart
 from sparserob_core.sip.search.trust_region import TrustRegion as TrustRegion
 from sparserob_core.sip.rules import InnerStop as InnerStop
 from sparserob_core.sip.rules import OuterStep as OuterStep

@@ -1,28 +1,33 @@
-"""DIRECT, the deterministic division of a box into ever smaller rectangles, by the implementation in scipy."""
+"""DIRECT, the deterministic division of a box into ever smaller rectangles, an iteration at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar
+from heapq import heappop, heappush
+from typing import ClassVar, Final
 
 import numpy as np
 from pydantic import Field
 
 import sparserob_core as sr
 
-SHOWN_EVERY = 32  # evaluations
 MOST_SHOWN = 200  # rectangles
-RETOLD = 3000  # points whose rectangles are followed
+NUMBERS_AT_ONCE: Final = 2**23  # coordinates of a batch: 64 MB, however many dimensions there are
+DEEPEST: Final = 33
+"""Cuts of one side, at most: 3^-33 is the spacing of doubles near 1. With ten fewer the last digits are lost; with
+more, points repeat."""
 
 
 class Direct(sr.Maximiser, sr.Options):
     """Dividing rectangles (Jones, Perttunen and Stuckman 1993), with the local bias of Gablonsky and Kelley (2001)
     unless switched off.
 
+    The rectangles that some Lipschitz constant makes the most promising ones are cut into thirds along all of their
+    longest sides; the side beside whose new centres the better value lies is cut first. The new centres of all
+    rectangles of one iteration are evaluated in one batch. Of equal values the earlier rectangle comes first.
     Deterministic: the generator is not used. It proves no upper bound.
     """
 
-    scaled: ClassVar[bool] = True
     apart: ClassVar[bool] = True
 
     eps: float = Field(default=1e-8, ge=0.0, le=1.0)
@@ -33,122 +38,115 @@ class Direct(sr.Maximiser, sr.Options):
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
-        from scipy.optimize import Bounds, direct
-
-        # An iteration takes two evaluations at least, so only the budget ends the search; scipy allocates memory for
-        # maxiter.
-        direct(
-            _Descent(objective),
-            Bounds(objective.domain.lower, objective.domain.upper),
-            eps=self.eps,
-            maxfun=objective.remaining,
-            maxiter=objective.remaining + 1,
-            locally_biased=self.locally_biased,
-            vol_tol=0.0,
-            len_tol=0.0,
-        )
+        division = Division(objective, self.locally_biased)
+        while chosen := division.promising(self.eps):
+            division.divide(chosen)
+            if objective.observed:
+                objective.sketch("rectangles, the best ones", *division.boxes())
         return float("inf")
 
 
-class _Descent:
-    """The negated objective at one point.
+class Division:
+    """The rectangles: their ``centres (n, d)`` in the unit box, how often each side was cut, ``levels (n, d)``, and the
+    ``losses (n,)`` at the centres, of which there are ``count``."""
 
-    scipy finishes its iteration beyond ``maxfun``, and averages values: once the budget is spent, and where the
-    objective is ``-inf``, it is given the worst finite value that was seen.
-    """
+    def __init__(self, objective: sr.Objective, biased: bool) -> None:
+        self.objective, self.biased, self.count = objective, biased, 0
+        dimension = objective.domain.dimension
+        self.centres, self.levels = np.empty((0, dimension)), np.empty((0, dimension), dtype=np.int8)
+        self.losses, self.worst = np.empty(0), -np.inf
+        self.waiting: dict[tuple[int, int], list[tuple[float, int]]] = {}  # by size, the best one first
+        self._add(np.full((1, dimension), 0.5), np.zeros((1, dimension), dtype=np.int8))
+        self._wait(0)
 
-    def __init__(self, objective: sr.Objective) -> None:
-        self.objective, self.worst, self.cells = objective, -np.inf, Rectangles(objective.domain)
+    def promising(self, eps: float) -> list[int]:
+        """Take out the rectangles that are the best for some Lipschitz constant and promise a gain of ``eps``."""
+        sizes = sorted(size for size, rectangles in self.waiting.items() if rectangles)
+        losses = np.array([self.waiting[size][0][0] for size in sizes])
+        losses[np.isinf(losses)] = self.worst if np.isfinite(self.worst) else 0.0
+        chosen = list[int]()
+        for at in best_for_some_slope(np.array([self._width(size) for size in sizes]), losses, eps):
+            rectangles = self.waiting[sizes[at]]
+            loss, first = heappop(rectangles)
+            chosen.append(first)
+            while not self.biased and rectangles and rectangles[0][0] == loss:
+                chosen.append(heappop(rectangles)[1])
+        return chosen
 
-    def __call__(self, point: np.ndarray) -> float:
-        domain = self.objective.domain
-        if not self.objective.remaining:
-            return self._substitute()
-        asked = np.clip(point, domain.lower, domain.upper)
-        value = -float(self.objective.evaluate(asked[np.newaxis])[0])
-        if self.objective.observed:
-            self.cells.add(asked, -value)
-            if self.objective.evaluations % SHOWN_EVERY == 0:
-                self.objective.sketch("rectangles, the best ones", *self.cells.boxes())
-        if np.isinf(value):
-            return self._substitute()
-        self.worst = max(self.worst, value)
-        return value
-
-    def _substitute(self) -> float:
-        return self.worst if np.isfinite(self.worst) else 0.0
-
-
-class Rectangles:
-    """The division of the box, retold from the points that are asked for: scipy keeps it to itself.
-
-    A rectangle is cut into thirds along its longest sides: points come in pairs beside its centre, and the side whose
-    pair has the better value is cut first. Where a pair is complete for every side that is asked for, its cuts are
-    known; until then the rectangle stands as it was. For showing, never for the search.
-    """
-
-    def __init__(self, domain: sr.Box) -> None:
-        self.domain = domain
-        self.centres = np.zeros((0, domain.dimension))
-        self.levels = np.zeros((0, domain.dimension), dtype=int)
-        self.values = np.zeros(0)
-        self.parent, self.pending = -1, list[tuple[int, int]]()
-
-    def add(self, point: np.ndarray, value: float) -> None:
-        """A point ``(d,)`` that was evaluated."""
-        if len(self.centres) >= RETOLD:
-            return
-        unit = (point - self.domain.lower) / (self.domain.upper - self.domain.lower)
-        parent, axis = self._origin(unit)
-        if self.pending and (parent != self.parent):
-            self._cut()
-            parent, axis = self._origin(unit)
-        self.centres = np.vstack([self.centres, unit])
-        self.values = np.append(self.values, value)
-        level = self.levels[parent] if parent >= 0 else np.zeros(unit.size, dtype=int)
-        self.levels = np.vstack([self.levels, level])
-        self.parent = parent
-        if parent >= 0:
-            self.pending.append((axis, len(self.centres) - 1))
+    def divide(self, chosen: list[int]) -> None:
+        """Evaluate the new centres in these rectangles, and cut them."""
+        longest = [np.flatnonzero(self.levels[one] == self.levels[one].min()) for one in chosen]
+        parents = np.repeat(chosen, [2 * axes.size for axes in longest])
+        axes = np.repeat(np.concatenate(longest), 2)
+        steps = 3.0 ** -(self.levels[parents, axes].astype(float) + 1.0)
+        steps[1::2] *= -1.0
+        first, rows = self.count, max(1, NUMBERS_AT_ONCE // self.centres.shape[1])
+        for begin in range(0, parents.size, rows):
+            part = slice(begin, begin + rows)
+            centres = self.centres[parents[part]]
+            centres[np.arange(len(centres)), axes[part]] += steps[part]
+            self._add(centres, self.levels[parents[part]])
+        for rectangle, sides in zip(chosen, longest, strict=True):
+            pairs = self.losses[first : first + 2 * sides.size].reshape(-1, 2).min(axis=1)
+            for place in np.argsort(pairs, kind="stable").tolist():  # a side that is cut first leaves larger thirds
+                self.levels[rectangle, sides[place]] += 1
+                self.levels[first + 2 * place : first + 2 * place + 2] = self.levels[rectangle]
+            for one in (rectangle, *range(first, first + 2 * sides.size)):
+                self._wait(one)
+            first += 2 * sides.size
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corners ``(k, d)``, of the best rectangles first; not of those that are just being cut."""
-        done = np.ones(len(self.centres), dtype=bool)
-        done[[row for _, row in self.pending]] = False
-        order = np.argsort(np.where(done, -self.values, np.inf), kind="stable")[: min(MOST_SHOWN, int(done.sum()))]
-        half, width = 0.5 / 3.0 ** self.levels[order], self.domain.upper - self.domain.lower
-        return (
-            self.domain.lower + np.clip(self.centres[order] - half, 0.0, 1.0) * width,
-            self.domain.lower + np.clip(self.centres[order] + half, 0.0, 1.0) * width,
-        )
+        """Lower and upper corners ``(k, d)``, of the best rectangles first."""
+        order = np.argsort(self.losses[: self.count], kind="stable")[:MOST_SHOWN]
+        half = 0.5 / 3.0 ** self.levels[order].astype(float)
+        return self._placed(self.centres[order] - half), self._placed(self.centres[order] + half)
 
-    def _origin(self, unit: np.ndarray) -> tuple[int, int]:
-        """The rectangle beside whose centre a point lies, by a third of a side, and along which; -1 for the first."""
-        if not len(self.centres):
-            return -1, 0
-        offset = np.abs(self.centres - unit)
-        moved = offset > 1e-12
-        axis = offset.argmax(axis=1)
-        step = offset[np.arange(len(offset)), axis] * 3.0 ** (self.levels[np.arange(len(offset)), axis] + 1)
-        fits = (moved.sum(axis=1) == 1) & (np.abs(step - 1.0) < 1e-6)
-        # the rectangle in work first, else the youngest
-        found = np.flatnonzero(fits)
-        if not found.size:
-            return -1, 0
-        at = self.parent if self.parent in found else int(found[-1])
-        return at, int(axis[at])
+    def _add(self, centres: np.ndarray, levels: np.ndarray) -> None:
+        losses = -self.objective.evaluate(self._placed(centres))
+        end = self.count + len(centres)
+        if end > len(self.losses):
+            more = max(end, 2 * self.count)
+            self.centres, self.levels, self.losses = (
+                np.concatenate([kept[: self.count], np.empty((more - self.count, *kept.shape[1:]), kept.dtype)])
+                for kept in (self.centres, self.levels, self.losses)
+            )
+        self.centres[self.count : end], self.levels[self.count : end] = centres, levels
+        self.losses[self.count : end], self.count = losses, end
+        self.worst = float(losses[np.isfinite(losses)].max(initial=self.worst))
 
-    def _cut(self) -> None:
-        axes = {axis: [row for other, row in self.pending if other == axis] for axis, _ in self.pending}
-        order = sorted(axes, key=lambda axis: -max(self.values[row] for row in axes[axis]))
-        for place, axis in enumerate(order):
-            later = [row for other in order[place:] for row in axes[other]]
-            for row in (self.parent, *later):
-                self.levels[row, axis] += 1
-        self.pending = []
+    def _wait(self, rectangle: int) -> None:
+        levels = self.levels[rectangle]
+        least = int(levels.min())
+        if least < DEEPEST:
+            size = (least, 0 if self.biased else int((levels > least).sum()))
+            heappush(self.waiting.setdefault(size, []), (float(self.losses[rectangle]), rectangle))
+
+    def _width(self, size: tuple[int, int]) -> float:
+        """The longest side with the local bias, else the diagonal."""
+        level, shorter = size
+        if self.biased:
+            return float(3.0**-level)
+        return float(3.0**-level * np.sqrt(self.centres.shape[1] - shorter + shorter / 9.0))
+
+    def _placed(self, unit: np.ndarray) -> np.ndarray:
+        domain = self.objective.domain
+        return np.clip(domain.lower + unit * (domain.upper - domain.lower), domain.lower, domain.upper)
+
+
+def best_for_some_slope(widths: np.ndarray, losses: np.ndarray, eps: float) -> Iterator[int]:
+    """The places ``j`` at which a slope ``K > 0`` makes ``losses[j] - K widths[j]`` the least of all, and less than the
+    least loss by the share ``eps`` of it; ``widths (k,)`` decrease."""
+    least = losses.min(initial=np.inf)
+    for at, (width, loss) in enumerate(zip(widths.tolist(), losses.tolist(), strict=True)):
+        with np.errstate(over="ignore"):  # a slope beyond all doubles is no slope
+            steepest = float(((losses[:at] - loss) / (widths[:at] - width)).min(initial=np.inf))
+            flattest = float(((loss - losses[at + 1 :]) / (width - widths[at + 1 :])).max(initial=0.0))
+        gains = steepest == np.inf or loss - steepest * width <= least - eps * abs(least)
+        if steepest > 0.0 and flattest <= steepest and gains:
+            yield at
 
 
 @sr.hookimpl
 def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
     """Offer ``direct``."""
-    yield sr.MaximiserPlugin(name="direct", factory=Direct, summary="dividing rectangles, deterministic (scipy)")
+    yield sr.MaximiserPlugin(name="direct", factory=Direct, summary="dividing rectangles, deterministic, in batches")

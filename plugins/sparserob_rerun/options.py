@@ -20,9 +20,9 @@ class LandscapeOptions(sr.Options):
     evaluations: int = Field(default=100_000, ge=64)
     """Evaluations of g that all landscapes of a run may take; for the last quarter of them they stay coarse."""
 
-    share: float = Field(default=0.5, gt=0.0, le=1.0)
+    share: float = Field(default=0.15, gt=0.0, le=1.0)
     """Share of the processor time of one core that it may take during the run, beside a first, coarse drawing for each
-    weight epsilon."""
+    weight epsilon; finer grids take a third of it, a coarse one after a gain all."""
 
     patience: float = Field(default=2.0, ge=0.0, le=600.0)
     """Seconds that a run waits at its end for the landscape of its last tuple."""

@@ -12,16 +12,17 @@ if TYPE_CHECKING:
 
 
 def first_temperature(options: SimulatedAnnealing, values: np.ndarray) -> float:
-    """The given one, or ``temperature_share`` times the median distance of the finite values from their median; 1 if
-    they are all equal."""
+    """The given one, or ``temperature_share`` times the median distance of the finite values from their median; the
+    size of the first of them if they are all equal, and 1 if that is 0."""
     if options.initial_temperature is not None:
         return options.initial_temperature
     finite = values[np.isfinite(values)]
+    size = float(np.abs(finite[:1]).max(initial=0.0)) or 1.0
     if finite.size < 2:
-        return 1.0
+        return size
     distances = np.abs(finite - np.median(finite))
     spread = float(np.median(distances)) or float(distances.max())
-    return options.temperature_share * spread if spread > 0.0 and isfinite(spread) else 1.0
+    return options.temperature_share * spread if spread > 0.0 and isfinite(spread) else size
 
 
 class Cooling:

@@ -18,7 +18,13 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
 
 @pytest.mark.parametrize(
     ("extra", "project"),
-    [("rerun", "rerun-sdk"), ("figures", "matplotlib"), ("dask", "distributed"), ("nevergrad", "nevergrad")],
+    [
+        ("rerun", "rerun-sdk"),
+        ("figures", "matplotlib"),
+        ("dask", "distributed"),
+        ("cma", "cma"),
+        ("nevergrad", "nevergrad"),
+    ],
 )
 def test_a_missing_package_is_named_with_the_bound_that_the_distribution_states(extra: str, project: str) -> None:
     (stated,) = EXTRAS[extra]
@@ -31,6 +37,7 @@ def test_a_missing_package_is_named_with_the_bound_that_the_distribution_states(
     [
         ("matplotlib", "matplotlib", ["run", "small.yaml", "--out", "out"], 0),
         ("distributed", "distributed", ["sweep", "small.yaml", "seed=1,2", "executor=dask", "--out", "out"], 2),
+        ("cma", "cma", ["run", "small.yaml", "maximiser=cma", "--out", "out"], 2),
         ("nevergrad", "nevergrad", ["run", "small.yaml", "maximiser=nevergrad", "--out", "out"], 2),
         ("rerun_bindings", "rerun-sdk", ["watch", "small.yaml", "--save", "new.rrd", "--out", "out"], 2),
         ("rerun_bindings", "rerun-sdk", ["sweep", "small.yaml", "seed=1,2", "--save", "new.rrd", "--out", "out"], 2),

@@ -197,9 +197,15 @@ def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.Fi
 def test_a_recording_has_a_name_and_says_of_what_it_is_and_how_it_ended(exchanged: sr.Outcome) -> None:
     said = properties(exchanged.directory / "recording.rrd")
     result = exchanged.result
-    assert said["name"] == said["title"] == json.loads(said["config"])["title"]
+    assert said["title"] == json.loads(said["config"])["title"] and said["name"] == f"exchange, seed 0: {said['title']}"
     assert said["status"] == "certified" and said["cost"] == result.cost and said["lower_bound"] == result.lower_bound
     assert json.loads(said["config"])["problem"]["name"] == "linear" and said["seed"] == 0
+
+
+def test_two_searches_of_one_problem_are_told_apart_by_the_first_words_of_their_names(searched: sr.Outcome) -> None:
+    said = properties(searched.directory / "recording.rrd")
+    config = json.loads(said["config"])
+    assert said["name"] == f"{config['maximiser']['name']}, seed {said['seed']}: {said['title']}"
 
 
 def test_what_is_arranged_otherwise_has_another_place_in_the_viewer() -> None:
@@ -337,7 +343,7 @@ def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
     for _ in range(2):
         landscape = sr.Landscape(inspection().relaxed_value(4, 0.01), anchor, (0, 0), (2, 0), 8, 0.01)
         levels = [complete for complete in landscape.evaluate() if complete]
-        assert len(levels) == 4 and landscape.spent == 53  # 36 pairs of eight even lines, and 17 on those of the anchor
+        assert len(levels) == 4 and landscape.spent == 55  # pairs of eight even lines and the two of the anchor
         found.append(landscape.values)
     assert (found[0] == found[1]).all()
     fresh = inspection().relaxed_value(4, 0.01)
@@ -462,7 +468,8 @@ def test_a_tuple_beside_a_line_of_the_grid_takes_its_place(place: float) -> None
     list(landscape.evaluate())
     assert landscape.axes[0][landscape.at[0]] == place and landscape.value == place + 0.3
     assert np.diff(landscape.axes[0]).min() > 1e-3
-    assert landscape.axes[0].size == (8 if place != 0.5 else 9)
+    assert 0.3 in landscape.axes[0]  # where the other index is, which is beside no line
+    assert landscape.axes[0].size == 1 + (8 if place != 0.5 else 9)
 
 
 def test_g_has_the_value_that_a_search_has_whatever_the_units(tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_every_method_is_watched_and_shown_again(
 def test_every_maximiser_is_watched_and_shown_again(
     maximiser: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    needs = {"nevergrad": "nevergrad"}.get(maximiser)
+    needs = {"cma": "cma", "nevergrad": "nevergrad"}.get(maximiser)
     if needs:
         pytest.importorskip(needs)
     changes = {**cheap("experiment1_reduced.yaml"), "maximiser.name": maximiser, "method.indices": 2}

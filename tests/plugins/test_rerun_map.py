@@ -438,6 +438,39 @@ def test_axes_are_the_coordinates_along_which_g_moves_most(value: Any, axes: tup
     assert landscape.flat or high - low > 0.5
 
 
+def test_a_map_over_one_coordinate_of_two_like_indices_is_symmetric_and_half_of_it_is_evaluated() -> None:
+    """Also where a third index moves with one of the two; both of their places are lines of either axis."""
+    asked: list[np.ndarray] = []
+
+    def value(slots: np.ndarray) -> float:
+        asked.append(slots.copy())
+        return float(np.exp(-50.0 * (slots[:, 0] - 0.33) ** 2).sum())
+
+    found, _ = drawn_of(plain(value, ("time",)), [[0.33], [0.71], [0.72]])
+    for shown, _ in found:
+        across, up, values = shown.shown
+        assert (across == up).all() and {0.33, 0.71} <= {*across.tolist()}
+        assert (values == values.T).all()
+        assert shown.value == pytest.approx(1.0 + np.exp(-50 * 0.38**2) + np.exp(-50 * 0.39**2))
+    finest = found[-1][0]
+    size = finest.shown[0].size
+    assert len(asked) - 1 == finest.spent == size * (size + 1) // 2  # one more says which indices decide
+    for slots in asked:
+        assert slots[0, 0] <= slots[1, 0] and slots[2, 0] == pytest.approx(min(1.0, slots[1, 0] + 0.01))
+
+
+def test_what_is_not_visibly_better_is_not_drawn_anew() -> None:
+    from sparserob_rerun.search.explorer import Aim
+
+    found, explorer = drawn_of(plain(lambda s: s[0, 0] + s[1, 0], ("time",)), [[0.2], [0.7]])
+    for gain, waits in ((1e-8, False), (np.nan, True), (1e-4, True)):
+        explorer.aim(Aim(np.array([[0.3], [0.7]]), 0.1, found[-1][1].value + gain, ""))
+        assert (explorer.waiting is not None) == waits
+        explorer.waiting = None
+    explorer.aim(Aim(np.array([[0.3], [0.7]]), 0.01, found[-1][1].value, ""))  # of another weight it is another map
+    assert explorer.waiting is not None
+
+
 def test_a_tuple_without_a_map_is_not_the_end_of_the_map_and_one_index_has_one_more_beside_it() -> None:
     found, explorer = drawn_of(plain(lambda s: 1.0, ("time",), ()), [[0.2]])
     assert not found and "no coordinate of the indices can move" in explorer.wrong and explorer.left > 0

@@ -13,7 +13,9 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rerun")
@@ -21,8 +23,10 @@ pytest.importorskip("rerun")
 from sparserob_core.experiment.config.load import load_config
 from sparserob_rerun.recording import sinks
 from tests.support.places import ROOT
+from tests.support.recordings import read, scalars, slowness, viewer
 
 PATIENCE = 60.0  # seconds; a loaded machine starts slowly
+LATE = 6.0  # seconds into a run at which somebody comes, who stays as long
 
 
 def variable(name: str) -> str:
@@ -85,9 +89,10 @@ def watching(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def address(process: subprocess.Popen[str]) -> str:
+    """The page that a browser is to open, with what it is told."""
     assert process.stdout is not None
     for line in process.stdout:
-        if found := re.search(r"to watch, open (http://127\.0\.0\.1:\d+/)", line):
+        if found := re.search(r"to watch, open (http://127\.0\.0\.1:\d+/\S*)", line):
             return found.group(1)
     raise AssertionError("no address was told")
 
@@ -118,3 +123,29 @@ def test_the_page_answers_during_the_run_and_one_interrupt_ends_the_run_and_the_
     while answers(page):
         assert time.monotonic() < end
         time.sleep(0.2)
+
+
+@pytest.mark.slow
+def test_a_viewer_that_joins_late_has_the_run_from_its_first_evaluation_and_what_comes_after(
+    watching: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    """It takes what the page would take, from the source that the page's address names, and keeps it in a file."""
+    page = address(watching)
+    (source,) = parse_qs(urlsplit(page).query)["url"]
+    late, file = LATE * max(1.0, slowness()), tmp_path / "late.rrd"
+    time.sleep(late)
+    assert watching.poll() is None
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        port = str(one.getsockname()[1])
+    joining = [str(viewer()), "--bind", "127.0.0.1", "--port", port, "--save", str(file), source]
+    process = subprocess.Popen(joining, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    time.sleep(late)
+    process.kill()
+    process.wait()
+    found = read(file)
+    seconds, _ = scalars([*found["/search/g/tried"], *found["/search/g/refused"]], "time")
+    numbers, _ = scalars([*found["/search/g/tried"], *found["/search/g/refused"]], "evaluation")
+    assert numbers[0] == 1 and np.diff(numbers).max() < numbers.size / 10  # no part is missing
+    assert seconds[-1] / 1e9 > late  # and it goes on
+    assert {"/landscape/map/g", "/physics/plots/curve", "/state", "/verdict", "/log"} <= set(found)

@@ -277,7 +277,7 @@ def test_the_map_of_a_margin_says_between_which_values_the_critical_one_is(
     if bracket is not None:
         assert board.bracket(rows) == bracket
         edge = board._axes((0.0, 1.0)).at(2.0, 0.0)[0, 0]
-        beyond = np.concatenate([points[:, 0] - edge for points, _, _ in drawing.strips["hatch"]])
+        beyond = np.concatenate([points[..., 0].ravel() - edge for points, _, _ in drawing.strips["hatch"]])
         assert (signs[sense] * beyond >= -1e-9).all()
 
 

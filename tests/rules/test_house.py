@@ -27,7 +27,7 @@ WRITTEN = ("*.md", "docs/**/*.md", "configs/*.*", "configs/studies/*", "tests/**
 PAGES = sorted({path for pattern in WRITTEN for path in ROOT.glob(pattern)} - {Path(__file__).resolve()})
 HEAVY = {
     "scipy", "matplotlib", "rich", "qpsolvers", "piqp", "proxsuite", "clarabel", "cvxpy", "rerun", "nevergrad", "dask",
-    "flint", "jaxtyping",
+    "cma", "flint", "jaxtyping",
 }  # fmt: skip
 A_DOZEN = 12
 PLACES = ("sparserob_core/experiment/cli/", "sparserob_core/experiment/terminal/")

@@ -22,6 +22,15 @@ def test_the_generated_pages_are_up_to_date() -> None:
         assert path.read_text() == text, f"{path.relative_to(ROOT)} is out of date: make docs"
 
 
+def test_every_maximiser_is_in_the_tables_that_compare_them_and_these_have_their_places() -> None:
+    written = runpy.run_path(str(ROOT / "docs" / "build_maximisers.py"))
+    assert {*written["NAMES"], "lipo"} == set(sr.load_registry().names("maximiser"))  # lipo wants a constant
+    page = (ROOT / "docs" / "maximisers.md").read_text()
+    for name in written["TABLES"]:
+        assert page.count(f"<!-- {name}: by docs/build_maximisers.py -->") == 1
+        assert page.count(f"<!-- end of {name} -->") == 1
+
+
 def test_every_component_has_a_summary_and_every_option_a_meaning() -> None:
     records = list(sr.load_registry().records())
     silent = [str(record) for record in records if not record.summary]

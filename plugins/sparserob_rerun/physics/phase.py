@@ -22,7 +22,8 @@ SLICES = 36
 ROOM = 2.0  # the panel is half as large as the drawing
 POINT = 8.0  # pixels: a goal that is smaller is drawn as a square of that size
 LAYERS = ("hatch", "slices", "frame", "worst", "curve", "arcs", "wall")
-LINE, ENTRY = 30.0, 300.0  # of words from one to the next, and how wide the longest are that say what is drawn
+LINE, ENTRY = 36.0, 340.0  # of words beside a plot, from one to the next, and how wide the longest are
+COLUMNS, WIDE = 2, 400.0  # of words below one, which have the width of the panel
 
 
 def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
@@ -86,13 +87,13 @@ def _outlined(drawing: Drawing, axes: Axes, limit: Any, allowed: Floats) -> tupl
 
 def _named(drawing: Drawing, axes: Axes, drawn: list[tuple[str, Colour]], below: bool = False) -> None:
     """What is drawn, beside the plot or ``below`` it, where no curve is."""
-    left, top = axes.left + axes.width, 0.0
+    left, top, columns, wide, line = axes.left + axes.width, 0.0, 1, ENTRY, ROOM * LINE
     if below:
-        left, top = axes.left, axes.top + axes.height + ROOM * LINE
-    columns = int(axes.width // ENTRY) if below else 1
+        columns, wide = COLUMNS, WIDE
+        left, top = axes.left + (axes.width - columns * wide) / 2, axes.top + axes.height + line
     for entry, (words, colour) in enumerate(dict.fromkeys(drawn)):
-        across, line = left + ENTRY * (entry % columns), entry // columns
-        drawing.text(across + ENTRY / 2, top + ROOM * LINE * (line + 0.5), words, colour)
+        row, column = divmod(entry, columns)
+        drawing.text(left + wide * (column + 0.5), top + line * (row + 0.5), words, colour)
 
 
 def _slices(data: sr.FigureData) -> Floats:

@@ -163,7 +163,7 @@ class Physics:
             axes,
             f"how the constraints push the nominal {name}; 1 is what its largest size costs"
             if self.switching.peak
-            else f"why {name} switches: it acts where the push leaves the band",
+            else f"why {name} switches: the push leaves the band",
             _time(data),
             ticks_below=last,
         )

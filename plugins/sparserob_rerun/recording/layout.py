@@ -98,7 +98,7 @@ def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
         below = rrb.Horizontal(search.climb(rrb, shown.stages, shown.budget), _lane(rrb), column_shares=[3, 1])
         left = rrb.Vertical(*terrain, below, row_shares=[4, 1][-1 - len(terrain) :])
         right = [rrb.Horizontal(*words, *map_words), *plots, *plane]
-        return [left, rrb.Vertical(*right, row_shares=[6, 6, 4][: len(right)])], [9, 5]
+        return [left, rrb.Vertical(*right, row_shares=[11, 12, 9][: len(right)])], [9, 5]
     numbers = [_violation(rrb, shown), _bounds(rrb)]
     middle = (
         rrb.Vertical(_terrain(shown), *numbers, row_shares=[10, _room(shown), 5])
@@ -117,7 +117,12 @@ def _plots(problem: sr.OptimalControlProblem, searches: bool) -> Any:
 
 
 def _lane(rrb: Any) -> Any:
-    return rrb.StateTimelineView(origin="/state", name="What is going on")
+    """The lane of states, from the beginning of the run on whatever timeline is shown."""
+    from rerun.encodings import TimeRange
+
+    everything = rrb.TimeRangeBoundary.infinite()
+    whole = rrb.TimeAxis(view_range=TimeRange(start=everything, end=everything))
+    return rrb.StateTimelineView(origin="/state", name="What is going on", time_view=whole)
 
 
 def _terrain(shown: Shown) -> Any:

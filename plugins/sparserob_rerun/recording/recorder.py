@@ -22,10 +22,10 @@ from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
 from sparserob_rerun.recording.layout import Shown, layout
 from sparserob_rerun.recording.waiting import BOUNDS, CLASH, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
-from sparserob_rerun.search.explorer import Aim, Explorer
+from sparserob_rerun.search.explorer import VISIBLE, Aim, Explorer
 from sparserob_rerun.search.projection import Projector
 from sparserob_rerun.search.search import SearchView
-from sparserob_rerun.search.terrain import VISIBLE, Terrain
+from sparserob_rerun.search.terrain import Terrain
 from sparserob_rerun.search.way import Stage
 
 SEEN = 10  # evaluations between two pictures of the way
@@ -96,7 +96,7 @@ class Recorder:
         self.shown, self.searches, self.began = shown, shown.searches, 0.0
         self.best_value, self.unseen, self.behind, self.way = -np.inf, 0, False, False
         self.relaxed: tuple[tuple[int, float], sr.RelaxedValue] | None = None
-        self.optimal: Floats = np.zeros((0, 0))  # the tuple whose control is shown
+        self.optimal: Aim | None = None  # the tuple whose control is shown
         self.heard = self.next = time.monotonic()
         self.ended = np.inf  # the moment at which the run was over, once it is
         self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
@@ -117,12 +117,16 @@ class Recorder:
         self._page("solving", [])
 
     def _describe(self, title: str) -> None:
-        """Give the recording its name, and say of what it is."""
-        self.stream.send_recording_name(title)
+        """Give the recording its name, and say of what it is. The name begins with what two runs of one problem differ
+        in, because a list of recordings shows its first words."""
         known: dict[str, Any] = {"title": [title]}
-        if self.inspection is not None:
+        if self.inspection is None:
+            self.stream.send_recording_name(title)
+        else:
             config = self.inspection.config
-            known |= {"config": [json.dumps(config, default=str)], "seed": [config.get("seed", 0)]}
+            by, seed = config["maximiser" if self.searches else "method"]["name"], config.get("seed", 0)
+            self.stream.send_recording_name(f"{by}, seed {seed}: {title}")
+            known |= {"config": [json.dumps(config, default=str)], "seed": [seed]}
         self.stream.send_property("run", self.rr.AnyValues(**known))
 
     def _conclude(self, event: sr.RunFinished) -> None:
@@ -249,14 +253,17 @@ class Recorder:
         self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.thread_time() - began))
 
     def _control(self, stage: Stage) -> None:
-        """Draw the control that is optimal for the best tuple so far, where it is another one."""
-        slots = stage.best.reshape(-1, stage.block)
-        if self.inspection is None or self.physics is None or np.array_equal(self.optimal, slots):
+        """Draw the control that is optimal for the best tuple so far, where its g is visibly higher."""
+        aim = self._best(stage, stage.number)
+        if self.inspection is None or self.physics is None:
             return
+        if self.optimal is not None and not aim.exceeds(self.optimal):
+            return
+        slots = aim.slots
         if self.relaxed is None or self.relaxed[0] != (len(slots), stage.epsilon):
             key = (len(slots), stage.epsilon)
             self.relaxed = key, self.inspection.relaxed_value(*key)
-        self.optimal, g = slots, self.relaxed[1]
+        self.optimal, g = aim, self.relaxed[1]
         g.at(slots)
         known = g.optimum()
         if known is not None:

@@ -29,6 +29,10 @@ weight. On four times as coarse a grid what matters lies between two lines; on t
 HELD = 0.8
 """Seconds for which a new landscape may wait until it is as fine as the one that is shown, which is of the same weight
 and nearly as high. Ten times as many, and what is drawn is too old; a tenth, and fine drawings flicker."""
+REFINING = 1 / 3
+"""Of the share of a core, what finer grids may take; the rest is kept for the coarse one after the next gain. With a
+tenth of it no map of a short search is ever fine; with all of it, what is drawn after a gain is seconds old."""
+VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
 
 
@@ -44,6 +48,10 @@ class Aim:
     words: str
     round: int = 0
     pair: tuple[int, ...] = ()
+
+    def exceeds(self, other: Aim) -> bool:
+        """Return whether its value is visibly above another one of the same weight, or either is not known."""
+        return self.epsilon != other.epsilon or not self.value - other.value <= VISIBLE * max(1.0, abs(self.value))
 
 
 @final
@@ -90,14 +98,18 @@ class Explorer:
     @property
     def rest(self) -> float:
         """Seconds until the share allows more work."""
-        return 0.0 if self.urgent else max(0.0, self.used / self.share - (time.monotonic() - self.began))
+        if self.urgent or (self.fresh and not self._held):
+            return 0.0
+        refines = self._coarse and (self.waiting is None or not self._better(self.waiting))
+        share = self.share * (REFINING if refines else 1.0)
+        return max(0.0, self.used / share - (time.monotonic() - self.began))
 
     def aim(self, aim: Aim) -> None:
         """Ask for the landscape through a tuple, in the middle of the coordinates that it does not say."""
         if self.left <= 0:
             return
         now = self.aimed
-        if now is not None and now.epsilon == aim.epsilon and np.array_equal(now.slots, aim.slots):
+        if now is not None and (not aim.exceeds(now) or _same(now, aim)):
             self.waiting = None
             return
         self.waiting = aim
@@ -229,6 +241,10 @@ class Explorer:
             return
         self.landscape = sr.Landscape(g, anchor, *axes.places(pair, anchor), self.options.grid, aim.epsilon, axes)
         yield from self.landscape.evaluate()
+
+
+def _same(one: Aim, other: Aim) -> bool:
+    return one.epsilon == other.epsilon and np.array_equal(one.slots, other.slots)
 
 
 def _gain(aim: Aim, before: Aim, landscape: sr.Landscape) -> float:

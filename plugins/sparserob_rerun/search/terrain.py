@@ -10,7 +10,7 @@ import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing, ticks
 from sparserob_rerun.drawing.palette import Floats
-from sparserob_rerun.search.explorer import Aim
+from sparserob_rerun.search.explorer import VISIBLE, Aim
 from sparserob_rerun.search.projection import outlines_on
 from sparserob_rerun.search.way import Shadow, Stage, shadow
 
@@ -25,7 +25,6 @@ ABOUT = (
     " tuples is J\\*, the least cost of a control that meets all."
 )
 """What a person who has never seen the map has to know first."""
-VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 LIFT = 0.015  # points stand this share of the height above the surface
 POLE = 0.32
 """How far above the surface the value of the best point is written, in heights of it, wherever that point is. Much

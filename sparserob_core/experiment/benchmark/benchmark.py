@@ -43,12 +43,13 @@ def benchmark(
 ) -> Benchmark:
     """Maximisers side by side: what ``sparserob benchmark NAME ...`` does.
 
-    ``suites``: ``standard`` (six functions), ``bbob`` (24 functions in dimensions 2 and 5, by ioh), ``g`` (the relaxed
-    value over tuples of 8 indices of ``configs``, whose maximum the exchange certifies; three shipped ones unless
-    given). Every search has ``budget`` evaluations and one of the seeds ``0, 1, ...``; the same numbers give the same
-    result. A landscape is solved at ``maximum - accuracy (maximum - begin)`` (Moré and Wild 2009, (2.2)), ``begin`` the
-    median of the function at uniform points. ``out``: a new or empty directory for ``profiles.png``,
-    ``benchmark.json`` and ``ioh/``, files that IOHanalyzer reads. Raises `InputError` when an argument is at fault.
+    ``suites``: ``standard`` (six functions), ``classic`` (twelve more), ``bbob`` (24 functions in dimensions 2 and 5,
+    by ioh), ``g`` (the relaxed value over tuples of 8 indices of ``configs``, whose maximum the exchange certifies;
+    three shipped ones unless given). Every search has ``budget`` evaluations and one of the seeds ``0, 1, ...``; the
+    same numbers give the same result. A landscape is solved at ``maximum - accuracy (maximum - begin)`` (Moré and Wild
+    2009, (2.2)), ``begin`` the median of the function at uniform points. ``out``: a new or empty directory for
+    ``profiles.png``, ``benchmark.json`` and ``ioh/``, files that IOHanalyzer reads. Raises `InputError` when an
+    argument is at fault.
     """
     if not maximisers:
         raise InputError("maximisers: expected at least one, got none")

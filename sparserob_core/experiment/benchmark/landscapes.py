@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from sparserob_core.experiment.benchmark import functions
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.search.search import Target
 
-SUITES = ("standard", "bbob", "g")
+Formulation: TypeAlias = Literal["reduced", "literal"]
+
+SUITES = ("standard", "classic", "bbob", "g")
 BBOB_DIMENSIONS = (2, 5)
 INDICES = 8  # of a tuple of a landscape of g
 EPSILON = 1e-3  # the weight of the regulariser in a landscape of g
@@ -56,6 +58,8 @@ def landscapes(suites: Sequence[str], configs: Sequence[Path], instance: int = 1
             raise InputError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
     if "standard" in suites:
         yield from standard()
+    if "classic" in suites:
+        yield from classic()
     if "bbob" in suites:
         yield from bbob(instance)
     if "g" in suites:
@@ -75,8 +79,38 @@ def standard() -> Iterator[Landscape]:
     yield _standard("rosenbrock", functions.rosenbrock, _cube(2.048, 5), 106)
 
 
-def _standard(name: str, function: Callable[[Array], Array], box: Box, number: int, maximum: float = 0.0) -> Landscape:
-    return Landscape(name, Target(function, box), maximum, number, "standard")
+def classic() -> Iterator[Landscape]:
+    """Twelve functions more, in two to twenty coordinates: each of them defeats some searches that are good
+    elsewhere."""
+    shift = np.random.default_rng(0).uniform(-0.6, 0.6, 20)
+    unit = Box(np.zeros(6), np.ones(6))
+    rows: Sequence[tuple[str, Callable[[Array], Array], Box, float]] = (
+        ("branin", functions.branin, Box(np.array([-5.0, 0.0]), np.array([10.0, 15.0])), -0.39788735772973816),
+        ("camel", functions.camel, Box(np.array([-3.0, -2.0]), np.array([3.0, 2.0])), 1.0316284534898774),
+        ("goldstein price", functions.goldstein, Box(np.full(2, -1.9), np.full(2, 2.1)), -3.0),
+        ("needle", functions.needle, Box(unit.lower[:2], unit.upper[:2]), 1.0220692642822948),
+        ("hartmann 3", functions.hartmann, Box(unit.lower[:3], unit.upper[:3]), 3.8627797873326634),
+        ("shekel", functions.shekel, Box(np.zeros(4), np.full(4, 10.0)), 10.536409816692046),
+        ("griewank", lambda x: functions.griewank(x, 60.0 * shift[:5]), _cube(60.0, 5), 0.0),
+        ("levy", functions.levy, _cube(10.0, 5), 0.0),
+        ("michalewicz", functions.michalewicz, Box(np.zeros(5), np.full(5, np.pi)), 4.687658179088149),
+        ("schwefel", functions.schwefel, _cube(500.0, 5), 5 * 418.98288727243373),
+        ("hartmann 6", functions.hartmann, unit, 3.3223680114155156),
+        ("ellipsoid", lambda x: functions.ellipsoid(x, shift), _cube(1.0, 20), 0.0),
+    )
+    for number, (name, function, box, maximum) in enumerate(rows, 107):
+        yield _standard(name, function, box, number, maximum, "classic")
+
+
+def _standard(
+    name: str,
+    function: Callable[[Array], Array],
+    box: Box,
+    number: int,
+    maximum: float = 0.0,
+    suite: str = "standard",
+) -> Landscape:
+    return Landscape(name, Target(function, box), maximum, number, suite)
 
 
 def bbob(instance: int = 1) -> Iterator[Landscape]:
@@ -99,30 +133,38 @@ def bbob(instance: int = 1) -> Iterator[Landscape]:
             yield Landscape(name, target, -float(problem.optimum.y), number, "bbob", instance)
 
 
-def landscape_of(config: Path, number: int) -> Landscape:
-    """``g`` at tuples of reduced indices of a config, at a small weight of the regulariser; its maximum is the value
-    that the exchange certifies at that weight.
+def landscape_of(
+    config: Path,
+    number: int,
+    formulation: Formulation = "reduced",
+    indices: int = INDICES,
+    overrides: Mapping[str, Any] | None = None,
+) -> Landscape:
+    """``g`` at tuples of so many indices of a config, at a small weight of the regulariser; its maximum is the value
+    that the exchange certifies at that weight. ``overrides``: what is another in the config.
 
-    Raises `InputError` where the exchange certifies none, for then the maximum is not known.
+    Raises `InputError` where the exchange certifies none, for then the maximum is not known, and for literal indices
+    without a disturbance.
     """
     from sparserob_core.experiment.assemble import assemble, build, tools_of
     from sparserob_core.experiment.config.load import load_config
     from sparserob_core.sip.methods.own_units import solve_in_own_units
     from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
-    from sparserob_core.sip.relaxed.tuples import TupleValue
+    from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 
     fixed = {"start": EPSILON, "stop": EPSILON}
-    loaded = load_config(str(config), {"method": {"name": "exchange", "exact": False}, "continuation": fixed})
+    method = {"name": "exchange", "exact": False}
+    loaded = load_config(str(config), {**(overrides or {}), "method": method, "continuation": fixed})
     experiment, tools = assemble(loaded), tools_of(loaded)
     result = solve_in_own_units(build(loaded, "method", loaded.config.method), experiment.program, tools)
     if result.status not in ("certified", "verified") or not experiment.program.families:
         raise InputError(f"{config}: expected a config whose value is certified, got {result.status}: {result.message}")
+    program = imposed_program(experiment.program, formulation)
 
     def made() -> Landscape:
-        relaxed = RelaxedProgram(experiment.program, tools.solver, tools.regulariser)
-        g = TupleValue(experiment.program, relaxed, INDICES)
+        g = TupleValue(program, RelaxedProgram(program, tools.solver, tools.regulariser), indices)
         g.epsilon = EPSILON
-        target = Target(g, g.domain, g.gradient, g.block, g.linear)
+        target = Target(g, g.domain, g.gradient, g.block, g.linear, g.acting)
         return Landscape(f"g of {config.stem}", target, float(result.value), number, "g", fresh=made)
 
     return made()

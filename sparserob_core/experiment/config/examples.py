@@ -17,7 +17,7 @@ SCHEMA = "# yaml-language-server:"  # a line for editors, beside the schema's fi
 @dataclass(frozen=True)
 class Example:
     """A config that comes with the distribution: its ``name``, the ``title`` of its runs, its ``story`` (the comment at
-    its beginning), and its ``text``."""
+    its beginning), and its ``text``, which is complete: of one that extends another it says what that says too."""
 
     name: str
     title: str
@@ -53,11 +53,35 @@ def _folder() -> Path:
 
 
 def _read(file: Path) -> Example:
-    text = file.read_text("utf-8")
+    text = _complete(file)
     lines = [line for line in text.splitlines() if not line.startswith(SCHEMA)]
     story = " ".join(line.lstrip("# ") for line in _leading(lines))
     title = re.search(r"^title: *(.*?) *$", text, re.MULTILINE)
     return Example(file.stem, file.stem if title is None else title[1].strip("'\""), story, "\n".join(lines) + "\n")
+
+
+def _complete(file: Path) -> str:
+    """The text of a config; of one that extends another with the keys of that which it has not itself, as they are
+    written there, and as plain data where that would not say the same."""
+    from sparserob_core.experiment.config.extending import EXTENDS, extended
+    from sparserob_core.experiment.config.reading.reader import read_source, read_value, write_yaml
+
+    text = file.read_text("utf-8")
+    if f"\n{EXTENDS}:" not in text:
+        return text
+    source = read_source(file)
+    data = extended(source).data
+    own, base = _keys(text), _keys(_complete(source.folder / source.data[EXTENDS]))
+    del own[EXTENDS]
+    story = "".join(f"{line}\n" for line in _leading(text.splitlines()))
+    composed = story + "".join({**base, **own}.values())
+    return composed if read_value(composed) == data else story + write_yaml(data)
+
+
+def _keys(text: str) -> dict[str, str]:
+    """The lines of every key at the top of a config."""
+    parts = re.split(r"^(?=[a-z_]+:)", text, flags=re.MULTILINE)[1:]
+    return {part.partition(":")[0]: part if part.endswith("\n") else f"{part}\n" for part in parts}
 
 
 def _leading(lines: list[str]) -> Iterator[str]:

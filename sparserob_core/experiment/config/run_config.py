@@ -48,7 +48,7 @@ class MaximiserEntry(Entry):
 
     polish: float | None = Field(default=None, ge=0.0, lt=1.0)
     """Share of the budget that goes to a local method, from the best points, at the end; null: what the maximiser says
-    of itself, a fifth as a rule, where the search is over literal tuples, and nothing elsewhere."""
+    of itself, a fifth as a rule, where ``g`` has a gradient or tuples are literal, and nothing elsewhere."""
 
 
 PIECES = Slot("dictionary", "piecewise_constant")

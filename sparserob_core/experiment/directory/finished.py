@@ -113,7 +113,7 @@ class StoredRun:
 
     @cached_property
     def proving(self) -> tuple[tuple[Cut, ...], Array]:
-        """The constraints that prove the lower bound of a policy, each at the deviation behind its index, and the
+        """The constraints that prove the lower bound, of a policy each at the deviation behind its index, and the
         multipliers of the equalities; none where ``solution.npz`` does not hold them."""
         columns = {name.removeprefix(BOUND): one for name, one in self.solution.items() if name.startswith(BOUND)}
         cuts = cuts_of(columns, "literal") if {*CUTS} <= {*columns} else ()

@@ -157,10 +157,10 @@ def arrays_of(
     """``solution.npz``: the decision, and for a control problem ``breakpoints``, ``control``, ``theta``; one row per
     imposed index in ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``,
     ``families``, ``formulations`` (what its index says) and ``multipliers``; ``worst_disturbance (mw, pieces)`` where
-    the worst constraint has one; under feedback the ``answers``: ``gains (K, K, m, p)``, and of outputs the
-    ``observer (K, d, p)``, and as ``bound_indices``, ``bound_rows``, ... the constraints that prove the lower bound,
-    each at the deviation behind its index, and as ``bound_equalities`` the multipliers of the equalities; where there
-    are equalities these too of a control that answers nothing."""
+    the worst constraint has one; as ``bound_indices``, ``bound_rows``, ... the constraints that prove the lower bound,
+    and as ``bound_equalities`` the multipliers of the equalities; under feedback the ``answers``, ``gains (K, K, m,
+    p)`` and of outputs the ``observer (K, d, p)``, and each constraint of the bound at the deviation behind its
+    index."""
     told = _told(result.indices)
     count, width = told["indices"].shape
     arrays = {
@@ -168,7 +168,7 @@ def arrays_of(
         "times": told["indices"][:, 0] if dictionary is not None and width else np.full(count, np.nan),
         **told,
     }
-    if answers or result.dual.mu.size:
+    if answers or result.dual.mu.size or result.dual.cuts:
         proving = {**_told(result.dual.cuts), "equalities": result.dual.mu}
         arrays |= {f"{BOUND}{name}": column for name, column in proving.items()}
     if dictionary is not None:

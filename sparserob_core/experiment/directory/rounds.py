@@ -15,7 +15,7 @@ from sparserob_core.sip.program import Formulation
 
 CUTS = ("families", "indices", "rows", "multipliers")
 FORMULATIONS = "formulations"
-BOUND = "bound_"  # before the names of what solution.npz says of the constraints that prove the bound of a policy
+BOUND = "bound_"  # before the names of what solution.npz says of the constraints that prove the bound
 NUMBERS = 500_000  # of all decisions, that a run keeps
 
 

@@ -2,7 +2,7 @@
 tuple has them: which indices these are in a tuple, which coordinates move g most, and the values of the map.
 
 It is filled from coarse to fine by evaluations of its own, of another program with another solver, on lines that only
-the options and the tuple decide; two of these lines go through the tuple itself.
+the options and the tuple decide; some of these lines go through the tuple itself.
 """
 
 from __future__ import annotations
@@ -68,17 +68,20 @@ class Landscape:
     spent: int = 0
 
     def __post_init__(self) -> None:
-        one, other = (self._axis(place) for place in (self.first, self.second))
-        self.axes, self.at = (one[0], other[0]), (one[1], other[1])
-        self._bases = (one[2], other[2])
         self._open = np.array([kind == "disturbance" for kind in self.g.kinds])
         heads = (self.first[0], self.second[0])
-        self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
         plain = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
         alike = bool((self.anchor[heads[0], plain] == self.anchor[heads[1], plain]).all())
-        alone = self._moving == [[head] for head in heads]
-        self._mirrored = self.first[1] == self.second[1] and alike and alone  # g is the same with the two exchanged
-        self._found: dict[tuple[float, ...], float] = {}
+        # one coordinate of two indices of which each may be the other: a value belongs to both of their orders
+        self._mirrored = self.first[1] == self.second[1] and alike and self.g.interchangeable
+        one, other = self._axis(self.first), self._axis(self.second)
+        self.axes, self._bases, self._always = (one[0], other[0]), (one[1], other[1]), (one[2], other[2])
+        self.at = (
+            int(np.searchsorted(one[0], self.anchor[self.first])),
+            int(np.searchsorted(other[0], self.anchor[self.second])),
+        )
+        self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
+        self._found: dict[tuple[float, float], float] = {}
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
 
     def _beside(self, slot: int, heads: tuple[int, int]) -> int:
@@ -90,15 +93,18 @@ class Landscape:
         nearest = slot if slot in heads else min(heads, key=lambda head: away[head])
         return nearest if away[nearest] < NEAR else -1
 
-    def _axis(self, place: Place) -> tuple[Array, int, np.ndarray]:
-        """The values along an axis, which of them is the anchor's, and which are those of the even grid; where one of
-        these is close to the anchor, it moves there."""
+    def _axis(self, place: Place) -> tuple[Array, np.ndarray, np.ndarray]:
+        """Return the values along an axis, which of them are those of the even grid, and which are the anchor's: of a
+        symmetric map those of both indices, since a ridge through either is on both axes. Where one of the even grid is
+        close to the anchor, it moves there."""
         even = np.linspace(self.g.slot.lower[place[1]], self.g.slot.upper[place[1]], self.grid)
-        nearest = int(np.abs(even - self.anchor[place]).argmin())
-        if abs(even[nearest] - self.anchor[place]) < CLOSE * (even[-1] - even[0]) / self.grid:
-            even[nearest] = self.anchor[place]
-        values = np.union1d(even, [self.anchor[place]])
-        return values, int(np.searchsorted(values, self.anchor[place])), np.searchsorted(values, even)
+        through = np.unique([self.anchor[at] for at in ((self.first, self.second) if self._mirrored else (place,))])
+        for value in through:
+            nearest = int(np.abs(even - value).argmin())
+            if abs(even[nearest] - value) < CLOSE * (even[-1] - even[0]) / self.grid:
+                even[nearest] = value
+        values = np.union1d(even, through)
+        return values, np.searchsorted(values, even), np.searchsorted(values, through)
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -108,8 +114,8 @@ class Landscape:
     def lines(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
         """Which values of either axis belong to the grid of a stride: its ends and the anchor's always do."""
         one, other = (
-            np.union1d(base[np.union1d(np.arange(0, self.grid, stride), [self.grid - 1])], [at])
-            for base, at in zip(self._bases, self.at, strict=True)
+            np.union1d(base[np.union1d(np.arange(0, self.grid, stride), [self.grid - 1])], always)
+            for base, always in zip(self._bases, self._always, strict=True)
         )
         return one, other
 
@@ -142,22 +148,29 @@ class Landscape:
         return float(np.mean(values == np.inf)), float(np.ptp(known)) if known.size else 0.0
 
     def _fill(self, i: int, j: int) -> None:
-        slots = self.anchor.copy()
-        for place, moving, to in zip(
-            (self.first, self.second), self._moving, (self.axes[0][i], self.axes[1][j]), strict=True
-        ):
-            # they keep their distance: at the anchor the tuple is the anchor's own, whose value none may lie below
-            c, shift = place[1], to - self.anchor[place]
-            slots[moving, c] = np.clip(self.anchor[moving, c] + shift, self.g.slot.lower[c], self.g.slot.upper[c])
-            slots[place] = to
-            slots[np.ix_(np.array(moving), self._open)] = np.nan
-        at = (float(self.axes[0][i]), float(self.axes[1][j]))
-        key = tuple(sorted(at)) if self._mirrored else at
-        if key not in self._found:
-            self._found[key] = self.g.at(slots)
+        to = self._order(float(self.axes[0][i]), float(self.axes[1][j]))
+        if to not in self._found:
+            self._found[to] = self.g.at(self._tuple(to))
             self.spent += 1
-        value = self._found[key]
+        value = self._found[to]
         self.values[i, j] = value if not np.isnan(value) else -np.inf
+
+    def _order(self, one: float, other: float) -> tuple[float, float]:
+        """Return where the first and the second index are at a point: where g knows no order of the two, in that of the
+        anchor."""
+        ordered = (one <= other) == bool(self.anchor[self.first] <= self.anchor[self.second])
+        return (other, one) if self._mirrored and not ordered else (one, other)
+
+    def _tuple(self, to: tuple[float, float]) -> Array:
+        """Return the tuple ``(D, width)`` whose two indices are where they are to be."""
+        slots = self.anchor.copy()
+        for place, moving, end in zip((self.first, self.second), self._moving, to, strict=True):
+            # they keep their distance: at the anchor the tuple is the anchor's own, whose value none may lie below
+            c, shift = place[1], end - self.anchor[place]
+            slots[moving, c] = np.clip(self.anchor[moving, c] + shift, self.g.slot.lower[c], self.g.slot.upper[c])
+            slots[place] = end
+            slots[np.ix_(np.array(moving), self._open)] = np.nan
+        return slots
 
     @property
     def value(self) -> float:

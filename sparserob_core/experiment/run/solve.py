@@ -104,12 +104,13 @@ def solve(
     the ``policy``, such as `AffinePolicy`: under feedback the decision begins with the nominal control.
     ``regulariser`` is by default the ridge for control problems, whose optimisers are to be unique, and none for other
     programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
-    ``polish`` goes to a local method at its end, unless given as in a config: the maximiser's own share over literal
-    tuples, nothing elsewhere. ``seconds``: the time after which it returns what it knows, as it does
-    at an interrupt from the keyboard; ``Result.stopped`` then says so; where no control can ever be certified it is 30
-    unless given. The result of a control problem knows its control, tube and worst cases as functions of time
-    (`ControlResult`), and is a run: it can be saved, drawn, and given to whatever takes one (`SolvedProblem`). So is
-    that of a program that `transcribe` made; of any other program it is a `Result`, which nothing could check.
+    ``polish`` goes to a local method at its end, unless given as in a config: the maximiser's own share where ``g``
+    has a gradient or literal tuples, nothing elsewhere. ``seconds``: the time after which it returns what it knows,
+    as it does at an interrupt from the keyboard; ``Result.stopped`` then says so; where no control can ever be
+    certified it is 30 unless given. The result of a control problem knows its control, tube and worst cases as
+    functions of time (`ControlResult`), and is a run: it can be saved, drawn, and given to whatever takes one
+    (`SolvedProblem`). So is that of a program that `transcribe` made; of any other program it is a `Result`, which
+    nothing could check.
     Raises `InputError` when an argument is at fault.
     """
     deadline, registry = Deadline(as_seconds(seconds)), load_registry()

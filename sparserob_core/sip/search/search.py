@@ -57,9 +57,9 @@ class Rules:
     value of at least ``target``, after ``patience`` evaluations in a row that gained nothing, and where ``halt`` says
     so, which is asked after every batch; its polish ends with it.
 
-    ``polish``: ``None`` is what the maximiser says of itself (`Maximiser.polished`) where the blocks of the target are
-    linear, for there `block_ascent` finds in ten evaluations what no search finds that only compares values, and 0
-    elsewhere.
+    ``polish``: ``None`` is what the maximiser says of itself (`Maximiser.polished`) where the target has a gradient, or
+    blocks that are linear: a local method finds in ten evaluations there what no search finds that only compares
+    values; and 0 elsewhere.
     """
 
     stop: Callable[[Progress], bool] | None = None
@@ -77,7 +77,7 @@ class Rules:
     def share(self, maximiser: Maximiser, target: Target) -> float:
         """The share of the budget that is kept for a polish."""
         if self.polish is None:
-            return maximiser.polished if target.linear is not None else 0.0
+            return maximiser.polished if target.linear is not None or target.gradient is not None else 0.0
         return self.polish
 
 
@@ -403,7 +403,7 @@ def maximise(
     evaluated value refutes.
     """
     rules = rules or Rules()
-    name = str(getattr(maximiser, "origin", f"maximiser {type(maximiser).__name__}"))
+    name = name_of(maximiser)
     moves = np.flatnonzero(target.domain.lower < target.domain.upper)
     reserved = int(rules.share(maximiser, target) * budget) if budget == int(budget) else 0
     objective = CountedObjective(target, budget - reserved, rules, notify, name)
@@ -415,7 +415,7 @@ def maximise(
                 objective.learn(*known)
             if start is not None:
                 objective.begin(np.atleast_2d(start))
-            bound = _bound(maximiser, name, shown, rng) if moves.size else _only_value(objective)
+            bound = ask(maximiser, shown, rng) if moves.size else _only_value(objective)
             stopped = stopped if objective.remaining else "the budget is spent"
         except SearchEnded as end:
             stopped = str(end)
@@ -450,8 +450,10 @@ def maximise(
     return replace(objective.report(stopped, bound), interrupted=interrupted)
 
 
-def _bound(maximiser: Maximiser, name: str, objective: Objective, rng: np.random.Generator) -> float:
-    """The upper bound that a maximiser claims; what it raises, other than an error of this project, is its fault."""
+def ask(maximiser: Maximiser, objective: Objective, rng: np.random.Generator) -> float:
+    """Let a maximiser search, in the units and with the indices apart that it asks for, and return the upper bound that
+    it claims; what it raises, other than an error of this project, is its fault."""
+    name = name_of(maximiser)
     if maximiser.apart and objective.acting is not None:  # a tuple of indices
         objective = Apart(objective)
     scaled = Scaled(objective, objective.known()[1]) if maximiser.scaled else None
@@ -464,6 +466,11 @@ def _bound(maximiser: Maximiser, name: str, objective: Objective, rng: np.random
     if isinstance(claimed, bool) or not isinstance(claimed, int | float | np.integer | np.floating):
         raise PluginError(f"{name}: search returned {claimed!r}, expected an upper bound, a number or inf")
     return float(claimed) * (1.0 if scaled is None else scaled.value or 1.0)
+
+
+def name_of(maximiser: Maximiser) -> str:
+    """What messages call a maximiser."""
+    return str(getattr(maximiser, "origin", f"maximiser {type(maximiser).__name__}"))
 
 
 def _only_value(objective: CountedObjective) -> float:

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+from sparserob_core.experiment.config.examples import _complete, examples
 from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.config.reading.reader import read_value
 from tests.support.stub import Command
 
 
@@ -19,6 +21,26 @@ def test_an_example_is_copied_and_means_the_same(repository: Path, command: Comm
     assert done.stdout == f"written to {file}; next: sparserob run {file}\n"
     assert load_config(file).config == load_config(repository / "configs" / "double_integrator.yaml").config
     assert "yaml-language-server" not in file.read_text()
+
+
+def test_every_example_is_complete_and_means_what_its_config_does(repository: Path, tmp_path: Path):
+    extending = []
+    for one in examples():
+        file, copied = repository / "configs" / f"{one.name}.yaml", tmp_path / f"{one.name}.yaml"
+        copied.write_text(one.text)
+        assert "extends:" not in one.text
+        assert load_config(copied).config == load_config(file).config, one.name
+        if "\nextends:" in file.read_text():
+            extending.append(one)
+    assert extending and all("# |u| <= 1" in one.text for one in extending if one.name.startswith("experiment1"))
+
+
+def test_what_cannot_be_composed_of_two_texts_is_written_as_data(tmp_path: Path):
+    (tmp_path / "base.yaml").write_text("# base\nmethod: {name: exchange, tolerance: 1.0e-3}\nseed: 1\n")
+    (tmp_path / "child.yaml").write_text("# child\nextends: base.yaml\nmethod: {name: exchange, rounds: 7}")
+    text = _complete(tmp_path / "child.yaml")
+    assert text.startswith("# child\n")
+    assert read_value(text) == {"method": {"name": "exchange", "tolerance": 1e-3, "rounds": 7}, "seed": 1}
 
 
 def test_nothing_is_overwritten_and_a_wrong_name_is_one_error(command: Command, tmp_path: Path):

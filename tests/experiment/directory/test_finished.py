@@ -178,15 +178,16 @@ def test_rounds_that_do_not_fit_are_named(copy: Path, name: str) -> None:
         _ = StoredRun(copy).history
 
 
-def test_a_directory_keeps_the_rows_that_prove_the_bound_of_a_policy(tmp_path: Path) -> None:
-    config = {**CONFIG, "policy": {"name": "affine"}}
+@pytest.mark.parametrize("policy", ["open_loop", "affine"])
+def test_a_directory_keeps_the_rows_that_prove_the_bound(tmp_path: Path, policy: str) -> None:
+    config = {**CONFIG, "policy": policy}
     result = sr.run(config, {}, tmp_path / "run", quiet=True, figures=False).result
     cuts = stored_result(StoredRun(tmp_path / "run")).dual.cuts
     assert len(cuts) == len(result.dual.cuts) > 0
     for stored, cut in zip(cuts, result.dual.cuts, strict=True):
         np.testing.assert_array_equal(stored.index, cut.index)
         told = (stored.family, stored.row, stored.multiplier, stored.formulation)
-        assert told == (cut.family, cut.row, cut.multiplier, "literal")
+        assert told == (cut.family, cut.row, cut.multiplier, cut.formulation)
     file = tmp_path / "run" / "solution.npz"
     np.savez(file, **{**read_arrays(file), "bound_rows": np.zeros(1 + len(cuts), dtype=int)})
     with pytest.raises(sr.InputError, match=r"solution\.npz: bound_"):

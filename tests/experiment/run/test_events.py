@@ -380,11 +380,12 @@ def test_large_points_are_not_kept_for_long() -> None:
         ("adalipo", {"constant", "rejected"}),
         ("gradient_ascent", {"ascent", "slope"}),
         ("nevergrad", {"spread"}),
+        ("cma", {"sigma"}),
     ],
 )
 def test_maximisers_tell_how_they_stand_in_their_own_terms(maximiser: str, names: set[str]) -> None:
-    if maximiser == "nevergrad":
-        pytest.importorskip("nevergrad")
+    if maximiser in ("cma", "nevergrad"):
+        pytest.importorskip(maximiser)
     heard: list[sr.EvaluationsFinished] = []
     sr.maximise(lambda x: -((x - 0.3) ** 2).sum(axis=1), SQUARE, maximiser, budget=60, notify=heard.append, polish=0.0)
     assert set(heard[-1].notes) == names

@@ -24,7 +24,8 @@ UNITLESS = {
     "Result.counts", "Result.epsilon", "Result.missed", "Result.seconds", "Result.solved_by",
     "RoundFinished.active_indices", "RoundFinished.cuts_added", "RoundFinished.cuts_dropped", "RoundFinished.epsilon",
     "RoundFinished.gap", "RoundFinished.relaxed_programs", "RoundFinished.round", "RoundFinished.seconds",
-    "RoundFinished.simplified", "SearchTrace.epsilon", "SearchTrace.outer", "SearchTrace.seconds", "Separation.rows",
+    "RoundFinished.simplified", "SearchTrace.epsilon", "SearchTrace.outer", "SearchTrace.polished",
+    "SearchTrace.seconds", "Separation.rows",
     "Sparsest.plain_count", "Witness.disturbance", "Witness.parameter", "Witness.row", "Witness.time",
 }  # fmt: skip
 ADDED = {"Proof.share", "Proof.units"}  # on the way back

@@ -93,26 +93,6 @@ def test_the_points_that_sequool_evaluates_next_are_in_the_cells_that_it_opens()
         assert inside.any(axis=1).all()
 
 
-@pytest.mark.parametrize("biased", [True, False])
-def test_the_rectangles_of_direct_fill_the_box_without_overlap_and_each_has_its_point(biased):
-    from sparserob_direct import Rectangles
-
-    box = sr.Box(np.zeros(2), np.array([2.0, 1.0]))
-    direct = load_own_registry().build("maximiser", "direct", {"locally_biased": biased})
-    trace = maximise(Target(hills, box), direct, 151, np.random.default_rng(0)).trace
-    cells = Rectangles(box)
-    for point, value in zip(trace.points, trace.values, strict=True):
-        cells.add(point, value)
-    lower, upper = cells.boxes()
-    assert len(lower) >= 140
-    share = (upper - lower).prod(axis=1).sum() / 2.0
-    assert 0.95 < share < 1.05
-    middles = (lower + upper) / 2
-    inside = ((middles[:, None] > lower[None] + 1e-9) & (middles[:, None] < upper[None] - 1e-9)).all(axis=2)
-    assert (inside.sum(axis=1) == 1).all()
-    assert np.abs(middles[:, None] - trace.points[None]).max(axis=2).min(axis=1).max() < 1e-9
-
-
 def test_what_lipo_shows_as_excluded_it_never_evaluates_afterwards():
     centre = np.array([0.7, 0.2])
     cone = Target(lambda points: -3.0 * np.linalg.norm(points - centre, axis=1), sr.Box([0.0, -1.0], [2.0, 1.0]))

@@ -75,8 +75,8 @@ def compare(runs: tuple[Path, ...], out: Path, accuracy: float | None, measure: 
     "--suite",
     "suites",
     multiple=True,
-    type=click.Choice(["standard", "bbob", "g"]),
-    help="What to maximise: six functions, the 24 of BBOB, g of configs; may be repeated; standard unless given.",
+    type=click.Choice(["standard", "classic", "bbob", "g"]),
+    help="What to maximise: six functions, twelve classic ones, the 24 of BBOB, g of configs; standard unless given.",
 )
 @click.option("--config", "configs", multiple=True, type=click.Path(path_type=Path), help="A config for the suite g.")
 @click.option("--budget", type=int, default=1000, show_default=True, help="Evaluations of every search.")

@@ -1,0 +1,79 @@
+"""A few maximisers try, and the one that comes farthest goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+import sparserob_core as sr
+
+
+class Portfolio(sr.Maximiser, sr.Options):
+    """Some maximisers, each with a part of the budget; then the one that has found the best value, with the rest.
+
+    Nobody knows beforehand which search suits a function: trees find narrow hills in few coordinates, walks that move
+    one coordinate at a time cross a separable landscape, evolution strategies follow ridges. Each member tries on its
+    own, from the same start, and sees nothing of the others. The winner is begun anew from the best point of all;
+    values that it asks for again are remembered, so that a deterministic one goes on where it was. It proves no upper
+    bound.
+
+    Notes ``member``, the number of the one that searches, from 1.
+    """
+
+    members: Sequence[str | Mapping[str, Any]] = Field(default=("sequool", "simulated_annealing", "cma"), min_length=1)
+    """Names of maximisers, or mappings with their options; ``cma`` is left out where its package is missing and it was
+    not asked for."""
+
+    trial: float = Field(default=0.5, gt=0.0, lt=1.0)
+    """Share of the budget that they try with, in equal parts."""
+
+    def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
+        """See `sparserob_core.Maximiser`."""
+        members = self._built()
+        known = objective.known()
+        each = int(self.trial * objective.remaining / len(members))
+        parts = list[sr.SearchPart]()
+        for number, member in enumerate(members, 1):
+            if each:
+                objective.note(member=float(number))
+                parts.append(sr.SearchPart(objective, each, *known))
+                parts[-1].run(member, rng)
+        winner = int(np.argmax([part.best_value for part in parts])) if parts else 0
+        objective.note(member=winner + 1.0)
+        known = _joined(known, *(batch for part in parts for batch in part.found))
+        idle = 0  # members that found nothing left to gain, one after the other
+        while objective.remaining and idle < len(members):
+            rest = sr.SearchPart(objective, objective.remaining, *known)
+            rest.run(members[(winner + idle) % len(members)], rng)
+            known = _joined(known, *rest.found)
+            idle = 0 if rest.found else idle + 1
+        return float("inf")
+
+    def _built(self) -> list[sr.Maximiser]:
+        registry = sr.load_registry()
+        built = list[sr.Maximiser]()
+        for entry in self.members:
+            name = entry if isinstance(entry, str) else str(entry.get("name"))
+            options = {} if isinstance(entry, str) else {key: value for key, value in entry.items() if key != "name"}
+            needs = registry.get("maximiser", name).needs
+            if needs and find_spec(needs[0]) is None and "members" not in self.model_fields_set:
+                continue
+            built.append(registry.build("maximiser", name, options))
+        return built
+
+
+def _joined(*batches: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    points, values = zip(*batches, strict=True)
+    return np.concatenate(points), np.concatenate(values)
+
+
+@sr.hookimpl
+def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
+    """Offer ``portfolio``."""
+    yield sr.MaximiserPlugin(
+        name="portfolio", factory=Portfolio, summary="a few maximisers try, and the one that comes farthest goes on"
+    )
