@@ -144,7 +144,7 @@ def sizes_of(series: Sequence[Series]) -> Array:
     """How large the entries of series of one shape are at most, ``(n, rows, columns)``."""
     entries = np.array([float(x.abs_upper()) for one in series for part in one.parts for x in part.entries()])
     found = np.where(entries > 0.0, entries + TINY, 0.0)
-    return found.reshape(len(series), len(series[0].parts), *series[0].shape).sum(axis=1) * OUTWARD
+    return np.asarray(found.reshape(len(series), len(series[0].parts), *series[0].shape).sum(axis=1) * OUTWARD)
 
 
 def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:

@@ -142,7 +142,8 @@ def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series
             terms.append(equation.slope(terms, n).scaled(_inverse(n + 1)).middle)
         sizes = (sizes_of(terms[first:]) / scale).max(axis=1)
         largest = np.maximum(largest, sizes.max(axis=0))
-        if len(terms) > max(len(equation.A), len(equation.F)) and (sizes[-2:] <= sharp * np.where(largest > 0.0, largest, 1.0)).all():
+        small = (sizes[-2:] <= sharp * np.where(largest > 0.0, largest, 1.0)).all()
+        if len(terms) > max(len(equation.A), len(equation.F)) and small:
             break
     return terms
 
