@@ -259,6 +259,11 @@ def test_powers_of_the_time_that_are_left_out_are_in_the_balls_of_the_first() ->
     assert laws._kept(A[:3], np.ones(1)) == A[:3]
 
 
+def test_units_are_not_those_of_times_at_which_a_wave_is_0() -> None:
+    system = VaryingSystem.of([[0, "sin(2*pi*t)"], [0, "-0.04"]], [[0], [1]], 8.0)
+    assert len(Law(Plant.of(system, 8.0), 8.0, Box()).stretches) < 200
+
+
 def test_a_plant_is_looked_at_where_it_is_finite() -> None:
     system = VaryingSystem.of([["1/(0.03125 + t)"]], [["1"]], 2.0)
     looks = [one[0, 0] for one in Plant.of(system, 2.0).looked_at([])]

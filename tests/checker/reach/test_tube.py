@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 pytest.importorskip("flint")
-import sparserob_core.checker.reach.varying.flow as varying
-import sparserob_core.checker.reach.varying.tube as varying_tube
+import sparserob_core as sr
+import sparserob_core.checker.flow.law as laws
+import sparserob_core.checker.flow.segment as segments
+import sparserob_core.checker.reach.tube as tubes
 from flint import arb_mat, ctx
 from sparserob_core.checker.reach.varying.tube import VaryingTube
 
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Ellipsoid
