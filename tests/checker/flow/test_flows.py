@@ -3,6 +3,8 @@ where they are close, and what is said to be 0, or the same at every parameter, 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from flint import arb, ctx
@@ -95,7 +97,7 @@ def test_a_parameter_at_which_nothing_changes_with_time_has_a_flow_over_the_stre
     flow = every.over(Box((0.0,), (0.0,)), 4)
     assert abs(transition(flow, 0.0, 0.1, 2.9) - (arb("-2.8")).exp()) < 1e-14
     marks = flow.marks([0.0, 3.0])
-    for a, b in zip(marks[:-1], marks[1:], strict=True):
+    for a, b in pairwise(marks):
         assert abs(flow.step(a, b).parts[0][0, 0] - (arb(a) - arb(b)).exp()) < 1e-14
 
 
@@ -148,4 +150,7 @@ def test_at_one_parameter_or_none_nothing_depends_on_it() -> None:
     A = parse_matrix("A", [["p1**3", "1"], ["0", "exp(p1)"]], ("p1",))
     still = LinearSystem(A, np.array([[0.0], [1.0]]), parameters=sr.Box([-1.0], [1.0]))
     there, moved = Flows(Plant.of(still, 1.0), 1.0, Box((0.0,), (1.0,))).links
-    assert there[:, :2].astype(int).tolist() == [[1, 1], [0, 1]] and moved[:, :2].astype(int).tolist() == [[1, 0], [0, 1]]
+    assert there[:, :2].astype(int).tolist() == [[1, 1], [0, 1]] and moved[:, :2].astype(int).tolist() == [
+        [1, 0],
+        [0, 1],
+    ]

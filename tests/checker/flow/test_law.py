@@ -88,28 +88,27 @@ def test_numbers_at_every_time_and_parameter_are_in_balls_that_narrow_with_the_d
 
 def test_phases_hold_their_own_laws_with_drifts_and_disturbances() -> None:
     names, box = ("p1", "p2"), sr.Box([-0.2, 0.0], [0.2, 1.0])
-    first = LinearSystem(parse_matrix("A", [["p1", "1"], ["-2", "p2**2"]], names), np.array([[0.0], [1.0]]),
-                         np.array([[1.0], [0.5]]), box, names, parse_matrix("c", [["p1*p2"], ["1"]], names))  # fmt: skip
-    second = LinearSystem(parse_matrix("A", [["0", "exp(p1)"], ["1", "0"]], names), np.array([[2.0], [0.0]]),
-                          np.array([[0.0], [3.0]]), box, names, np.array([[4.0], [0.0]]))  # fmt: skip
+    A, c = (parse_matrix(name, rows, names) for name, rows in (
+        ("A", [["p1", "1"], ["-2", "p2**2"]]), ("c", [["p1*p2"], ["1"]])))  # fmt: skip
+    first = LinearSystem(A, np.array([[0.0], [1.0]]), np.array([[1.0], [0.5]]), box, names, c)
+    other, drift = parse_matrix("A", [["0", "exp(p1)"], ["1", "0"]], names), np.array([[4.0], [0.0]])
+    second = LinearSystem(other, np.array([[2.0], [0.0]]), np.array([[0.0], [3.0]]), box, names, drift)
     plant = Plant.of(SwitchedSystem([(0.75, first), (2.0, second)]), 2.0)
     assert (plant.states, plant.driven, len(plant.phases)) == (2, 2, 2)
     law = Law(plant, 2.0, Box.between([-0.1, 0.2], [0.1, 0.3]), 6)
 
-    def truth(t, p):
-        if t <= 0.75 and law.stretches[0].stop >= t and not truth.second:
+    def truth(number, p):
+        if not number:
             return [[p[0], 1, 0, p[0] * p[1], 1], [-2, p[1] ** 2, 1, 1, 0.5]]
         return [[0, np.exp(p[0]), 2, 4, 0], [1, 0, 0, 0, 3]]
 
-    truth.second = False
     assert [(one.start, one.stop) for one in law.stretches] == [(0.0, 0.75), (0.75, 2.0)]
     assert all(one.is_still for one in law.stretches)
     for number, stretch in enumerate(law.stretches):
-        truth.second = bool(number)
         for point in [(1.0, -1.0), (-1.0, 1.0), (0.2, 0.3)]:
             p = np.array(law.box.middle) + np.array(law.box.halves) * np.array(point)
             found = seen(law, stretch, stretch.start, stretch.stop, 0.5, point)
-            for row, values in zip(found, truth(stretch.start, p), strict=True):
+            for row, values in zip(found, truth(number, p), strict=True):
                 for ball, value in zip(row, values, strict=True):
                     assert abs(float(ball.mid()) - value) <= float(ball.rad()) + 1e-15
                     assert float(ball.rad()) < 1e-9

@@ -1,5 +1,5 @@
-"""Guards checker/reach/measurable and products of checker/sets/polynomials: integrals of the largest of polynomials, and
-products of matrices that are known to a radius, in exact arithmetic and by hand."""
+"""Guards checker/reach/measurable and products of checker/sets/polynomials: integrals of the largest of polynomials,
+and products of matrices that are known to a radius, in exact arithmetic and by hand."""
 
 from __future__ import annotations
 
