@@ -38,7 +38,7 @@ FEWER = sr.Dictionary(np.array([0.0, 1.0, 2.0]), np.array([[1.0, -1.0]]))
 
 @pytest.fixture(autouse=True)
 def precision() -> Any:
-    with ctx.workprec(96):
+    with ctx.workprec(192):
         yield
 
 

@@ -20,9 +20,10 @@ from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.law import Box as ParameterBox
 from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.flow.segment import Segment
 from sparserob_core.checker.problem.lasting import Lasting
 from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.states import States, _blocks, enclosed, ring
+from sparserob_core.checker.reach.states import Lines, States, _blocks, enclosed, ring
 from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.problem.system import VaryingSystem
@@ -293,3 +294,20 @@ def test_products_of_numbers_hold_those_of_every_two_within_both_and_what_is_bey
     with ctx.workprec(96):
         series = Series(known, [arb_mat([[arb(float(x)) for x in row] for row in part]) for part in a])
         assert (enclosed([series]).mid[0] == a).all()
+
+
+@pytest.mark.parametrize("order", [1, 3, 9])
+def test_rows_of_a_segment_are_off_by_what_it_is_and_by_the_terms_that_are_not_kept(order: int) -> None:
+    """Of positive numbers, for which nothing cancels: at the end of a part all of it is needed."""
+    rng = np.random.default_rng(8)
+    tables, off, basis = rng.uniform(0.1, 1.0, (6, 2, 3)), rng.uniform(0.1, 1.0, (2, 3)), rng.uniform(0.5, 1.0, (3, 2))
+    with ctx.workprec(96):
+        terms = [Series.known(arb_mat([[arb(float(x)) for x in row] for row in one])) for one in tables]
+        lines = Lines.of(Segment(terms, off), basis)
+        for first, width in ((0.0, 1.0), (0.3, 0.5), (0.9, 0.0)):
+            found = lines.shifted(first, width, order)
+            assert len(found.mid) == min(order, len(tables))
+            truth = basis @ np.einsum("n,nij->ij", (first + width) ** np.arange(6), tables)
+            missed = np.abs(truth - found.mid[:, 0].sum(axis=0)) + basis @ off
+            assert (missed <= found.rad.sum(axis=(0, 1)) * (1 + 1e-12)).all()
+            assert (found.rad.sum(axis=(0, 1)) <= missed * (1 + 1e-9)).all()
