@@ -1,0 +1,53 @@
+"""Guards checker/problem/turns: what takes turns, acts late or is uncertain is the same system with a law in the time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.checker.problem.turns import in_turns
+from sparserob_core.control.problem.expression import parse_matrix
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+
+
+def system(text: str) -> LinearSystem:
+    A, c = (parse_matrix(name, rows, ("p1",)) for name, rows in (("A", [[text]]), ("c", [["p1"]])))
+    return LinearSystem(A, np.array([[2.0]]), np.array([[3.0]]), sr.Box([0.5], [0.75]), ("p1",), c)
+
+
+def problem(plant: Any, **more: Any) -> sr.OptimalControlProblem:
+    return sr.OptimalControlProblem(
+        **{"system": plant, "horizon": 2.0, "initial_state": [1.0], "control": sr.Box([-1.0], [1.0]), **more}
+    )
+
+
+def test_laws_in_turns_are_those_of_the_systems_that_take_turns() -> None:
+    turns = SwitchedSystem([(0.75, system("-p1")), (2.0, system("p1^2"))])
+    found = in_turns(problem(turns, execution=np.array([0.1]))).system
+    assert isinstance(found, VaryingSystem) and found.horizon == 2.0
+    assert [begin for begin, *_ in found.laws] == [0.0, 0.75]
+    assert found.parameters is not None and found.parameters.bounding_box().upper.tolist() == [0.75]
+    for (_, _, law), expected in zip(found.laws, (-0.625, 0.625**2), strict=True):
+        at = np.array([0.8, 0.625])
+        assert [float(np.asarray(law.entry(name)(at) if callable(law.entry(name)) else law.entry(name)).item())
+                for name in ("A", "B", "E", "c")] == [expected, 2.0, 3.0, 0.625]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("plant", "more", "changed"),
+    [
+        (LinearSystem(-np.eye(1), np.eye(1)), {"execution": np.array([0.1])}, False),
+        (LinearSystem(-np.eye(1), np.eye(1), delay=0.25), {"execution": np.array([0.1])}, True),
+        (LinearSystem(-np.eye(1), np.eye(1), delay=0.25), {}, False),
+        (system("-p1"), {"execution": np.array([0.1])}, True),
+        (system("-p1"), {}, False),
+    ],
+)
+def test_only_what_is_followed_in_time_is_changed(plant: Any, more: dict[str, Any], changed: bool) -> None:
+    given = problem(plant, **more)
+    found = in_turns(given)
+    assert (found is not given) == changed == isinstance(found.system, VaryingSystem)
+    assert found.system.delay == plant.delay
