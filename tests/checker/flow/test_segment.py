@@ -269,3 +269,15 @@ def test_terms_are_as_many_as_are_needed_and_no_more_than_are_allowed(monkeypatc
     short = solve(equation.A, equation.F, np.ones(2))
     assert len(short.terms) <= 6 + segments.AT_ONCE and short.off.max() > 1e-9
     assert (missed(short.terms, equation, [], 1.0) <= short.off).all()
+
+
+def test_what_is_remembered_of_one_polynomial_is_not_said_of_another():
+    equation = system(0, 0)
+    terms = guess(equation, np.ones(2))
+    for n in range(6):
+        for changed in range(max(0, n - 2), n + 1):
+            wrong = [*terms]
+            wrong[changed] = terms[changed].scaled(arb(2))
+            equation.slope(terms, n)
+            assert equation.slope(wrong, n).matrix == Equation(equation.A, equation.F).slope(wrong, n).matrix
+            assert equation.slope(terms, n).matrix == Equation(equation.A, equation.F).slope(terms, n).matrix

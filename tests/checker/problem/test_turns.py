@@ -1,4 +1,4 @@
-"""Guards checker/problem/turns: what takes turns, acts late or is uncertain is the same system with a law in the time."""
+"""Guards checker/problem/turns: what takes turns, acts late or is uncertain is one system with laws in the time."""
 
 from __future__ import annotations
 
