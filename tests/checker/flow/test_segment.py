@@ -278,6 +278,6 @@ def test_what_is_remembered_of_one_polynomial_is_not_said_of_another():
         for changed in range(max(0, n - 2), n + 1):
             wrong = [*terms]
             wrong[changed] = terms[changed].scaled(arb(2))
-            equation.slope(terms, n)
-            assert equation.slope(wrong, n).matrix == Equation(equation.A, equation.F).slope(wrong, n).matrix
-            assert equation.slope(terms, n).matrix == Equation(equation.A, equation.F).slope(terms, n).matrix
+            for given in (terms, wrong, terms):
+                found, fresh = equation.slope(given, n), Equation(equation.A, equation.F).slope(given, n)
+                assert (middles(found.matrix) == middles(fresh.matrix)).all()

@@ -1,4 +1,4 @@
-"""Guards checker/reach/disturbance_support: bounds of the support at weights that are off by what is told."""
+"""Guards checker/reach/supports: bounds of the support at weights that are off by what is told."""
 
 from __future__ import annotations
 
