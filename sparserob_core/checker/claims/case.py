@@ -303,11 +303,7 @@ class Case:
     @cached_property
     def marks(self) -> list[float]:
         """The times from each of which to the next the state is a polynomial of the time."""
-        return (
-            self.grid
-            if self.looped and self.changing is None
-            else self.flows.at(self.flows.box.middle).marks(self.grid)
-        )
+        return self.grid if self.looped and self.changing is None else self.flows.marks(self.grid)
 
     def states(self, box: ParameterBox) -> States:
         """The states that are reached over a box of parameters, or over a larger one."""

@@ -19,6 +19,7 @@ WIDE = {1: 16, 2: 8, 3: 5, 4: 3}  # of those that are to serve many boxes
 CLOSE = 1e-11  # of transitions over the horizon, what an expansion may leave out that serves smaller boxes too
 HALVINGS = 10  # of the box of all parameters, until a box has a flow of its own
 KEPT = 64  # flows over boxes
+ASIDE = 0.3819  # of half the width of all parameters, from their middle
 
 
 @final
@@ -57,8 +58,17 @@ class Flows:
 
     @cached_property
     def timing(self) -> Law:
-        """The law in the middle of all parameters, whose stretches are those of all boxes."""
-        return self.at(self.box.middle).law
+        """The law at one place among all parameters, whose stretches are those of all boxes."""
+        return self.at(self.aside).law
+
+    @property
+    def aside(self) -> tuple[float, ...]:
+        """A place where it would be a coincidence if what changes with time had a factor of 0."""
+        return tuple(m + ASIDE * h for m, h in zip(self.box.middle, self.box.halves, strict=True))
+
+    def marks(self, times: Sequence[float]) -> list[float]:
+        """`Flow.marks` of every box."""
+        return self.at(self.aside).marks(times)
 
     def holding(self, box: Box) -> Flow:
         """A flow over a box, or over a larger one where the expansion is close over all of that."""

@@ -121,6 +121,11 @@ class Stretch:
         return found[0] * OUTWARD, found[1] * OUTWARD
 
 
+def _power(length: float) -> float:
+    """The least power of two that is not below it."""
+    return 2.0 ** ceil(log2(length))
+
+
 def _kept(A: list[Series], units: Array) -> list[Series]:
     """The powers of which more is left than nothing; those beyond are in the balls of the first."""
     sizes = [one.size for one in A]
@@ -185,7 +190,7 @@ class Law:
         """The law on a stretch of the timing."""
         phase = next(one for one in reversed(self.plant.phases) if one.begin <= other.start)
         frame, table = self._table(other.start, other.stop, phase, self.monomials)
-        return replace(other, frame=frame, table=table)
+        return replace(other, frame=frame, table=table, stride=min(other.stride, _power(other.stop - other.start)))
 
     def _on(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
         whole = self._still(begin, until, phase)
@@ -213,7 +218,7 @@ class Law:
             return None
         if not found.is_still or (phase.timed and self._hides(found, phase)):
             return None
-        d, u, longest = len(self.units), self.units, 2.0 ** ceil(log2(until - begin))
+        d, u, longest = len(self.units), self.units, _power(until - begin)
         pace = float((found.sizes[0][:, :d] * u / u[:, None]).sum(axis=1).max(initial=0.0))
         return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / pace))) if pace > 0.0 else longest)
 

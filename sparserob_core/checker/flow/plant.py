@@ -13,6 +13,7 @@ from sparserob_core.control.problem.system import LinearSystem, System, VaryingS
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
+GOLDEN = 0.6180339887
 LOOKS = 17  # times of a phase at which its numbers are looked at, by which nothing is proven
 
 
@@ -59,7 +60,8 @@ class Plant:
     def looked_at(self, parameter: Sequence[float]) -> Iterator[Array]:
         """``[A B c E]`` at some times, and a parameter."""
         for phase in self.phases:
-            for time in np.linspace(phase.begin, phase.until, LOOKS).tolist():
+            for share in np.sort(np.arange(LOOKS) * GOLDEN % 1.0).tolist():  # none is a period of anything
+                time = phase.begin + share * (phase.until - phase.begin)
                 try:
                     yield phase.called(np.array([time, *parameter])).astype(float)
                 except (InputError, Unchecked):  # not finite there

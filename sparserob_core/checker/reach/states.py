@@ -191,10 +191,11 @@ class States:
         """About how much of the state at a mark, ``(d,)``, is due to the size of the box of parameters and unknown."""
         if not self.flow.monomials.degree:
             return np.zeros(self.flow.states)
-        found = np.array([float(x.rad()) for x in self.node(place).parts[0].entries()])
+        mark = max(place, 1)  # at the first nothing is unknown yet
+        found = np.array([float(x.rad()) for x in self.node(mark).parts[0].entries()])
         for convex, number in ((self.scene.initial_set, 0), (self.scene.disturbance, 1)):
             if convex is not None:
-                rad = self.effect(place)[number].rad[0]
+                rad = self.effect(mark)[number].rad[0]
                 found += rad.reshape(*rad.shape[:1], -1, convex.dimension).sum(axis=1) @ np.array(known(convex).radius)
         return found
 
