@@ -22,8 +22,6 @@ from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
 from sparserob_core.checker.reach.measurable import LoopBeside, MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
-from sparserob_core.checker.reach.varying.loop import VaryingLoop
-from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import NEAR, along
 from sparserob_core.control.problem.disturbances import apart
@@ -122,12 +120,11 @@ class Answers:
         )
         if case.several:
             return LoopBeside(
-                *parts, beside=MeasurableLoop.alone(case.problem, parts[4], parts[5], case.control.pieces)
+                *parts,
+                law=case.flows.at(()),
+                beside=MeasurableLoop.alone(case.problem, parts[4], parts[5], case.control.pieces),
             )
-        measurable = case.measurable and changes is None
-        if case.changing is not None:
-            return (VaryingMeasurableLoop if measurable else VaryingLoop)(*parts, law=case.changing.at(()))
-        return (MeasurableLoop if measurable else ClosedLoop)(*parts)
+        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(*parts, law=case.flows.at(()))
 
     @cached_property
     def commands(self) -> list[arb_mat]:

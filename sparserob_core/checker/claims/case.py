@@ -32,9 +32,9 @@ from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.measurable import Side, Together
+from sparserob_core.checker.reach.missed import SpreadExecution, VaryingExecution
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.cost import nominal_point
@@ -303,7 +303,7 @@ class Case:
     @cached_property
     def marks(self) -> list[float]:
         """The times from each of which to the next the state is a polynomial of the time."""
-        return self.grid if self.looped and self.changing is None else self.flows.marks(self.grid)
+        return self.flows.marks(self.grid)
 
     def states(self, box: ParameterBox) -> States:
         """The states that are reached over a box of parameters, or over a larger one."""

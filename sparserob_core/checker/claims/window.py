@@ -14,9 +14,9 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.execution import Execution
+from sparserob_core.checker.reach.missed import SpreadExecution, VaryingExecution
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.tube import Polynomial
-from sparserob_core.checker.reach.varying.execution import SpreadExecution, VaryingExecution
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.shape import Shape

@@ -214,12 +214,11 @@ class Flow:
         most. The rows of ``Phi(stop, s)`` are the flow of the transposed system, backwards."""
         stretch = self.law.stretches[self._place(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
-        none = Series.constant(self.monomials, zeros(self.states, 0))
-        rows = solve([one.transpose() for one in A], [none], 1.0 / stretch.units, ROUGH)
-        back, w = [one.transpose() for one in rows.terms], F[0].shape[1]
+        back, lost = self._back(stretch, A, start, stop)
+        w = F[0].shape[1]
         wanted = max(float((one.size / stretch.units[:, None]).max(initial=0.0)) for one in F) * ENOUGH
         inputs, found, off = [one.size for one in F], list[Series](), np.zeros((self.states, w))
-        off += rows.off.T @ np.sum(inputs, axis=0)
+        off += lost @ np.sum(inputs, axis=0)
         sizes = [one.size for one in back]
         for n in range(len(back) + len(F) - 1):
             pairs = [(n - k, k) for k in range(len(F)) if 0 <= n - k < len(back)]
@@ -234,6 +233,22 @@ class Flow:
                 found.append(Series.constant(self.monomials, zeros(self.states, w)))
             found.append(term)
         return found, off * OUTWARD
+
+    def _back(self, stretch: Stretch, A: Sequence[Series], start: float, stop: float) -> tuple[list[Series], Array]:
+        """``Phi(stop, s)`` as terms in the share of an interval that is left at ``s``, and by how much they are off at
+        most; of what does not change with time it is the flow of what is left."""
+        if stretch.is_still:
+            segment, share = self.segment(start, stop)
+            terms = [one.columns(0, self.states).scaled(share**n) for n, one in enumerate(segment.terms)]
+            return terms, segment.off[:, : self.states]
+        none = Series.constant(self.monomials, zeros(self.states, 0))
+        rows = solve([one.transpose() for one in A], [none], 1.0 / stretch.units, ROUGH)
+        return [one.transpose() for one in rows.terms], rows.off.T
+
+    def alike(self, start: float, stop: float) -> tuple[object, ...]:
+        """What intervals share of which the flow is the same."""
+        inside = not any(start < one < stop for one in self._begins)
+        return self.kind(start, stop) if inside else (start, stop)
 
     def sizes(self, start: float, stop: float) -> tuple[Array, Array, Array]:
         """The largest absolute values of ``[A B E]`` and of its derivative on the stretch that an interval is in, ``(d,

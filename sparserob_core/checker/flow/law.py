@@ -177,6 +177,11 @@ class Law:
         cut = [(phase.begin, min(phase.until, self.until), phase) for phase in self.plant.phases]
         return [one for begin, until, phase in cut if begin < until for one in self._on(begin, until, phase)]
 
+    @property
+    def is_still(self) -> bool:
+        """Whether no stretch changes with time."""
+        return all(one.is_still for one in self.stretches)
+
     @cached_property
     def weights(self) -> Array:
         """How much every monomial of the parameters has to do with the law, ``(M,)``, about."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import accumulate, pairwise
@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import middles, norm, stacked
-from sparserob_core.checker.flow.still import held, modes_at
-from sparserob_core.checker.flow.units import OwnUnits
+from sparserob_core.checker.arithmetic.series import around, identity, stacked
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets.known import known
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from sparserob_core.control.policies.measurements import Measurements
     from sparserob_core.control.problem.system import System
 
-TERMS = 8  # of the expansion that bounds a second derivative
+ORDER = 8  # of the states in the time on a cell; what comes after counts twice, half of it takes shorter cells
 
 
 def arb_of(value: float) -> arb:
@@ -75,21 +76,13 @@ class ClosedLoop:
     before: tuple[float, ...] = ()
     measured: Measurements | None = None
     observer: Array | None = None
-    _steps: dict[tuple[int, float], tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
+    law: Flow | None = None
 
     @cached_property
-    def modes(self) -> list[dict[str, arb_mat]]:
-        """``A``, ``B``, ``E`` of the systems that take turns."""
-        return modes_at(self.system, ())
-
-    @property
-    def parts(self) -> dict[str, arb_mat]:
-        """Those of the first one."""
-        return self.modes[0]
-
-    def mode(self, time: float) -> int:
-        """Which of them acts from a time on."""
-        return bisect_right(self.system.switches, time)
+    def flow(self) -> Flow:
+        """The flow of the system, its ``law`` where that is given."""
+        until = self.grid[-1]
+        return Flow(Plant.of(self.system, until), until) if self.law is None else self.law
 
     @cached_property
     def acting(self) -> list[float]:
@@ -158,48 +151,29 @@ class ClosedLoop:
         inside = (self.grid[piece] + self.grid[piece + 1]) / 2
         return bisect_right(self.acting, inside) - 1, bisect_right(self.changes, inside) - 1
 
-    def _held(self, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
-        """``e^{A s}`` and its integral, ``s`` from one time to another."""
-        from flint import arb
-
-        length = arb(stop) - arb(start)
-        key = self.mode(start), stop - start
-        exact = self._exact(start, stop, stop - start)
-        if key in self._steps and exact:
-            return self._steps[key]
-        found = held(self.modes[key[0]]["A"], self._identity, length)
-        if exact:
-            self._steps[key] = found
-        return found
-
     @property
     def _identity(self) -> arb_mat:
-        from flint import arb_mat
-
-        d = self.system.states
-        return arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
+        return identity(self.system.states)
 
     def _moved(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         """What a part of a piece of the grid makes of the states at its beginning, and what is added by what drives
         them, ``(d, 1 + Q)``."""
-        Phi, Gamma = self._held(start, stop)
-        return Phi, Gamma * self.drives[piece]
+        Phi, Gamma, Delta = self.flow.over(start, stop)
+        return Phi.matrix, Gamma.beside(Delta).matrix * self.drives[piece]
 
     def _passed(self, piece: int) -> tuple[arb_mat, arb_mat]:
         """What a piece of the grid makes of a state, and of the block of the disturbance that acts, ``(d, mw)``."""
-        Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
-        return Phi, Gamma * self.modes[self.mode(self.grid[piece])]["E"]
+        Phi, _, Delta = self.flow.over(self.grid[piece], self.grid[piece + 1])
+        return Phi.matrix, Delta.matrix
 
     def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
-        """Who can see a block of the disturbance along these vectors."""
-        return Pushed.of([(one["A"], one["E"]) for one in self.modes], vectors)
-
-    @staticmethod
-    def _exact(start: float, stop: float, key: float) -> bool:
-        """Whether the difference of two times is the float that it was rounded to."""
-        from fractions import Fraction
-
-        return Fraction(stop) - Fraction(start) == Fraction(key)
+        """Who can see a block of the disturbance along these vectors; of what changes with time from which numbers are
+        other than 0 at any time alone."""
+        if self.flow.law.is_still:
+            return Pushed.of([(one["A"], one["E"]) for one in modes_at(self.system, ())], vectors)
+        d, m = self.flow.states, self.flow.driven
+        there = np.any([one.sizes[0] > 0.0 for one in self.flow.law.stretches], axis=0)
+        return Pushed.linked(there[:, :d], there[:, d + m :], vectors)
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
@@ -276,33 +250,23 @@ class ClosedLoop:
 
     @cached_property
     def drives(self) -> list[arb_mat]:
-        """What drives the nominal state and every response on each piece of the grid, ``(d, 1 + Q)``."""
-        from flint import arb
-
-        m, found = self.gains.shape[2], []
-        pushed = stacked([[arb(float(v))] for v in self.middle])
-        by_control: dict[tuple[int, int], arb_mat] = {}
+        """What acts on each piece of the grid, nominally and as answers: control, drift and disturbance, ``(m + mw, 1 +
+        Q)``."""
+        found, none = [], [0.0] * self.starts[-1]
         for piece in range(len(self.grid) - 1):
-            (k, block), number = self._places(piece), self.mode(self.grid[piece])
-            B, E = self.modes[number]["B"].tolist(), self.modes[number]["E"]
-            if (number, k) not in by_control:
-                by_control[number, k] = stacked([row[:m] for row in B]) * self.inputs(k)
-            rows = by_control[number, k].tolist()
-            onto = (E * pushed).entries() if self.blocks else [arb(0)] * len(rows)
-            for i, (row, more) in enumerate(
-                zip(B, onto, strict=True)
-            ):  # the columns beyond the control's are the drift
-                rows[i][0] = sum(row[m:], rows[i][0]) + more
+            k, block = self._places(piece)
+            given = [balls([1.0, *none])] if self.flow.driven > self.system.controls else []
+            entering = [balls([middle, *none]) for middle in self.middle.tolist()]
             if self.blocks:
-                self._entered(rows, block, E)
-            found.append(stacked(rows))
+                self._entered(entering, block)
+            found.append(stacked([*self.inputs(k).tolist(), *given, *entering]))
         return found
 
-    def _entered(self, rows: list[list[arb]], block: int, E: arb_mat) -> None:
-        """Add what a block of the disturbance drives through ``E`` to what drives the state, row by row."""
+    def _entered(self, rows: list[list[arb]], block: int) -> None:
+        """Add a block of the disturbance to what acts, row by row."""
         for i, row in enumerate(rows):
-            for b in range(self.width):
-                row[1 + block * self.width + b] = row[1 + block * self.width + b] + E[i, b]
+            place = 1 + block * self.width + i
+            row[place] = row[place] + 1
 
     def _ended(self, piece: int, state: arb_mat) -> arb_mat:
         """The state and the responses when a piece of the grid is over, from what they are by then."""
@@ -384,44 +348,21 @@ class ClosedLoop:
         """`heights` at a time in a piece of the grid."""
         return self.heights(self.state(piece, time), rows, beside)
 
-    @cached_property
-    def _speed(self) -> Array:
-        """How fast the sources change the states, about, ``(d,)``."""
-        sizes = np.concatenate([[1.0], self.radii])
-        return np.asarray(np.max([np.abs(middles(drive)) @ sizes for drive in self.drives], axis=0))
-
-    @cached_property
-    def owns(self) -> list[OwnUnits]:
-        """The units in which rests are bounded, of every system."""
-        return [OwnUnits.of(parts["A"], self.grid[-1], self._speed) for parts in self.modes]
-
-    @property
-    def own(self) -> OwnUnits:
-        """Those of the first one."""
-        return self.owns[0]
-
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
-        """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid, at
-        most, ``(r,)``: ``(stop - start)^2 / 8`` times the largest second derivatives of the nominal state and of every
-        response, each times how far its deviation goes. The rest of the expansion is taken in `own` units."""
-        from flint import arb
-
-        number = self.mode(self.grid[piece])
-        A, own, h = self.modes[number]["A"], self.owns[number], arb(stop) - arb(start)
-        rate = A * self.state(piece, start) + self.drives[piece]
-        row, factor = exactly(rows) * A, arb(1)
-        total = np.zeros((row.nrows(), 1 + self.starts[-1]))
-        for order in range(TERMS):
-            found = Enclosed.of(row * rate)
-            total = total + (np.abs(found.mid) + found.rad) * float((factor * OUTWARD).upper())
-            row, factor = row * A, factor * h / (order + 1)
-        sizes = np.concatenate([[1.0], self.radii])
-        far = Enclosed.of(own.states(rate))
-        speed = float((np.sqrt(((np.abs(far.mid) + far.rad) ** 2).sum(axis=0)) @ sizes) * OUTWARD)
-        tail = float((factor * (own.growth * h).exp()).upper()) * speed
-        lengths = np.array([float(norm(stacked([line])).upper()) for line in own.rows(row).tolist()])
-        summed = total @ sizes * (1.0 + rounding(sizes.size)) + tail * lengths
-        return np.asarray(float((h * h / 8).upper()) * summed * OUTWARD)
+        """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid
+        without marks, at most, ``(r,)``: the states are a polynomial of the share ``s`` of the cell, whose term ``a
+        s^n`` is at most ``(n - 1) n^(-n / (n - 1)) |a|`` from its chord."""
+        terms, off = self.flow.within(start, stop, start, stop, ORDER + 1)
+        both = stacked([*self.state(piece, start).tolist(), *self.drives[piece].tolist()])
+        line, sizes = exactly(rows), np.concatenate([[1.0], self.radii])
+        total = np.zeros((line.nrows(), sizes.size))
+        for n, term in enumerate(terms[2:], 2):
+            found = Enclosed.of(line * (term.matrix * both))
+            total += (np.abs(found.mid) + found.rad) * ((n - 1) * n ** (-n / (n - 1)) * OUTWARD)
+        # at both ends too, of which the chord takes the larger share
+        found = Enclosed.of(line * (around(off) * both))
+        total += 2.0 * (np.abs(found.mid) + found.rad)
+        return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)
 
 
 def exactly(rows: Array | arb_mat) -> arb_mat:

@@ -11,21 +11,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import middles, norm, stacked
-from sparserob_core.checker.flow.still import column, held
-from sparserob_core.checker.flow.units import OwnUnits
-from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
+from sparserob_core.checker.reach.kernels import above_chord, pushes
 from sparserob_core.checker.sets.along import Curve
 from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -33,13 +31,11 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-ORDER = 13  # of the polynomials
-PARTS, MOST_PARTS = 4, 2048  # of a piece, at least and at most
 SETTLED = 2.0**-49  # of the heights: what another corner may add on a cell
 ROUNDS = 60  # in which cells are cut
 CROSSING = 8  # of them always where two corners are equally good, which is beside an end where they touch there
 SECANTS = 12  # steps to where two corners are equally good
-APART = 2.0**-45  # how far the place of a time among the parts may be off
+KEPT = 4096  # ways from the beginning of a piece to a time in it, of which kernels are remembered
 
 
 @final
@@ -124,41 +120,12 @@ class Together:
 @final
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """``e^{A r} E`` for ``r`` from 0 to a length, on equal parts, as polynomials of ``u`` from -1 to 1 across each:
-    coefficients ``(S, p + 1, d, mw)``, all together off by at most ``off (S, d, mw)``; ``half`` of a part's length."""
+    """``Phi(end, s) E(s)`` for the time ``r`` that is left of an interval at ``s``, on parts one after another, as
+    polynomials of ``u`` from -1 to 1 across each, times its length: coefficients ``(S, p + 1, d, mw)``, all together
+    off by at most ``off (S, d, mw)``."""
 
     coefficients: Array
     off: Array
-    half: float
-
-    @staticmethod
-    def of(A: arb_mat, E: arb_mat, length: arb, own: OwnUnits) -> Kernel:
-        """The kernel of a piece; what is left of the expansion is bounded in the states' ``own`` units."""
-        from flint import arb, arb_mat
-
-        d, mw = A.nrows(), E.ncols()
-        speed = float((own.growth * length).upper())
-        if not speed < MOST_PARTS:
-            raise Unchecked("the system is too fast for its pieces to be integrated")
-        count = max(PARTS, int(np.ceil(speed)))
-        half = length / (2 * count)
-        unit = arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
-        step, term = held(A, unit, 2 * half)[0], held(A, unit, half)[0]
-        terms, factor = [E], arb(1)
-        for order in range(ORDER):
-            terms.append(A * terms[-1] * (half / (order + 1)))
-            factor = factor * own.growth * half / (order + 1)
-        rest = factor * own.growth * half / (ORDER + 1) * (own.growth * half).exp()
-        pushed = [norm(column(own.states(E), w)) for w in range(mw)]
-        matrices, lost = [], []
-        for _ in range(count):
-            matrices += [term * one for one in terms]
-            left = rest * norm(own.rows(own.states(term)))
-            lost.append([float((left * size).upper()) for size in pushed])
-            term = step * term
-        found = Enclosed.all(matrices, (count, ORDER + 1, d, mw))
-        off = (found.rad.sum(axis=1) + own.units[:, None] * np.array(lost)[:, None, :]) * OUTWARD
-        return Kernel(found.mid, off, float(half.mid()))
 
     @property
     def count(self) -> int:
@@ -174,38 +141,24 @@ class Kernel:
         off = (off + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
         return plain, off
 
-    def most(self, a: Enclosed, sides: Sequence[Side | Curve], share: float = 1.0) -> Enclosed:
-        """The integral of the support function of ``K(r)'a`` for ``a (N, d)``, over the first ``share`` of the length:
-        between bounds, as a middle and a radius ``(N,)``."""
+    def most(self, a: Enclosed, sides: Sequence[Side | Curve]) -> Enclosed:
+        """The integral of the support function of ``K(r)'a`` for ``a (N, d)``: between bounds, as a middle and a radius
+        ``(N,)``."""
         size, count = np.abs(a.mid), self.count
         large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
         plain, off = self.along(a)
-        place = share * count
-        last = min(int(place), count - 1)
-        ends = np.where(np.arange(count) < last, 1.0, 2.0 * min(place - last, 1.0) - 1.0)[: last + 1]
         low, high, lost = np.zeros(len(size)), np.zeros(len(size)), np.zeros(len(size))
-        begun = [part[:, : last + 1].reshape(-1, *part.shape[2:]) for part in (plain, off, large)]
+        begun = [part.reshape(-1, *part.shape[2:]) for part in (plain, off, large)]
         off = begun[1] + rounding(off.shape[2] + 2 * self.coefficients.shape[1] + 6) * begun[2]
         for side in sides:
-            every = side.swept(begun[0], off, begun[2], np.tile(ends, len(size)))
+            every = side.swept(begun[0], off, begun[2], np.ones(len(off)))
             *bounds, tops = (one.reshape(len(size), -1) for one in every)
             value, more, less = (one.sum(axis=1) for one in bounds)
             low, high = low + value - less, high + value + more
             lost += rounding(4 * count + 8) * 2.0 * tops.sum(axis=1)
-            if share < 1.0:
-                lost += APART * count * tops.max(axis=1)
-        low, high = low * self.half, high * self.half
-        rad = (high - low) / 2.0 + (lost * self.half + rounding(4) * (np.abs(low) + np.abs(high)))
+        low, high = low / 2.0, high / 2.0  # of u from -1 to 1
+        rad = (high - low) / 2.0 + (lost / 2.0 + rounding(4) * (np.abs(low) + np.abs(high)))
         return Enclosed((low + high) / 2.0, rad * OUTWARD)
-
-    def steepest(self, a: Enclosed, sides: Sequence[Side | Curve]) -> Array:
-        """How fast the support function of ``K(r)'a`` changes with ``r`` at most, for ``a (N, d)``: ``(N,)``."""
-        radii = sum((side.far for side in sides), np.zeros(self.off.shape[2]))
-        unsure = rounding(a.mid.shape[1]) * np.abs(a.mid) + a.rad * OUTWARD
-        plain = np.abs(np.einsum("nd,spdw->npsw", a.mid, self.coefficients))
-        plain = plain + np.einsum("nd,spdw->npsw", unsure, np.abs(self.coefficients))
-        slopes = (np.arange(ORDER + 1)[:, None, None] * plain).sum(axis=1) / self.half
-        return np.asarray((slopes @ radii).max(axis=1) * OUTWARD)
 
 
 def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
@@ -282,7 +235,7 @@ class MeasurableLoop(ClosedLoop):
     """`ClosedLoop` under measurable disturbances. Its deviations are what they make of the state by the end of every
     piece of the grid, ``(d,)`` each, and that of the initial state."""
 
-    _kernels: dict[tuple[int, float, bool], Kernel] = field(default_factory=dict, repr=False)
+    _ways: dict[tuple[object, ...], Kernel] = field(default_factory=dict, repr=False)
 
     @staticmethod
     def alone(
@@ -315,26 +268,29 @@ class MeasurableLoop(ClosedLoop):
         assert self.shape is not None
         return Side.of(self.shape)
 
-    @cached_property
-    def _speed(self) -> Array:
-        """That of the nominal state and of the disturbance: what this makes of a state is known from the kernels only,
-        whose rests are bounded in these units."""
-        assert self.shape is not None
-        nominal = np.max([np.abs(middles(drive)[:, 0]) for drive in self.drives], axis=0)
-        far = np.array(known(self.shape).radius) + np.abs(self.middle)
-        return np.asarray(nominal + np.max([np.abs(middles(mode["E"])) @ far for mode in self.modes], axis=0))
-
     def kernel(self, piece: int) -> Kernel:
         """That of a piece."""
-        from flint import arb
+        return self._way(self.grid[piece], self.grid[piece + 1])
 
-        start, stop = self.grid[piece], self.grid[piece + 1]
-        exact, mode = self._exact(start, stop, stop - start), self.mode(start)
-        key = (mode, stop - start, True) if exact else (mode, float(piece), False)
-        if key not in self._kernels:
-            A, E = self.modes[mode]["A"], self.modes[mode]["E"]
-            self._kernels[key] = Kernel.of(A, E, arb(stop) - arb(start), self.owns[mode])
-        return self._kernels[key]
+    def _way(self, start: float, stop: float) -> Kernel:
+        """The kernel of an interval, whose parts are those between marks, in shares of each."""
+        key = self.flow.alike(start, stop)
+        if key not in self._ways:
+            if len(self._ways) >= KEPT:
+                self._ways.clear()
+            every, onward = list[Enclosed](), self._identity
+            columns = slice(self.flow.driven, self.flow.driven + self.width)
+            for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
+                terms = pushes(self.flow, first, last, columns)
+                every.append(product(Enclosed.of(onward), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
+                onward = onward * self.flow.over(first, last)[0].matrix
+            most = max(len(one.mid) for one in every)
+            mid, rad = (
+                np.array([np.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in parts])
+                for parts in zip(*((one.mid, one.rad) for one in every), strict=True)
+            )
+            self._ways[key] = Kernel(mid, rad.sum(axis=1) * OUTWARD)
+        return self._ways[key]
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
@@ -351,7 +307,7 @@ class MeasurableLoop(ClosedLoop):
             later = k, left * self._passed(piece)[0]
         return found
 
-    def _entered(self, rows: list[list[arb]], block: int, E: arb_mat) -> None:
+    def _entered(self, rows: list[list[arb]], block: int) -> None:
         """Nothing: what happens within a piece counts at its end."""
 
     def _ended(self, piece: int, state: arb_mat) -> arb_mat:
@@ -432,15 +388,19 @@ class MeasurableLoop(ClosedLoop):
 
     def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
         """What disturbances on a piece make of ``rows (r, d)`` at most until a time in it."""
-        from flint import arb
-
-        share = float(((arb(time) - arb(self.grid[piece])) / (arb(self.grid[piece + 1]) - arb(self.grid[piece]))).mid())
-        return self.kernel(piece).most(as_enclosed(rows), self.sides, min(share, 1.0))
+        return self._way(self.grid[piece], time).most(as_enclosed(rows), self.sides)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
-        """As of `ClosedLoop`; what the piece itself adds is the integral of a Lipschitz function."""
-        steep = self.kernel(piece).steepest(as_enclosed(rows), self.sides)
-        return np.asarray(super().bent(piece, start, stop, rows) + (stop - start) ** 2 / 8.0 * steep * OUTWARD)
+        """As of `ClosedLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
+        assert isinstance(rows, np.ndarray)
+        axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
+        begun, size = np.zeros(len(axes)), sum((side.far for side in self.sides), np.zeros(self.width))
+        if start > self.grid[piece]:
+            ends = self.under_way(piece, start, axes)
+            begun = np.maximum(ends.mid + ends.rad, 0.0) * OUTWARD
+        states = begun.reshape(2, -1).max(axis=0)
+        more = above_chord(self.flow, rows, start, stop, states, size * OUTWARD, self.flow.driven)
+        return np.asarray((super().bent(piece, start, stop, rows) + more) * OUTWARD)
 
 
 def as_enclosed(rows: Array | arb_mat) -> Enclosed:
@@ -468,11 +428,6 @@ class LoopBeside(ClosedLoop):
     def _other(self) -> MeasurableLoop:
         assert self.beside is not None
         return self.beside
-
-    @cached_property
-    def _speed(self) -> Array:
-        """That of all sources: without the others a state may have none but the rounding of a control."""
-        return np.asarray(super()._speed + self._other._speed)
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         both = super().highest(piece, time, rows, beside), self._other.highest(piece, time, rows)

@@ -70,6 +70,14 @@ class Pushed:
             pattern = pattern | (linked @ pattern.astype(int) > 0)
         return Pushed(pattern, len(spanned), fmpq_mat([row for one in entered for row in one.tolist()]).rank())
 
+    @staticmethod
+    def linked(A: Pattern, E: Pattern, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
+        """From which entries of the matrices are other than 0 alone."""
+        pattern: Pattern = E.astype(int) @ np.array([[bool(v) for v in vector] for vector in vectors]).T > 0
+        for _ in range(len(A) - 1):
+            pattern = pattern | (A.astype(int) @ pattern.astype(int) > 0)
+        return Pushed(pattern, int(pattern.any(axis=1).sum()), int(pattern.any(axis=0).sum()))
+
 
 def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
     from flint import fmpq, fmpq_mat

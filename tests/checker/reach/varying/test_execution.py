@@ -22,7 +22,7 @@ from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.measurable import Side
-from sparserob_core.checker.reach.varying.execution import VaryingExecution
+from sparserob_core.checker.reach.missed import VaryingExecution
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
 

@@ -1,0 +1,55 @@
+"""What inputs at any time of an interval make of the state at its end, and how far sums of their integrals bend."""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.series import Series
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.reach.closed_loop import ORDER, exactly
+from sparserob_core.checker.reach.states import enclosed
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.sip.convex_set import Array
+
+
+def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:
+    """What some ``columns`` of ``[B E]`` make, at any time of an interval without marks, of the state at its end, times
+    its length: coefficients ``(p + 1, M, d, m)`` of powers of ``u`` from -1 to 1 across what is left of it."""
+    from flint import arb, arb_mat
+
+    terms, off = law.kernel(start, stop)
+    d, (count, size) = law.states, (len(terms), terms[0].shape[1])
+    table = arb_mat([[x for part in term.parts for x in part.entries()] for term in terms])
+    weights = arb_mat([[arb(comb(n, j)) / 2**n for n in range(count)] for j in range(count)])
+    found = Enclosed.all([weights * table], (count, law.monomials.size, d, size))
+    found.rad[0, 0] += off
+    return Enclosed(found.mid[..., columns], found.rad[..., columns])
+
+
+def above_chord(law: Flow, rows: Array, start: float, stop: float, begun: Array, size: Array, first: int) -> Array:
+    """How far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to the time may be above their chords on ``[start,
+    stop]``, which lies between two marks, for ``rows (r, d)``: ``(r,)``, at every parameter. Of every state they are at
+    most ``begun (d,)`` at the start, and ``size (m,)`` is what drives them through the columns of ``[B E]`` from the
+    ``first`` one on.
+
+    An integrand that began before is ``|c'Phi(t, start) y|``, above its chord by no more than ``c'Phi(t, start) y``
+    is from its own: its terms ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What begins within the
+    cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
+    """
+    d, width = rows.shape[1], (stop - start) * (1.0 + rounding(2))
+    terms, off = law.within(start, stop, start, stop, ORDER + 1)
+    lines, total = exactly(rows), 2.0 * (np.abs(rows) @ off[:, :d]) @ begun
+    for n, term in enumerate(terms[2:], 2):
+        found = enclosed([Series(term.monomials, [lines * part for part in term.columns(0, d).parts])])
+        total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(found.mid) + found.rad).sum(axis=(0, 1)) @ begun)
+    if size.any():
+        most, slope, units = law.sizes(start, stop)
+        entering = slice(d + first, d + first + size.size)
+        A, B = most[:, :d], most[:, entering]
+        pace = float((A * units / units[:, None]).sum(axis=1).max())
+        grown = np.exp(pace * width) * units * ((B @ size) / units).max()
+        second = (slope[:, entering] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ grown
+        total += width**2 / 8.0 * (np.abs(rows) @ second)
+    return np.asarray(total * OUTWARD * (1.0 + rounding(8 * d * d)))

@@ -1,1 +1,0 @@
-"""Systems that change with time: their loops, and what is missed in them."""
