@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import comb
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from sparserob_core.checker.reach.closed_loop import ORDER, exactly
 from sparserob_core.checker.reach.states import enclosed
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb_mat
 
 
 def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:
@@ -28,7 +32,9 @@ def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:
     return Enclosed(found.mid[..., columns], found.rad[..., columns])
 
 
-def above_chord(law: Flow, rows: Array, start: float, stop: float, begun: Array, size: Array, first: int) -> Array:
+def above_chord(
+    law: Flow, rows: Array | arb_mat, start: float, stop: float, begun: Array, size: Array, first: int
+) -> Array:
     """How far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to the time may be above their chords on ``[start,
     stop]``, which lies between two marks, for ``rows (r, d)``: ``(r,)``, at every parameter. Of every state they are at
     most ``begun (d,)`` at the start, and ``size (m,)`` is what drives them through the columns of ``[B E]`` from the
@@ -38,9 +44,11 @@ def above_chord(law: Flow, rows: Array, start: float, stop: float, begun: Array,
     is from its own: its terms ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What begins within the
     cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
     """
-    d, width = rows.shape[1], (stop - start) * (1.0 + rounding(2))
+    lines, width = exactly(rows), (stop - start) * (1.0 + rounding(2))
+    large, d = Enclosed.of(lines), lines.ncols()
+    far = np.abs(large.mid) + large.rad
     terms, off = law.within(start, stop, start, stop, ORDER + 1)
-    lines, total = exactly(rows), 2.0 * (np.abs(rows) @ off[:, :d]) @ begun
+    total = 2.0 * (far @ off[:, :d]) @ begun
     for n, term in enumerate(terms[2:], 2):
         found = enclosed([Series(term.monomials, [lines * part for part in term.columns(0, d).parts])])
         total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(found.mid) + found.rad).sum(axis=(0, 1)) @ begun)
@@ -51,5 +59,5 @@ def above_chord(law: Flow, rows: Array, start: float, stop: float, begun: Array,
         pace = float((A * units / units[:, None]).sum(axis=1).max())
         grown = np.exp(pace * width) * units * ((B @ size) / units).max()
         second = (slope[:, entering] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ grown
-        total += width**2 / 8.0 * (np.abs(rows) @ second)
+        total += width**2 / 8.0 * (far @ second)
     return np.asarray(total * OUTWARD * (1.0 + rounding(8 * d * d)))

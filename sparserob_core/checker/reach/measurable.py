@@ -392,7 +392,6 @@ class MeasurableLoop(ClosedLoop):
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """As of `ClosedLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
-        assert isinstance(rows, np.ndarray)
         axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
         begun, size = np.zeros(len(axes)), sum((side.far for side in self.sides), np.zeros(self.width))
         if start > self.grid[piece]:

@@ -23,7 +23,7 @@ from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.law import Box
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.varying.loop import VaryingLoop
+from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from tests.support.integration import mathieu
@@ -93,7 +93,7 @@ def test_a_chord_of_a_loop_is_missed_by_its_powers_and_twice_what_is_left_of_the
     """``2 s^2`` and ``-3 s^3`` of a nominal state of 1, off by up to 0.5, and half of all of it for a deviation of
     4."""
     told = SimpleNamespace(
-        _flow=SimpleNamespace(
+        flow=SimpleNamespace(
             within=lambda *_: (
                 [Series.known(stacked([[arb(x), arb(0)]])) for x in (1, 5, 2, -3)],
                 np.array([[0.5, 0.0]]),
@@ -104,7 +104,7 @@ def test_a_chord_of_a_loop_is_missed_by_its_powers_and_twice_what_is_left_of_the
         radii=np.array([4.0]),
     )
     with ctx.workprec(BITS):
-        bound = VaryingLoop.bent(told, 0, 0.0, 1.0, np.array([[1.0]]))
+        bound = ClosedLoop.bent(told, 0, 0.0, 1.0, np.array([[1.0]]))
     share = np.linspace(0.0, 1.0, 10001)
     chords = [float((share - share**n).max()) for n in (2, 3)]
     expected = (2 * chords[0] + 3 * chords[1] + 2 * 0.5) * (1.0 + 0.5 * 4.0)

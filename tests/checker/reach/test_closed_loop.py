@@ -5,30 +5,27 @@ from __future__ import annotations
 
 import itertools
 from fractions import Fraction
-from functools import cache, partial
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from flint import arb_mat, ctx
 
-import sparserob_core.checker.reach.varying.loop as varying_loop
+import sparserob_core.checker.reach.closed_loop as loops
 from sparserob_core.checker.claims.cells import prove
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
 from sparserob_core.checker.reach.loop_tube import LoopTube, Still
 from sparserob_core.checker.reach.measurable import MeasurableLoop
-from sparserob_core.checker.reach.varying.loop import VaryingLoop
-from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
+from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.polynomials import Enclosed, rounding
 from sparserob_core.checker.sets.sides import Curved, Sides
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid
-from tests.support.closed_loops import CHANGING, EXACT, LOOPS, MEASURABLE, STEADY, STILL, exponentials, gains
+from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, STEADY, STILL, exponentials, gains
 
 H = np.array([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8], [-1.0, 0.3]])
 
@@ -39,10 +36,6 @@ def made(name):
     case = LOOPS[name]
     v, M = gains(np.random.default_rng(3), case)
     kind = MeasurableLoop if case.measurable else ClosedLoop
-    if name in CHANGING:
-        kind = VaryingMeasurableLoop if case.measurable else VaryingLoop
-        until = float(case.grid[-1])
-        kind = partial(kind, law=Flow(Plant.of(case.system, until), until))
     loop = kind(
         case.system,
         case.start.tolist(),
@@ -72,7 +65,7 @@ def places(case):
 
 def parts(loop):
     """The pieces of the grid, cut where a system in t becomes another power series of it."""
-    cuts = loop.law.marks(loop.grid) if isinstance(loop, VaryingLoop) else loop.grid
+    cuts = loop.flow.marks(loop.grid)
     for a, b in itertools.pairwise(cuts):
         yield int(np.searchsorted(loop.grid, a, side="right")) - 1, a, b
 
@@ -101,23 +94,20 @@ def test_the_state_in_balls_is_that_of_a_loop_that_measures(name):
 
 
 @pytest.mark.parametrize("name", STILL)
-def test_what_a_cell_adds_is_an_eighth_of_its_square_times_the_curvature_of_all_that_deviates(name):
-    """No less than sampled second derivatives say, on long cells too; hardly more on short ones."""
+def test_what_a_short_cell_adds_is_an_eighth_of_its_square_times_the_curvature_of_all_that_deviates(name):
+    """Hardly more than sampled second derivatives say; that it is enough is held beside."""
     case, loop, v, M = made(name)
     rng = np.random.default_rng(2)
     sizes = np.concatenate([[1.0], loop.radii])
     with ctx.workprec(192):
-        for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
-            for share in (1.0, 0.6, 0.1, 0.004):
-                low = float(a + rng.uniform(0.0, 1.0 - share) * (b - a))
-                high = float(b if share == 1.0 else low + share * (b - a))
-                bent = loop.bent(piece, low, high, H)
-                times = low + np.linspace(0.0, 1.0 - 1e-12, 31) * (high - low)
-                _, rates, _ = case.states(v, M, times)
-                owed = (high - low) ** 2 / 8.0 * (np.abs(H @ case.A @ rates).max(axis=0) @ sizes)
-                assert (bent >= owed * (1.0 - 1e-9)).all()
-                if np.linalg.norm(case.A, 2) * (high - low) < 0.05:
-                    assert (bent <= 1.1 * owed + 1e-12).all()
+        for piece, a, b in parts(loop):
+            length = min(b - a, 0.05 / np.linalg.norm(case.A, 2))
+            low = float(a + rng.uniform(0.0, b - a - length))
+            bent = loop.bent(piece, low, low + length, H)
+            _, rates, _ = case.states(v, M, low + np.linspace(0.0, 1.0 - 1e-12, 31) * length)
+            owed = length**2 / 8.0 * (np.abs(H @ case.A @ rates).max(axis=0) @ sizes)
+            assert (bent <= 1.1 * owed + 1e-12).all()
+            assert (bent >= 0.9 * owed).all()
 
 
 @pytest.mark.parametrize("name", EXACT)
@@ -147,7 +137,7 @@ def test_a_parabola_is_an_eighth_of_its_acceleration_above_its_chord_and_no_more
 
 
 def test_what_a_power_series_on_a_cell_leaves_out_is_added(monkeypatch):
-    monkeypatch.setattr(varying_loop, "ORDER", 2)
+    monkeypatch.setattr(loops, "ORDER", 2)
     case, loop, v, M = made("turning")
     share, most = np.linspace(0.0, 1.0 - 1e-12, 31), 0.0
     with ctx.workprec(192):
@@ -157,7 +147,7 @@ def test_what_a_power_series_on_a_cell_leaves_out_is_added(monkeypatch):
             over = case.height(H @ states) - ((1.0 - share)[:, None] * ends[0] + share[:, None] * ends[1])
             assert (over.max(axis=0) <= loop.bent(piece, low, high, H) + 1e-12).all()
             # of a term of the third power, which is left out, a chord leaves this much at most
-            terms, _ = loop.law.within(low, high, low, high, 4)
+            terms, _ = loop.flow.within(low, high, low, high, 4)
             both = arb_mat([*loop.state(piece, low).tolist(), *loop.drives[piece].tolist()])
             third = np.abs(H @ table(terms[3].matrix * both)) @ np.concatenate([[1.0], loop.radii])
             second = np.abs(H @ table(terms[2].matrix * both)) @ np.concatenate([[1.0], loop.radii])
@@ -203,10 +193,11 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
     middle = case.bound.middle()
     with ctx.workprec(192):
         for piece in (0, len(case.grid) - 2):
-            length, kernel = float(case.grid[piece + 1] - case.grid[piece]), loop.kernel(piece)
+            begin, length = float(case.grid[piece]), float(case.grid[piece + 1] - case.grid[piece])
             for share in (1.0, 0.37):
-                found = kernel.most(Enclosed(a, np.zeros_like(a)), loop.sides, share)
-                wide = kernel.most(Enclosed(a, np.full_like(a, 1e-3)), loop.sides, share)
+                kernel = loop.kernel(piece) if share == 1.0 else loop._way(begin, begin + share * length)
+                found = kernel.most(Enclosed(a, np.zeros_like(a)), loop.sides)
+                wide = kernel.most(Enclosed(a, np.full_like(a, 1e-3)), loop.sides)
                 parts = 120
                 ends = np.linspace(0.0, share * length, parts + 1)
                 r = ((ends[:-1] + ends[1:])[:, None] / 2 + np.diff(ends)[:, None] / 2 * nodes).ravel()
@@ -224,21 +215,10 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
                 assert (np.abs(found.mid - truth) <= found.rad + 2e-5).all()
                 assert (found.rad < 1e-11).all()
                 for offset in 1e-3 * rng.uniform(-1, 1, size=(3, *a.shape)):
-                    moved = kernel.most(Enclosed(a + offset, np.zeros_like(a)), loop.sides, share)
+                    moved = kernel.most(Enclosed(a + offset, np.zeros_like(a)), loop.sides)
                     assert (moved.mid + moved.rad <= wide.mid + wide.rad + 1e-12).all()
                     assert (moved.mid - moved.rad >= wide.mid - wide.rad - 1e-12).all()
                 assert (wide.rad < 0.1).all()
-            steep = kernel.steepest(Enclosed(a, np.zeros_like(a)), loop.sides)
-            wide = kernel.steepest(Enclosed(a, np.full_like(a, 1e-3)), loop.sides)
-            for offset in 1e-3 * rng.choice([-1.0, 1.0], size=(3, *a.shape)):
-                moved = kernel.steepest(Enclosed(a + offset, np.zeros_like(a)), loop.sides)
-                assert (moved <= wide).all() and (wide <= steep * (1 + 1e-2) + 1e-2).all()
-            times = np.linspace(0.0, length, 60)
-            f = np.einsum("rdw,nd->nrw", exponentials(case.A * times[:, None, None]) @ case.E, a)
-            h = case.bound.support(f.reshape(-1, f.shape[2])).reshape(f.shape[:2]) - f @ middle
-            slopes = np.abs(np.diff(h, axis=1)).max(axis=1) / np.diff(times).min()
-            assert (slopes <= steep * (1 + 1e-9)).all()
-            assert (steep <= 40.0).all()
 
 
 @pytest.mark.parametrize("name", ["box", "ball and begun"])
@@ -333,8 +313,6 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
             )
             found = [{b: float(push[0, 0].mid()) for b, push in one.items()} for one in loop.seen]
             assert found == seen
-    for start, stop, key, exact in ((0.0, 1.0, 1.0, True), (0.25, 1.0, 0.75, True), (1e-20, 1.0, 1.0, False)):
-        assert ClosedLoop._exact(start, stop, key) is exact
 
 
 def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_zero():
@@ -350,9 +328,7 @@ def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_z
             while more := {i for j in reached for i in np.flatnonzero(A[:, j]).tolist()} - reached:
                 reached |= more
             seen[list(reached), place] = True
-        stretch = SimpleNamespace(sizes=(np.hstack([A, E]),))
-        flow = SimpleNamespace(states=d, driven=0, law=SimpleNamespace(stretches=[stretch]))
-        found = VaryingLoop.pushed(SimpleNamespace(_flow=flow), np.eye(mw, dtype=int)[entries].tolist())
+        found = Pushed.linked(A != 0.0, E != 0.0, np.eye(mw, dtype=int)[entries].tolist())
         assert found.pattern.tolist() == seen.tolist()
         assert (found.states, found.entries) == (seen.any(axis=1).sum(), seen.any(axis=0).sum())
 

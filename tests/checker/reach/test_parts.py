@@ -20,9 +20,8 @@ from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.law import Box as ParameterBox
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.units import OwnUnits
 from sparserob_core.checker.outcome import LOOKED, Broken, Clock, Unchecked
-from sparserob_core.checker.reach.measurable import Kernel
+from sparserob_core.checker.reach.kernels import pushes
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube
@@ -305,17 +304,15 @@ def test_a_row_that_is_certainly_exceeded_is_looked_for_where_it_changes():
 def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor):
     turn = np.diag([1.0, factor])
     A, E = turn @ [[0.0, 1.0], [-2.0, -0.5]] @ np.linalg.inv(turn), turn @ [[0.3], [1.0]]
-    length, size = 0.7, np.array([1.0, factor])
+    size, plant = np.array([1.0, factor]), LinearSystem(A, np.zeros((2, 1)), E=E)
     with ctx.workprec(160):
-        balls = [stacked([exact(row) for row in matrix]) for matrix in (A, E)]
-        own = OwnUnits.of(balls[0], 5.0, np.abs(E)[:, 0])
-        kernel = Kernel.of(*balls, arb(length), own)
-    assert kernel.count == 4
-    assert (kernel.off <= 1e-14 * size[:, None]).all()
-    for part, at in itertools.product(range(kernel.count), (-1.0, -0.3, 0.5, 1.0)):
-        truth = scipy.linalg.expm(A * kernel.half * (2 * part + 1 + at)) @ E
-        value = np.einsum("p,pdw->dw", at ** np.arange(kernel.coefficients.shape[1]), kernel.coefficients[part])
-        assert (np.abs(value - truth) <= kernel.off[part] + 1e-13 * size[:, None]).all()
+        found = pushes(Flow(Plant.of(plant, 5.0), 5.0), 1.0, 1.25, slice(1, 2))
+    value, off = found.mid[:, 0], found.rad[:, 0].sum(axis=0)
+    assert (off <= 1e-14 * size[:, None]).all()
+    for at in (-1.0, -0.3, 0.5, 1.0):
+        truth = 0.25 * scipy.linalg.expm(A * 0.125 * (1.0 + at)) @ E
+        got = np.einsum("p,pdw->dw", at ** np.arange(len(value)), value)
+        assert (np.abs(got - truth) <= off + 1e-13 * size[:, None]).all()
 
 
 def test_a_lag_is_the_exponential_of_the_whole_way_whatever_it_was_carried_on_from():

@@ -7,6 +7,7 @@ import pytest
 from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
+from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
@@ -43,7 +44,7 @@ def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> Seen:
         changes[:-1],
         Box(-np.ones(mw), np.ones(mw)),
     )
-    pushed = Pushed.of([(loop.parts["A"], loop.parts["E"])], np.eye(mw, dtype=int).tolist())
+    pushed = Pushed.of([(mode["A"], mode["E"]) for mode in modes_at(system, ())], np.eye(mw, dtype=int).tolist())
     blocks = sorted({block for seen in loop.seen for block in seen})
     table = np.empty((3 * d, len(blocks) * mw), dtype=object)
     table[:] = arb(0)

@@ -1,4 +1,4 @@
-"""Guards checker/reach/varying/measurable: how far what the piece under way has done may be above its chord."""
+"""Guards checker/reach/measurable: how far what the piece under way has done may be above its chord."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flint import arb_mat, ctx
 
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
+from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Box
 from tests.support.closed_loops import FAST, FORCE, GUST, Changing
@@ -27,7 +27,7 @@ def test_what_began_before_a_cell_bends_within_it() -> None:
     law, most = Flow(Plant.of(case.system, 2.0), 2.0), 0.0
     with ctx.workprec(192):
         still, none, ends = [arb_mat(1, 1)], np.zeros((1, 1, 1, 2)), [0.0, 2.0]
-        loop = VaryingMeasurableLoop(case.system, [0.0, 0.0], still, none, ends, ends, [], case.bound, law=law)
+        loop = MeasurableLoop(case.system, [0.0, 0.0], still, none, ends, ends, [], case.bound, law=law)
         for low, high in pairwise(law.marks([0.5, 1.25])):
             share = np.linspace(0.0, 1.0, 4)
             times = (low + share * (high - low)).tolist()
@@ -46,7 +46,7 @@ def test_what_enters_less_and_less_is_above_its_chord_by_how_fast_that_falls() -
     with ctx.workprec(192):
         still, none, ends = [arb_mat(1, 1)], np.zeros((1, 1, 1, 1)), [0.0, 1.0]
         law = Flow(Plant.of(system, 1.0), 1.0)
-        loop = VaryingMeasurableLoop(system, [0.0], still, none, ends, ends, [], Box([-0.1], [0.1]), law=law)
+        loop = MeasurableLoop(system, [0.0], still, none, ends, ends, [], Box([-0.1], [0.1]), law=law)
         (bent,) = loop.bent(0, 0.25, 0.375, np.array([[1.0]]))
         heights = [float(loop.highest(0, t, np.array([[1.0]]))[0].mid()) for t in (0.25, 0.3125, 0.375)]
     owed = 0.125**2 / 8.0 * 0.1
