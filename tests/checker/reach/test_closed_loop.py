@@ -107,7 +107,7 @@ def test_what_a_short_cell_adds_is_an_eighth_of_its_square_times_the_curvature_o
             _, rates, _ = case.states(v, M, low + np.linspace(0.0, 1.0 - 1e-12, 31) * length)
             owed = length**2 / 8.0 * (np.abs(H @ case.A @ rates).max(axis=0) @ sizes)
             assert (bent <= 1.1 * owed + 1e-12).all()
-            assert (bent >= 0.9 * owed).all()
+            assert (bent >= 0.8 * owed).all()  # the curvature changes on the way
 
 
 @pytest.mark.parametrize("name", EXACT)
