@@ -25,6 +25,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
+MOST_MARKS = 2**17  # of the horizon
 KEPT = 4096  # parts of the horizon whose flows are remembered
 POINTS_KEPT = 256  # flows at single parameters
 LONGER = 1.0 + 2.0**-30  # than the parts of time, whose ends are rounded, is the time of which the flow is verified
@@ -112,8 +113,10 @@ class Flow:
             ends = [one for one in self._begins if start < one < stop]
             for a, b in pairwise([start, *ends, stop]):
                 stretch = self.law.stretches[self._place(a, b)]
-                count = ceil((b - a) / stretch.stride * (1.0 - 1e-14)) if stretch.is_still else 1
-                found += [float(t) for t in np.linspace(a, b, max(1, count) + 1)[1:-1]] + [b]
+                count = (b - a) / stretch.stride * (1.0 - 1e-14) if stretch.is_still else 1.0
+                if not len(found) + count <= MOST_MARKS:
+                    raise Unchecked("the system is too fast for its horizon to be followed")
+                found += [float(t) for t in np.linspace(a, b, max(1, ceil(count)) + 1)[1:-1]] + [b]
         return found
 
     def segment(self, start: float, stop: float) -> tuple[Segment, arb]:

@@ -225,6 +225,8 @@ class Law:
             return None
         d, u, longest = len(self.units), self.units, _power(until - begin)
         pace = float((found.sizes[0][:, :d] * u / u[:, None]).sum(axis=1).max(initial=0.0))
+        if not pace < 2.0**1000:
+            raise Unchecked("the system is too fast for its horizon to be followed")
         return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / pace))) if pace > 0.0 else longest)
 
     def _hides(self, found: Stretch, phase: Phase) -> bool:

@@ -888,7 +888,7 @@ def test_a_box_of_parameters_is_looked_at_once_for_all_directions(monkeypatch):
                 a[axis] = b[axis] = sign
                 cells.append(([2.0, -0.1, -1.0, *a], [2.0, 0.1, 1.0, *b]))
     known_tube = constraints.Tube
-    monkeypatch.setattr(constraints, "Tube", lambda *given: made.append(given[0][0].centre) or known_tube(*given))
+    monkeypatch.setattr(constraints, "Tube", lambda *given: made.append(given[1].middle) or known_tube(*given))
 
     def shown(radius):
         made.clear()

@@ -372,3 +372,9 @@ def test_a_slow_part_has_units_of_its_own_and_balls_hold_what_shorter_parts_make
         for mine, other in zip(whole, (two[0] * one[0], *(two[0] * one[k] + two[k] for k in (1, 2))), strict=True):
             for a, b in zip(mine.matrix.entries(), other.matrix.entries(), strict=True):
                 assert a.overlaps(b) and a.rad() < 1e-18 * (1 + abs(b))
+
+
+@pytest.mark.parametrize("rate", [1e9, 1e200, 1e305, 1.7e308])
+def test_what_is_too_fast_for_its_horizon_is_refused_at_once(rate: float) -> None:
+    with ctx.workprec(BITS), pytest.raises(Unchecked, match="too fast"):
+        of(LinearSystem(np.array([[0.0, rate], [-rate, 0.0]]), np.ones((2, 1))), 1.0).marks([0.0, 1.0])
