@@ -351,7 +351,7 @@ def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_z
                 reached |= more
             seen[list(reached), place] = True
         stretch = SimpleNamespace(sizes=(np.hstack([A, E]),))
-        flow = SimpleNamespace(states=d, driven=0, law=SimpleNamespace(stretches=[stretch]))
+        flow = SimpleNamespace(states=d, driven=0, law=SimpleNamespace(there=stretch.sizes[0] > 0.0))
         found = VaryingLoop.pushed(SimpleNamespace(_flow=flow), np.eye(mw, dtype=int)[entries].tolist())
         assert found.pattern.tolist() == seen.tolist()
         assert (found.states, found.entries) == (seen.any(axis=1).sum(), seen.any(axis=0).sum())

@@ -61,7 +61,7 @@ class VaryingLoop(ClosedLoop):
     def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
         """As that of `ClosedLoop`, from which numbers are other than 0 at any time alone."""
         d, m = self._flow.states, self._flow.driven
-        there = np.any([one.sizes[0] > 0.0 for one in self._flow.law.stretches], axis=0)
+        there = self._flow.law.there
         A, E = there[:, :d], there[:, d + m :]
         pattern = E.astype(int) @ np.array([[bool(v) for v in vector] for vector in vectors]).T > 0
         for _ in range(len(A) - 1):
