@@ -291,9 +291,9 @@ class Case:
     @property
     def varying(self) -> Flows:
         """`flows` of a system that changes with time; raises `Unchecked` for another one."""
-        if not isinstance(self.problem.system, VaryingSystem):
+        if self.changing is None:
             raise Unchecked("the system does not change with time")
-        return self.flows
+        return self.changing
 
     @property
     def changing(self) -> Flows | None:

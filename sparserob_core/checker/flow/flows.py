@@ -10,8 +10,9 @@ from typing import final
 import numpy as np
 
 from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.law import Box, Law
+from sparserob_core.checker.flow.law import Box, Law, most
 from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
 
 DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of expansions in so many parameters; 2 beyond
@@ -74,12 +75,12 @@ class Flows:
         """A flow over a box, or over a larger one where the expansion is close over all of that."""
         if self._is_still:
             return self.over(box, self.degree)
-        part, most = self.box, WIDE.get(len(box.middle), 2)
+        part, degree = self.box, WIDE.get(len(box.middle), 2)
         for _ in range(HALVINGS):
-            if not part.holds(box) or part == box or self._is_close(part, most):
+            if not part.holds(box) or part == box or self._is_close(part, degree):
                 break
             part = next((half for half in part.halved(self._axis(part)) if half.holds(box)), box)
-        return self.over(part if part.holds(box) else box, most)
+        return self.over(part if part.holds(box) else box, degree)
 
     @cached_property
     def _is_still(self) -> bool:
@@ -107,9 +108,8 @@ class Flows:
             for one in law.stretches:
                 u = law.units
                 for j in range(sizes.size):
-                    table = one.table[law.monomials.linear(j)]
-                    size = np.array([[sum(float(c.abs_upper()) for c in e.coeffs()) for e in row] for row in table])
-                    sizes[j] += (one.stop - one.start) * (size[:, : len(u)] * u / u[:, None]).sum(axis=1).max()
+                    size = most(one.table[law.monomials.linear(j)])
+                    sizes[j] += (one.stop - one.start) * pace(size[:, : len(u)], u)
             return int(sizes.argmax()) if sizes.any() else int(np.argmax(box.halves))
         except Unchecked:
             return int(np.argmax(box.halves))
@@ -119,13 +119,12 @@ class Flows:
         """Which entries of ``[A B E]`` are other than 0 at any time and parameter, and which depend on the
         parameters."""
         law = Law(self.plant, self.until, self.box, min(1, self.degree), self.timing)
-        there, moved = [], []
+        moved = []
         for one in law.stretches:
             first, *others = one.table
-            there.append(one.sizes[0] > 0.0)
             moved.append([[any(part[i][j].length() for part in others) or _is_wide(first[i][j])
                            for j in range(len(first[0]))] for i in range(len(first))])  # fmt: skip
-        return np.any(there, axis=0), np.any(moved, axis=0) & bool(self.box.middle)
+        return law.there, np.any(moved, axis=0) & bool(self.box.middle)
 
 
 def _is_wide(entry: object) -> bool:

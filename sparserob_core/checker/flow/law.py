@@ -18,7 +18,7 @@ from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked
 from sparserob_core.checker.flow.plant import Phase, Plant
 from sparserob_core.checker.flow.segment import SHARP
-from sparserob_core.checker.flow.units import balanced
+from sparserob_core.checker.flow.units import balanced, pace
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 
@@ -121,6 +121,11 @@ class Stretch:
         return found[0] * OUTWARD, found[1] * OUTWARD
 
 
+def most(table: Sequence[Sequence[arb_poly]]) -> Array:
+    """About how large polynomials on [-1, 1] may be, ``(d, d + w)``."""
+    return np.array([[sum(float(c.abs_upper()) for c in entry.coeffs()) for entry in row] for row in table])
+
+
 def _power(length: float) -> float:
     """The least power of two that is not below it."""
     return 2.0 ** ceil(log2(length))
@@ -129,7 +134,7 @@ def _power(length: float) -> float:
 def _kept(A: list[Series], units: Array) -> list[Series]:
     """The powers of which more is left than nothing; those beyond are in the balls of the first."""
     sizes = [one.size for one in A]
-    paces = [float((size * units / units[:, None]).sum(axis=1).max(initial=0.0)) for size in sizes]
+    paces = [pace(size, units) for size in sizes]
     kept = len(A)
     while kept > 1 and sum(paces[kept - 1 :]) <= SHARP:
         kept -= 1
@@ -183,12 +188,16 @@ class Law:
         return all(one.is_still for one in self.stretches)
 
     @cached_property
+    def there(self) -> np.ndarray:
+        """Which entries of ``[A B c E]`` are other than 0 at any time or parameter, ``(d, d + w)``."""
+        return np.asarray(np.any([one.sizes[0] > 0.0 for one in self.stretches], axis=0))
+
+    @cached_property
     def weights(self) -> Array:
         """How much every monomial of the parameters has to do with the law, ``(M,)``, about."""
         found = np.zeros(self.monomials.size)
         for one in self.stretches:
-            for k, part in enumerate(one.table):
-                found[k] += sum(float(c.abs_upper()) for row in part for entry in row for c in entry.coeffs())
+            found += [most(part).sum() for part in one.table]
         return found
 
     def _on_same(self, other: Stretch) -> Stretch:
@@ -223,11 +232,10 @@ class Law:
             return None
         if not found.is_still or (phase.timed and self._hides(found, phase)):
             return None
-        d, u, longest = len(self.units), self.units, _power(until - begin)
-        pace = float((found.sizes[0][:, :d] * u / u[:, None]).sum(axis=1).max(initial=0.0))
-        if not pace < 2.0**1000:
+        longest, rate = _power(until - begin), pace(found.sizes[0][:, : self.plant.states], self.units)
+        if not rate < 2.0**1000:
             raise Unchecked("the system is too fast for its horizon to be followed")
-        return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / pace))) if pace > 0.0 else longest)
+        return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / rate))) if rate > 0.0 else longest)
 
     def _hides(self, found: Stretch, phase: Phase) -> bool:
         """Whether the balls of a law hold what changes with the time: those of one time are less wide."""
@@ -246,13 +254,12 @@ class Law:
         try:
             _, middle = self._table(start, stop, phase, NONE)
             d, u = len(middle[0]), self.units
-            size = np.array([[sum(float(c.abs_upper()) for c in e.coeffs()) for e in row] for row in middle[0]])
+            size = most(middle[0])
             lost = np.array([[sum(float(c.rad()) for c in e.coeffs()) for e in row] for row in middle[0]])
-            paces, gone = ((one[:, :d] * u / u[:, None]) for one in (size, lost))
-            pace, long = float(paces.sum(axis=1).max(initial=0.0)), float((stop - start) * OUTWARD)
-            ratios = np.ones(d) if pace * long <= LONG else _slow(paces * long)
-            least = SHARP * max(pace, float((self._looks[0] * u / u[:, None]).sum(axis=1).max(initial=0.0)))
-            if ratios is None or not gone.sum(axis=1).max(initial=0.0) * ratios.max() <= least:
+            rate, long = pace(size[:, :d], u), float((stop - start) * OUTWARD)
+            ratios = np.ones(d) if rate * long <= LONG else _slow(size[:, :d] * u / u[:, None] * long)
+            least = SHARP * max(rate, pace(self._looks[0], u))
+            if ratios is None or not pace(lost[:, :d], u) * ratios.max() <= least:
                 return None
             if not (lost[:, d:] <= SHARP * self._looks[1]).all():
                 return None

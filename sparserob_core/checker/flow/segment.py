@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, dot, identity, sizes_of, zeros
+from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 
@@ -161,8 +162,7 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
             missed = missed + paces[k] @ sizes[n - k] / (n + 1)
         if n < len(F):
             missed[:, d:] += drives[n] / (n + 1)
-    rates = [(one * units / units[:, None]).sum(axis=1).max(initial=0.0) / (k + 1) for k, one in enumerate(paces)]
-    growth = float(sum(rates)) * OUTWARD
+    growth = sum(pace(one, units) / (k + 1) for k, one in enumerate(paces)) * OUTWARD
     if not growth <= FAR:
         raise Unchecked("the system is too fast for a part of its horizon")
     worst = (missed / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * OUTWARD)

@@ -50,6 +50,11 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
     return np.asarray(np.exp2(np.clip(np.round(exponents[:-1] - exponents[-1]), -500, 500)), dtype=float)
 
 
+def pace(rates: Array, units: Array) -> float:
+    """The largest sum of a row of ``rates (d, d)``, none of them negative, between states in these units."""
+    return float((rates * units / units[:, None]).sum(axis=1).max(initial=0.0))
+
+
 def scaled(matrix: arb_mat, rows: Array, columns: Array) -> arb_mat:
     """A ball matrix with its rows and its columns multiplied by powers of two, which is exact."""
     factors = list(map(float, columns))

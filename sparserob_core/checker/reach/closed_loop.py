@@ -172,7 +172,7 @@ class ClosedLoop:
         if self.flow.law.is_still:
             return Pushed.of([(one["A"], one["E"]) for one in modes_at(self.system, ())], vectors)
         d, m = self.flow.states, self.flow.driven
-        there = np.any([one.sizes[0] > 0.0 for one in self.flow.law.stretches], axis=0)
+        there = self.flow.law.there
         return Pushed.linked(there[:, :d], there[:, d + m :], vectors)
 
     @cached_property
