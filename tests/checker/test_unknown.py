@@ -136,7 +136,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     ),
     "an effort that is known roughly": (largest_effort(arb(0, 1), 0.5), Unchecked, "known too roughly"),
     "an effort that is larger": (largest_effort(arb(2), 0.5), Broken, "causes the effort 2.0"),
-    "a system that is too fast": (lambda: kernel_of([[-1e9]], [[1.0]], 1.0), Unchecked, "too fast for its pieces"),
+    "a system that is too fast": (lambda: kernel_of([[-1e9]], [[1.0]], 1.0), Unchecked, "too fast for its horizon"),
     "numbers that are not exact": (
         lambda: Pushed.of([(arb_mat([[arb(1, 0.1)]]), arb_mat([[1]]))], [[1]]),
         Unchecked,

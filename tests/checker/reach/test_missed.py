@@ -1,4 +1,4 @@
-"""Guards checker/reach/varying/execution: errors of execution of systems that change with time: integrals of absolute
+"""Guards checker/reach/missed: errors of execution of systems that change with time: integrals of absolute
 values between closed forms, and their bends."""
 
 from __future__ import annotations
