@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from flint import arb_mat, ctx
 from scipy.integrate import solve_ivp
+from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 
 import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.reach.varying.measurable import VaryingMeasurableLoop
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.feedback.measurable import VaryingPieces
