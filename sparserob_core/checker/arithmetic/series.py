@@ -214,7 +214,13 @@ def products(steps: Sequence[Series]) -> list[Series]:
     if len(steps) == 1:
         return [steps[0], unit]
     odd = len(steps) % 2
-    pairs = [second * first for first, second in zip(steps[:-1:2], steps[1::2], strict=False)]
+    made = dict[tuple[int, int], Series]()  # steps that are one object have products that are one
+    pairs = []
+    for first, second in zip(steps[:-1:2], steps[1::2], strict=False):
+        key = id(first), id(second)
+        if key not in made:
+            made[key] = second * first
+        pairs.append(made[key])
     coarse = products([*pairs, *([steps[-1]] if odd else [])])
     found: list[Series] = []
     for k in range(len(steps) + 1):

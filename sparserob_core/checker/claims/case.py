@@ -21,7 +21,6 @@ from sparserob_core.checker.cost.price import Price
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.flows import Flows
 from sparserob_core.checker.flow.law import Box as ParameterBox
-from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.problem.integrals import Running, integrating, spelt
@@ -280,13 +279,7 @@ class Case:
     @cached_property
     def flows(self) -> Flows:
         """The flows of the system, over boxes of its parameters and at single ones."""
-        bound, until = self.problem.system.parameters, self.grid[-1]
-        plant, box = Plant.of(self.problem.system, until), None if bound is None else bound.bounding_box()
-        return Flows(
-            plant,
-            until,
-            ParameterBox() if box is None else ParameterBox.between(box.lower.tolist(), box.upper.tolist()),
-        )
+        return Flows.of(self.problem.system, self.grid[-1])
 
     @property
     def varying(self) -> Flows:
@@ -512,13 +505,13 @@ class Case:
         if window not in self._units:
             self._units[window] = RowUnits(
                 self.problem,
+                self.flows,
                 self.scene,
                 window.shape,
                 window.start,
                 window.stop,
                 window.reference,
                 self._acting,
-                self.changing,
                 self.nominal_sizes,
             )
         return self._units[window]
@@ -601,7 +594,7 @@ class Case:
 
     @cached_property
     def duality(self) -> Duality:
-        return Duality(self.problem, self.control, self.changes, self.changing, self.held, self.lasting)
+        return Duality(self.problem, self.control, self.changes, self.flows, self.held, self.lasting)
 
 
 def _middle(bound: ConvexSet) -> Array:

@@ -425,7 +425,7 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     initial state and control do, and where deviations are answered also of these, with and without the control."""
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
-    sums = RowUnits(case.problem, scene, everything, horizon, horizon, varying=case.changing).sums
+    sums = RowUnits(case.problem, case.flows, scene, everything, horizon, horizon).sums
     answers, found = answers_of(case), []
     last = answers.loop.nodes[-1].tolist() if case.looped else _unreached(case, scene)
     for state, value in case.equalities:
@@ -443,9 +443,7 @@ def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
     for state, _ in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
-    if case.changing is not None:  # over many orbits, in units that follow them
-        return list(States(case.changing.at(case.nominal_parameter), scene).last.matrix.tolist())
-    return case.nominal_states[-1].tolist()
+    return list(States(case.flows.at(case.nominal_parameter), scene).last.matrix.tolist())
 
 
 def of_fixed(case: Case) -> str:

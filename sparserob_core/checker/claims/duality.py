@@ -8,20 +8,17 @@ the controls' set alone, piece by piece. With ``J`` left out, a positive number 
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.cost.price import Price, Tangent
-from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.flows import Flows
-from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.problem.lasting import Lasting, summed
 from sparserob_core.checker.sets.flat import Boxed
@@ -34,9 +31,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 
-LEAPS = 64  # times in a row that a lag is carried on from the one before
 EFFORT = "effort"
-STEPS_KEPT = 64  # lengths whose exponentials are remembered from row to row: of 300 states each takes 10 MB
 
 
 @final
@@ -61,17 +56,15 @@ class Row:
 @dataclass(frozen=True, eq=False)
 class Duality:
     """The data that bounds are derived from. ``changes``: where the disturbance may jump, ``None`` when there is
-    none; ``varying``: the flow of a system that changes with time, and ``held`` the set of what of its disturbance
-    stays the same between these; ``lasting``: which components stay longer what they are."""
+    none, and ``held`` the set of what of it stays the same between these; ``flows``: those of the system;
+    ``lasting``: which components stay longer what they are."""
 
     problem: OptimalControlProblem
     control: Dictionary
     changes: list[float] | None
-    varying: Flows | None = None
+    flows: Flows
     held: ConvexSet | None = None
     lasting: Lasting | None = None
-    _known: dict[tuple[float, ...], list[dict[str, arb_mat]]] = field(default_factory=dict, repr=False)
-    _steps: dict[tuple[tuple[float, ...], int, tuple[float, float]], arb_mat] = field(default_factory=dict, repr=False)
 
     @property
     def nothing(self) -> arb:
@@ -113,39 +106,11 @@ class Duality:
     def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
         it."""
-        if self.varying is not None:
-            return self._varying_row(self.varying.at(parameter), direction, time, limit, disturbed)
-        delay, parts = self.problem.system.delay, self._modes(parameter)[0]
-        d, m, columns = parts["A"].nrows(), self.problem.system.controls, parts["B"].ncols()
-        breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
-        jumps = self.changes if self.changes is not None else []
-        lags = self._lags(parameter, direction, time, {0.0, *(s for s in (*breaks, *jumps) if s < time)})
-        constant = (
-            sum((lags[0.0][i] * _exact(x) for i, x in enumerate(np.asarray(self.problem.initial_state))), _exact(0.0))
-            - limit
-        )
-        constant = sum(lags[0.0][d + m : d + columns], constant)  # a drift, whose input is 1
-        if delay > 0.0:
-            early = _differences([lags[s][d : d + m] if s < time else None for s in (0.0, breaks[0])], m)[0]
-            constant = sum((w * _exact(u) for w, u in zip(early, before(self.problem), strict=True)), constant)
-        slope = _differences([lags[s][d : d + m] if s < time else None for s in breaks], m)
-        if disturbed and self.problem.initial_set is not None:
-            constant = constant + known(self.problem.initial_set).support(lags[0.0][:d])
-        if disturbed and self.changes is not None and self.problem.disturbance is not None:
-            mw = parts["E"].ncols()
-            pushes = _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw)
-            for weights in summed(self.lasting, pushes):
-                if any(not w.is_zero() for w in weights):
-                    constant = constant + known(self.problem.disturbance).support(weights)
-        return Row(constant, slope)
-
-    def _varying_row(self, flow: Flow, direction: Array, time: float, limit: arb, disturbed: bool) -> Row:
-        """`row` of a system that changes with time, at a parameter that is known."""
         m, problem = self.problem.system.controls, self.problem
         delay, jumps = problem.system.delay, self.changes or []
         breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
         begins = sorted({0.0, *(s for s in (*breaks, *jumps) if s < time)})
-        weights = flow.weights([*begins, time])
+        weights = self.flows.at(parameter).weights([*begins, time])
         row, start = stacked([[_exact(c) for c in direction]]), np.asarray(problem.initial_state)
         free = (row * weights.free).entries()
         constant = sum((w * _exact(x) for w, x in zip(free, start, strict=True)), _exact(0.0)) - limit
@@ -174,62 +139,16 @@ class Duality:
         jumps = self.changes if jumps is None else jumps
         if not jumps:
             return []
-        if self.varying is not None:
-            begins = sorted({0.0, *(s for s in jumps if s < time)})
-            weights, row = self.varying.at(()).weights([*begins, time]), stacked([[_exact(c) for c in direction]])
-            given = {s: (row * one).entries() for s, one in zip(begins, weights.disturbance, strict=True)}
-            late = [_exact(0.0)] * self.problem.system.disturbances
-            return [given[s] if s < time else late for s in jumps]
-        parts = self._modes(())[0]
-        first, mw = direction.size + parts["B"].ncols(), parts["E"].ncols()
-        lags = self._lags((), direction, time, {0.0, *(s for s in jumps if s < time)})
-        return _differences([lags[s][first:] if s < time else None for s in jumps], mw)
+        begins = sorted({0.0, *(s for s in jumps if s < time)})
+        weights, row = self.flows.at(()).weights([*begins, time]), stacked([[_exact(c) for c in direction]])
+        given = {s: (row * one).entries() for s, one in zip(begins, weights.disturbance, strict=True)}
+        late = [_exact(0.0)] * self.problem.system.disturbances
+        return [given[s] if s < time else late for s in jumps]
 
     def carried(self, direction: Array, time: float) -> list[arb]:
         """What the initial state of a known system gives to ``c'x(t)``, ``(d,)``."""
-        if self.varying is not None:
-            row = stacked([[_exact(c) for c in direction]])
-            return list((row * self.varying.at(()).weights([0.0, time]).free).entries())
-        return self._lags((), direction, time, {0.0})[0.0][: direction.size]
-
-    def _modes(self, parameter: Sequence[float]) -> list[dict[str, arb_mat]]:
-        """The systems that take turns, at a parameter."""
-        point = tuple(map(float, parameter))
-        if point not in self._known:
-            if len(self._known) >= STEPS_KEPT:
-                self._known.clear()
-            self._known[point] = modes_at(self.problem.system, point)
-        return self._known[point]
-
-    def _lags(
-        self, parameter: Sequence[float], direction: Array, time: float, since: set[float]
-    ) -> dict[float, list[arb]]:
-        """``c'e^{A (t - s)}`` and its integrals from each of the times ``since`` to ``time``, times ``B`` and ``E``;
-        back through the systems that took turns until then. From one time to the next by the exponential of the step,
-        which is the same wherever pieces are equally long; every `LEAPS` times anew, since balls grow."""
-
-        switches, d = self.problem.system.switches, direction.size
-        matrices = [_joined(mode) for mode in self._modes(parameter)]
-        column, found = [_exact(v) for v in (*direction, *np.zeros(matrices[0].nrows() - d))], {}
-        for leg in range(bisect_left(switches, time), -1, -1):
-            begin, end = (0.0, *switches)[leg], min((*switches, time)[leg], time)
-            row, totals = stacked([[v] for v in column[:d]] + [[_exact(0.0)] for _ in column[d:]]), column[d:]
-            latest, moved = end, row
-            for number, s in enumerate(sorted({begin, *(s for s in since if begin <= s < end)}, reverse=True)):
-                if number % LEAPS == 0:
-                    moved = (matrices[leg] * (_exact(end) - _exact(s))).exp() * row
-                else:
-                    length = (tuple(map(float, parameter)), leg, difference(latest, s))
-                    if length not in self._steps:
-                        step = (matrices[leg] * (_exact(latest) - _exact(s))).exp()
-                        if len(self._steps) >= STEPS_KEPT:
-                            self._steps.clear()
-                        self._steps[length] = step
-                    moved = self._steps[length] * moved
-                latest, lag = s, moved.entries()
-                found[s] = lag[:d] + [a + b for a, b in zip(lag[d:], totals, strict=True)]
-            column = found[begin]
-        return found
+        row = stacked([[_exact(c) for c in direction]])
+        return list((row * self.flows.at(()).weights([0.0, time]).free).entries())
 
     def bound(
         self,
@@ -378,23 +297,6 @@ def before(problem: OptimalControlProblem) -> list[float]:
     """The control that acts until the first one of a delayed system does, ``(m,)``."""
     given = problem.initial_control
     return [0.0] * problem.system.controls if given is None else [float(u) for u in np.asarray(given)]
-
-
-def _joined(mode: dict[str, arb_mat]) -> arb_mat:
-    """``y' = A'y`` with the integrals of ``B'y`` and ``E'y``."""
-    A, B, E = (mode[name].transpose() for name in ("A", "B", "E"))
-    table = [row for part in (A, B, E) for row in part.tolist()]
-    return stacked([row + [_exact(0.0)] * (len(table) - len(row)) for row in table])
-
-
-def _differences(integrals: Sequence[list[arb] | None], width: int) -> list[list[arb]]:
-    """What each piece contributes: the integral since its start less that since its end."""
-    zero = [_exact(0.0)] * width
-    nexts = [*integrals[1:], None]
-    return [
-        zero if now is None else [a - b for a, b in zip(now, later or zero, strict=True)]
-        for now, later in zip(integrals, nexts, strict=True)
-    ]
 
 
 def _most(values: Sequence[arb]) -> arb:

@@ -3,7 +3,6 @@ witness exceeds there, and by how much the worst one does."""
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,9 +16,6 @@ from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
 from sparserob_core.checker.claims.cells import Reached
 from sparserob_core.checker.claims.constraints import beside, erring_at, followed, follows, missed
 from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.still import held as held_for
-from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.loop_tube import LoopTube
@@ -43,33 +39,8 @@ ROUNDED = 1e-11
 def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
     """The state at ``time`` under the case's control, and ``signal (mw, pieces)`` on the pieces of the common grid
     (``None``: no disturbance), from the centre of the initial states and a ``deviation (d,)`` in their set."""
-    from flint import arb, arb_mat
-
-    if case.changing is not None:
-        return _changed(case, case.changing.at(parameter.tolist()), time, signal, deviation)
-    every = modes_at(case.problem.system, parameter.tolist())
-    wanted = case.problem.disturbance is not None
-    w = _admissible(case, signal) if wanted else None
-    both = [
-        stacked([left + right for left, right in zip(parts["B"].tolist(), parts["E"].tolist(), strict=True)])
-        for parts in every
-    ]
-    x = _start(case, deviation)
-    for k, start in enumerate(case.grid[:-1]):
-        if start >= time:
-            break
-        leg = bisect_right(case.problem.system.switches, start)
-        Phi, Gamma = held_for(every[leg]["A"], both[leg], arb(min(case.grid[k + 1], time)) - arb(start))
-        pushed = [arb(0)] * every[leg]["E"].ncols() if w is None else balls(w[:, k])
-        x = Phi * x + Gamma * arb_mat([[v] for v in case.scene.control[k].entries() + pushed])
-    state: list[arb] = x.entries()
-    return state
-
-
-def _changed(case: Case, flow: Flow, time: float, signal: object, deviation: object) -> list[arb]:
-    """`reached` of a system that changes with time."""
     w = _admissible(case, signal) if case.problem.disturbance is not None else None
-    weights = flow.weights([0.0, *(t for t in case.grid[1:-1] if t < time), time])
+    weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.grid[1:-1] if t < time), time])
     x = weights.free * _start(case, deviation)
     for k, (acts, pushes) in enumerate(zip(weights.control, weights.disturbance, strict=True)):
         x = x + acts * case.scene.control[k]

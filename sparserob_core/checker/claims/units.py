@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 import numpy.typing as npt
 
-from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.duality import before
 from sparserob_core.checker.flow.flows import Flows
-from sparserob_core.checker.flow.still import held, modes_at
 from sparserob_core.checker.outcome import RESOLVED, THIN, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.sets.known import known
@@ -24,13 +21,9 @@ from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
+    from flint import arb
 
 MOST_TIMES = 64  # at which a window is looked at
-# States from which transitions are made of floats, which is what units need: of 348 states one in balls takes as long
-# as the rest of a check; of few states that is nothing, and what grows by many digits has them right.
-COARSE = 16
-TERMS = 18  # of the series of such a transition, at a norm of at most a half: more are below rounding
 MOST_HELD = 16_000_000  # numbers that tell what inputs do on every piece, at once
 # So many times as far as a control goes it is taken to go in the numbers that are added up, where its range is larger.
 # With a tenth of it, runs would be refused that were honest in the units of their whole range; with ten times as much,
@@ -47,8 +40,8 @@ MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 class RowUnits:
     """The units of the constraint ``x(t) - r(t)`` in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in one
     of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``;
-    ``acting (m,)``: how far the control of a decision goes; ``varying``: the flow of a system that changes with time;
-    ``nominal``: the largest values of rows on the state and on the control along the nominal trajectory.
+    ``acting (m,)``: how far the control of a decision goes; ``flows``: those of the system; ``nominal``: the largest
+    values of rows on the state and on the control along the nominal trajectory.
 
     That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any
     admissible control, the worst disturbance, any parameter), ``|b|``, and the width of the slab where the opposite row
@@ -60,13 +53,13 @@ class RowUnits:
     """
 
     problem: OptimalControlProblem
+    flows: Flows
     scene: Scene
     shape: ConvexSet
     start: float
     stop: float
     reference: Array | None = None
     acting: Array | None = None
-    varying: Flows | None = None
     nominal: Callable[[Array, Array], Array] | None = None
 
     @cached_property
@@ -200,7 +193,7 @@ class RowUnits:
         system, bound = self.problem.system, self.problem.disturbance
         d, m, columns = system.states, system.controls, system.controls + (system.c is not None)
         rows, gains = self._rows_of(states)
-        step = _Steps(self.problem, parameter, columns, self.scene.tick, self.varying)
+        flow = self.flows.at(parameter)
         v = np.tile(rows, (len(places), 1, 1))
         count = len(nodes) - 1
         driven = np.zeros((count, *v.shape[:2], columns))
@@ -208,9 +201,7 @@ class RowUnits:
         for k in range(count - 1, -1, -1):
             first = int(np.searchsorted(places, k, side="right"))
             if first < len(places):
-                Phi, Gamma, Delta = step.over(
-                    nodes[k], nodes[k + 1], bisect_right(self.problem.system.switches, nodes[k])
-                )
+                Phi, Gamma, Delta = flow.about(nodes[k], nodes[k + 1])
                 driven[k, first:], pushed[k, first:] = v[first:] @ Gamma, v[first:] @ Delta
                 v[first:] = v[first:] @ Phi
         start = np.asarray(self.problem.initial_state, dtype=float)
@@ -266,59 +257,3 @@ class RowUnits:
         if window.size > MOST_TIMES:
             window = window[np.unique(np.linspace(0, window.size - 1, MOST_TIMES).round().astype(int))]
         return nodes, window
-
-
-@final
-@dataclass(eq=False)
-class _Steps:
-    """What an interval makes of the state, of a control and of a disturbance, at one parameter."""
-
-    problem: OptimalControlProblem
-    parameter: tuple[float, ...]
-    controls: int
-    tick: float
-    varying: Flows | None
-    _known: dict[tuple[int, int], tuple[Array, Array, Array]] = field(default_factory=dict)
-
-    def over(self, start: float, stop: float, leg: int) -> tuple[Array, Array, Array]:
-        """``e^{A s}``, and the integrals of it times ``B`` and times ``E``, ``s`` the length of the interval; of the
-        system whose turn it is."""
-        from flint import arb
-
-        if self.varying is not None:
-            Phi, Gamma, Delta = self.varying.at(self.parameter).over(start, stop)
-            return _floats(Phi.matrix), _floats(Gamma.matrix), _floats(Delta.matrix)
-        key = (leg, round((stop - start) / self.tick))
-        if key not in self._known:
-            parts = self._modes[leg]
-            both = stacked([b + e for b, e in zip(parts["B"].tolist(), parts["E"].tolist(), strict=True)])
-            if both.nrows() >= COARSE:
-                flow, table = _held(_floats(parts["A"]), _floats(both), stop - start)
-            else:
-                flow, table = map(_floats, held(parts["A"], both, arb(stop - start)))
-            self._known[key] = (flow, table[:, : self.controls], table[:, self.controls :])
-        return self._known[key]
-
-    @cached_property
-    def _modes(self) -> list[dict[str, arb_mat]]:
-        return modes_at(self.problem.system, self.parameter)
-
-
-def _floats(matrix: arb_mat) -> Array:
-    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
-
-
-def _held(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
-    """``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats: the series over a short time, and what that makes
-    of twice the time, again and again."""
-    d, size = A.shape[0], float(np.abs(A).sum(axis=1).max(initial=0.0)) * time
-    halvings = max(0, int(np.ceil(np.log2(2.0 * size)))) if 0.0 < size < np.inf else 0
-    short = time / 2.0**halvings
-    flow, driven, term = np.eye(d), np.eye(d) * short, np.eye(d)
-    for order in range(1, TERMS + 1):
-        term = term @ A * (short / order)
-        flow, driven = flow + term, driven + term * (short / (order + 1))
-    driven = driven @ inputs
-    for _ in range(halvings):
-        flow, driven = flow @ flow, driven + flow @ driven
-    return flow, driven

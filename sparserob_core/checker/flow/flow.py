@@ -15,20 +15,23 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.monomials import Monomials
-from sparserob_core.checker.arithmetic.series import OUTWARD, Series, products, zeros
+from sparserob_core.checker.arithmetic.series import OUTWARD, Series, middles, products, zeros
 from sparserob_core.checker.flow.law import Box, Law, Stretch
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.segment import ROUGH, Segment, solve
+from sparserob_core.checker.flow.segment import LONGER, ROUGH, Segment, solve
+from sparserob_core.checker.flow.still import held_about
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
+# States from which transitions that no claim rests on are made of floats: of 348 states one in balls takes as long as
+# the rest of a check; of few states that is nothing, and what grows by many digits has them right.
+COARSE = 16
 MOST_MARKS = 2**17  # of the horizon
 KEPT = 4096  # parts of the horizon whose flows are remembered
 POINTS_KEPT = 256  # flows at single parameters
-LONGER = 1.0 + 2.0**-30  # than the parts of time, whose ends are rounded, is the time of which the flow is verified
 ENOUGH = 2.0**-64  # of a kernel, which goes on as numbers of 53 bits, what its last terms may be: 2^-54 would show
 
 
@@ -57,8 +60,9 @@ class Flow:
     timing: Law | None = None
     _segments: dict[tuple[float, float], Segment] = field(default_factory=dict, repr=False)
     _longest: dict[float, float] = field(default_factory=dict, repr=False)
-    _over: dict[tuple[float, float], tuple[Series, Series]] = field(default_factory=dict, repr=False)
+    _over: dict[tuple[object, ...], tuple[Series, Series]] = field(default_factory=dict, repr=False)
     _ends: dict[tuple[int, tuple[float, float]], Series] = field(default_factory=dict, repr=False)
+    _about: dict[tuple[int, float], tuple[Array, Array]] = field(default_factory=dict, repr=False)
     _points: dict[tuple[float, ...], Flow] = field(default_factory=dict, repr=False)
     _weights: dict[tuple[float, ...], Weights] = field(default_factory=dict, repr=False)
 
@@ -125,8 +129,8 @@ class Flow:
 
         stretch = self.law.stretches[self._place(start, stop)]
         if stretch.is_still:
-            share = (arb(stop) - arb(start)) / arb(stretch.stride * LONGER)
-            if not share <= 1:
+            share = (arb(stop) - arb(start)) / arb(stretch.stride)  # exactly, by a power of two
+            if not share <= LONGER:
                 raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
             return self._still(stretch), share
         longest = self._longest.get(start, -1.0)
@@ -159,9 +163,10 @@ class Flow:
     def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
         """What an interval makes of a state, of controls that stay the same (a drift among them), and of such
         disturbances."""
-        if (start, stop) not in self._over:
-            if not 0.0 <= start <= stop <= self.until:
-                raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
+        if not 0.0 <= start <= stop <= self.until:
+            raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
+        key = self.alike(start, stop)
+        if key not in self._over:
             whole: tuple[Series, Series] | None = None
             for a, b in pairwise([start, *(one for one in self._begins if start < one < stop), stop]):
                 Phi, pushed = self._through(a, b)
@@ -169,9 +174,28 @@ class Flow:
             assert whole is not None
             if len(self._over) >= KEPT:
                 self._over.clear()
-            self._over[start, stop] = whole
-        Phi, pushed = self._over[start, stop]
+            self._over[key] = whole
+        Phi, pushed = self._over[key]
         return Phi, pushed.columns(0, self.driven), pushed.columns(self.driven, None)
+
+    def about(self, start: float, stop: float) -> tuple[Array, Array, Array]:
+        """`over` in floats, off by their rounding, of which units of rows are made, and no claim."""
+        phases, d = self.plant.phases, self.states
+        if d < COARSE or any(phase.timed for phase in phases):
+            Phi, Gamma, Delta = self.over(start, stop)
+            return middles(Phi.matrix), middles(Gamma.matrix), middles(Delta.matrix)
+        found = np.hstack([np.eye(d), np.zeros((d, self.plant.inputs))])
+        for number, phase in enumerate(phases):
+            length = min(stop, phase.until) - max(start, phase.begin)
+            if length > 0.0:
+                key = number, length
+                if key not in self._about:
+                    table = phase.called(np.array([phase.begin, *self.box.middle])).astype(float)
+                    self._about[key] = held_about(table[:, :d], table[:, d:], length)
+                Phi, pushed = self._about[key]
+                found = Phi @ found
+                found[:, d:] += pushed
+        return found[:, :d], found[:, d : d + self.driven], found[:, d + self.driven :]
 
     def _through(self, start: float, stop: float) -> tuple[Series, Series]:
         """What an interval within one stretch makes of states, and of inputs: of what does not change with time by
@@ -182,7 +206,7 @@ class Flow:
         if not stretch.is_still:
             part = self.step(start, stop)
             return part.columns(0, self.states), part.columns(self.states, None)
-        share = (arb(stop) - arb(start)) / arb(stretch.stride * LONGER)
+        share = (arb(stop) - arb(start)) / arb(stretch.stride)
         while not share <= 1:
             share, halvings = share / 2, halvings + 1
         part = self._still(stretch).at(share)
@@ -195,7 +219,7 @@ class Flow:
         """The flow of a stretch on which nothing changes with time."""
         key = (-1.0, stretch.start)
         if key not in self._segments:
-            self._segments[key] = solve(*stretch.between(0.0, stretch.stride * LONGER), stretch.units)
+            self._segments[key] = solve(*stretch.between(0.0, stretch.stride), stretch.units)
         return self._segments[key]
 
     def within(self, begin: float, end: float, start: float, stop: float, order: int) -> tuple[list[Series], Array]:

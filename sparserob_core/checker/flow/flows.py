@@ -14,6 +14,7 @@ from sparserob_core.checker.flow.law import Box, Law, most
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.control.problem.system import System
 
 DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of expansions in so many parameters; 2 beyond
 WIDE = {1: 16, 2: 8, 3: 5, 4: 3}  # of those that are to serve many boxes
@@ -33,6 +34,13 @@ class Flows:
     box: Box = Box()  # noqa: RUF009  immutable
     _made: dict[tuple[Box, int], Flow] = field(default_factory=dict, repr=False)
     _close: dict[tuple[Box, int], bool] = field(default_factory=dict, repr=False)
+
+    @staticmethod
+    def of(system: System, until: float) -> Flows:
+        """Those of a system over the box around its parameters."""
+        bound = None if system.parameters is None else system.parameters.bounding_box()
+        box = Box() if bound is None else Box.between(bound.lower.tolist(), bound.upper.tolist())
+        return Flows(Plant.of(system, until), until, box)
 
     def at(self, parameter: Sequence[float]) -> Flow:
         """The flow at one parameter, of which there may be none."""

@@ -39,11 +39,12 @@ class Phase:
 @dataclass(frozen=True, eq=False)
 class Plant:
     """The ``phases`` of a system with ``states``, and with so many inputs that are ``driven``, controls and a drift,
-    before the disturbances."""
+    before the disturbances, and all ``inputs``."""
 
     phases: tuple[Phase, ...]
     states: int
     driven: int
+    inputs: int
 
     @staticmethod
     def of(system: System, horizon: float) -> Plant:
@@ -55,7 +56,8 @@ class Plant:
         ends = [*(begin for begin, _ in laws[1:]), horizon]
         timed = isinstance(system, VaryingSystem)
         phases = [Phase(begin, until, law, timed) for (begin, law), until in zip(laws, ends, strict=True)]
-        return Plant(tuple(phases), int(system.states), int(system.controls + (system.c is not None)))
+        driven = int(system.controls + (system.c is not None))
+        return Plant(tuple(phases), int(system.states), driven, driven + int(system.disturbances))
 
     def looked_at(self, parameter: Sequence[float]) -> Iterator[Array]:
         """``[A B c E]`` at some times, and a parameter."""

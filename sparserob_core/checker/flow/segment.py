@@ -28,6 +28,7 @@ SHARP = 2.0**-100  # of the system's numbers, what a guess leaves out; 2^-10 wou
 ROUGH = 2.0**-70  # the same over a box of parameters, where less is known anyway, and of kernels, which become floats
 AT_ONCE = 4  # terms after which it is looked whether more are needed
 TERMS = 64  # of a guess, at most
+LONGER = 1.0 + 2.0**-30  # shares up to which a flow is verified: of times whose ends are rounded some are above 1
 FAR = 300.0  # of the exponent in Gronwall's inequality: beyond, nothing is known
 
 
@@ -74,7 +75,7 @@ class Powers:
 @dataclass(frozen=True, eq=False)
 class Segment:
     """``[Phi Gamma]``, what a share ``x`` of the time makes of the states at its beginning and of inputs that stay the
-    same: ``sum_n terms_n x^n``, off by at most ``off (d, d + w)`` at every share and parameter."""
+    same: ``sum_n terms_n x^n``, off by at most ``off (d, d + w)`` at every share up to `LONGER` and every parameter."""
 
     terms: list[Series]
     off: Array
@@ -162,10 +163,11 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
             missed = missed + paces[k] @ sizes[n - k] / (n + 1)
         if n < len(F):
             missed[:, d:] += drives[n] / (n + 1)
-    growth = sum(pace(one, units) / (k + 1) for k, one in enumerate(paces)) * OUTWARD
+    highest = LONGER ** (2 * TERMS + len(A) + len(F))  # no power of a share is above this
+    growth = sum(pace(one, units) / (k + 1) for k, one in enumerate(paces)) * highest * OUTWARD
     if not growth <= FAR:
         raise Unchecked("the system is too fast for a part of its horizon")
-    worst = (missed / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * OUTWARD)
+    worst = (missed / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * highest * OUTWARD)
     return np.asarray(units[:, None] * worst * OUTWARD)
 
 

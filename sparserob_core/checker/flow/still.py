@@ -12,11 +12,13 @@ from sparserob_core.checker.arithmetic.monomials import NONE
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.plant import Phase
 from sparserob_core.control.problem.system import System
+from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
+    from flint import arb_mat
 
 POINT = Frame(NONE, 0)
+TERMS = 18  # of the series of a transition in floats, at a norm of at most a half: more are below rounding
 
 
 def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_mat]]:
@@ -37,14 +39,20 @@ def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_m
     return found
 
 
-def held(matrix: arb_mat, inputs: arb_mat, time: arb) -> tuple[arb_mat, arb_mat]:
-    """``e^{matrix time}`` and ``int_0^time e^{matrix s} ds inputs`` from one exponential (Van Loan 1978)."""
-    from flint import arb, arb_mat
-
-    n, m = matrix.nrows(), inputs.ncols()
-    rows = [a + b for a, b in zip(matrix.tolist(), inputs.tolist(), strict=True)]
-    whole = (stacked(rows + [[arb(0)] * (n + m)] * m) * time).exp().tolist()
-    return stacked([row[:n] for row in whole[:n]]), arb_mat(n, m, [x for row in whole[:n] for x in row[n:]])
+def held_about(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
+    """``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats: the series over a short time, and what that makes
+    of twice the time, again and again."""
+    d, size = A.shape[0], float(np.abs(A).sum(axis=1).max(initial=0.0)) * time
+    halvings = max(0, int(np.ceil(np.log2(2.0 * size)))) if 0.0 < size < np.inf else 0
+    short = time / 2.0**halvings
+    flow, driven, term = np.eye(d), np.eye(d) * short, np.eye(d)
+    for order in range(1, TERMS + 1):
+        term = term @ A * (short / order)
+        flow, driven = flow + term, driven + term * (short / (order + 1))
+    driven = driven @ inputs
+    for _ in range(halvings):
+        flow, driven = flow @ flow, driven + flow @ driven
+    return flow, driven
 
 
 def column(matrix: arb_mat, number: int) -> arb_mat:

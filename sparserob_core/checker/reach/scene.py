@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, final
 
 from sparserob_core.checker.problem.lasting import Lasting
@@ -11,8 +10,6 @@ from sparserob_core.control.sets.sets import ConvexSet
 
 if TYPE_CHECKING:
     from flint import arb_mat
-
-SAME = 1e-14  # of the horizon: durations closer than this are treated as one
 
 
 @final
@@ -29,8 +26,3 @@ class Scene:
     changes: list[float]
     initial_set: ConvexSet | None = None
     lasting: Lasting | None = None
-
-    @cached_property
-    def tick(self) -> float:
-        """The unit in which durations are told apart."""
-        return SAME * self.grid[-1]

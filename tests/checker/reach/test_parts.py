@@ -18,6 +18,7 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.cells import _to_blame
 from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flows import Flows
 from sparserob_core.checker.flow.law import Box as ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import LOOKED, Broken, Clock, Unchecked
@@ -315,21 +316,28 @@ def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor)
         assert (np.abs(got - truth) <= off + 1e-13 * size[:, None]).all()
 
 
-def test_a_lag_is_the_exponential_of_the_whole_way_whatever_it_was_carried_on_from():
-    """`_lags` goes from time to time; on pieces of many lengths, over many of them, it holds what one step gives."""
+def test_what_a_row_is_made_of_is_known_as_well_on_many_pieces_as_on_one() -> None:
+    """Of what oscillates, on pieces of many lengths and over many of them, blocks add up to what a few large ones give,
+    and the balls stay small."""
     ends = np.concatenate([np.linspace(0.0, 1.0, 150), 1.0 + np.sort(np.random.default_rng(5).uniform(0.0, 2.0, 40))])
     stiff = LinearSystem(np.array([[0.0, 40.0], [-40.0, -0.1]]), np.eye(2), E=np.eye(2))
     problem = sr.OptimalControlProblem(
         system=stiff, horizon=float(ends[-1]), initial_state=[1.0, 0.0], control=Box(-np.ones(2), np.ones(2))
     )
     with ctx.workprec(96):
-        duality, time = Duality(problem, sr.Dictionary.indicators(ends), None), float(ends[-3])
-        lags = duality._lags((), np.array([1.0, 2.0]), time, {float(s) for s in ends[:-3]})
-        assert len(lags) == ends.size - 3
-        for s, lag in lags.items():
-            exact = scipy.linalg.expm(stiff.A.T * (time - s)) @ [1.0, 2.0]
-            assert [float(x.mid()) for x in lag[:2]] == pytest.approx(exact.tolist(), abs=1e-11)
-            assert max(float(x.rad()) for x in lag) < 1e-15
+        flows, c, time = Flows.of(stiff, float(ends[-1])), np.array([1.0, 2.0]), float(ends[-3])
+        duality = Duality(problem, sr.Dictionary.indicators(ends), None, flows)
+        row = duality.row(c, time, (), arb(0), disturbed=False)
+        pushed = duality.pushed(c, time, ends[:-1].tolist())
+        carried = duality.carried(c, time)
+    inverse = np.linalg.inv(stiff.A.T)
+    lags = np.array([scipy.linalg.expm(stiff.A.T * max(0.0, time - s)) @ c for s in ends])
+    assert [float(x.mid()) for x in carried] == pytest.approx(lags[0].tolist(), abs=1e-11)
+    for found in (row.slope, pushed):
+        assert np.array([[float(x.mid()) for x in one] for one in found]) == pytest.approx(
+            -np.diff(lags, axis=0) @ inverse.T, abs=1e-11
+        )
+        assert max(float(x.rad()) for one in found for x in one) < 1e-15
 
 
 def test_the_remainder_is_needed_and_enough_on_a_wide_box():
@@ -393,7 +401,7 @@ def test_rows_of_the_dual_are_those_of_the_transcription(nu):
         path=[PathConstraint(Ellipsoid(np.zeros(2), np.eye(2)), 0.1, 1.9), PathConstraint(SETS["box"], 0.0, 2.0)],
     )
     family = prepare(problem, control, disturbance).program.families[1]
-    dual = Duality(problem, control, disturbance.breakpoints[:-1].tolist())
+    dual = Duality(problem, control, disturbance.breakpoints[:-1].tolist(), Flows.of(problem.system, 2.0), TRIANGLE)
     for time in (0.0, 0.3, 0.7, 2.0):
         parameter = rng.uniform(-0.1, 0.1, size=nu)
         G, h = family.rows(np.concatenate([[time], parameter])[None])
