@@ -20,11 +20,10 @@ from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
 from sparserob_core.checker.cost.effort import at_most
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
-from sparserob_core.checker.reach.measurable import LoopBeside, MeasurableLoop
+from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import NEAR, along
-from sparserob_core.control.problem.disturbances import apart
 from sparserob_core.control.problem.system import SwitchedSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -90,41 +89,31 @@ class Answers:
     def _loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> ClosedLoop:
         """The loop; where ``changes`` are given, under disturbances that jump there only."""
         case = self.case
-        if case.problem.system.parameter_count:
-            raise Unchecked("the checker knows feedback and measurable disturbances of known systems only")
         system = case.problem.system
-        one = not isinstance(system, SwitchedSystem) and not system.delay
-        if case.answering and case.measurable and not one:
+        if system.parameter_count:
+            raise Unchecked("the checker knows feedback of known systems only")
+        if case.measurable and (isinstance(system, SwitchedSystem) or system.delay):
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
-        if case.answering and not case.alike:
+        if not case.alike:
             raise Unchecked("the checker knows feedback under disturbances of one class, on one dictionary")
-        held = (changes or []) if case.measurable and not case.several else (case.changes or [])
-        measured = case.problem.measurements if case.answering else None
+        held, measured = (changes if case.measurable else case.changes) or [], case.problem.measurements
         if measured is not None and case.measurable:
             raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
-        parts = (
-            case.problem.system,
+        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(
+            system,
             [float(v) for v in np.asarray(case.problem.initial_state)],
             nominal,
             gains,
             sorted({*case.grid, *held}),
             [float(t) for t in case.control.breakpoints],
             held,
-            apart(case.problem.disturbance, case.problem.disturbance_class, "piecewise_constant")
-            if case.several
-            else case.problem.disturbance,
+            case.problem.disturbance,
             case.problem.initial_set,
             tuple(float(v) for v in before(case.problem)),
             measured,
             self.observer,
+            law=case.flows.at(()),
         )
-        if case.several:
-            return LoopBeside(
-                *parts,
-                law=case.flows.at(()),
-                beside=MeasurableLoop.alone(case.problem, parts[4], parts[5], case.control.pieces),
-            )
-        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(*parts, law=case.flows.at(()))
 
     @cached_property
     def commands(self) -> list[arb_mat]:
@@ -221,20 +210,6 @@ class Answers:
             for axis in range(shape.dimension)
         ]
         at_most(a, A, loop.support, np.array(reach), limit, case.clock)
-
-    def disturbed(self, direction: Array, time: float, limit: arb) -> arb:
-        """By how much ``c'x(t)`` exceeds a limit without any control, for the worst disturbance and initial state."""
-        return self.at_rest.highest(self.case.piece_at(time), time, direction[None])[0] - limit
-
-    def farthest(self, c: Array, gain: Array, time: float, k: int | None) -> arb:
-        """The largest ``c'x(t) + gain'u``, ``u`` the control on piece ``k``, over all deviations."""
-        beside = None if k is None else stacked([balls(gain)]) * self.loop.inputs(k)
-        return self.loop.highest(self.case.piece_at(time), time, c[None], beside)[0]
-
-    @cached_property
-    def at_rest(self) -> ClosedLoop:
-        """The system without any control, under the disturbances of the problem."""
-        return self._loop(self._still, self._none)
 
     def least(self, rows: Sequence[tuple[float, Row]], priced: bool) -> arb:
         """At most what gains, and peaks or an effort that are charged, add to the sum of ``rows`` times their

@@ -30,8 +30,9 @@ from sparserob_core.checker.problem.turns import in_turns
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.execution import Execution
+from sparserob_core.checker.reach.kernels import Missed
 from sparserob_core.checker.reach.measurable import Side, Together
-from sparserob_core.checker.reach.missed import SpreadExecution, VaryingExecution
+from sparserob_core.checker.reach.missed import MissedAt, MissedOver
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.sets.known import known
@@ -117,12 +118,6 @@ class Case:
     def answering(self) -> bool:
         """Whether the control answers what it measures."""
         return self.policy is not None
-
-    @property
-    def looped(self) -> bool:
-        """Whether the state is followed block by block of what deviates: where the control answers, and under
-        measurable disturbances of a system that does not change with time."""
-        return self.answering or (self.measurable and not isinstance(self.problem.system, VaryingSystem))
 
     @property
     def charge(self) -> Cost:
@@ -282,13 +277,6 @@ class Case:
         return Flows.of(self.problem.system, self.grid[-1])
 
     @property
-    def varying(self) -> Flows:
-        """`flows` of a system that changes with time; raises `Unchecked` for another one."""
-        if self.changing is None:
-            raise Unchecked("the system does not change with time")
-        return self.changing
-
-    @property
     def changing(self) -> Flows | None:
         """`varying`; ``None`` where the system does not change with time."""
         return self.flows if isinstance(self.problem.system, VaryingSystem) else None
@@ -401,7 +389,7 @@ class Case:
         """The set of the disturbances of which every one stays the same between `changes`: of a system that changes
         with time, measurable ones are in the middle of their set, and `strayed` says how far they may be from that."""
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
-        if self.looped or not self.measurable or bound is None:
+        if self.answering or not self.measurable or bound is None:
             return bound
         parts, kinds = ((bound,), (classes,)) if isinstance(classes, str) else (self._parts(bound), classes)
         middles = [
@@ -417,12 +405,12 @@ class Case:
         return bound.parts
 
     @cached_property
-    def strayed(self) -> VaryingExecution | SpreadExecution | None:
+    def strayed(self) -> Missed | None:
         """What measurable disturbances of a system that changes with time do beside the middle of their box: a command
         of 1 through the columns of ``E`` that is missed by half the widths; of a polytope all of it at once, counted
         from its middle. ``None`` where there are none."""
         bound = self.problem.measurable
-        if bound is None or self.looped or self.changing is None:
+        if bound is None or self.answering:
             return None
         ends, system = np.array([0.0, self.grid[-1]]), self.problem.system
         first = system.controls + (system.c is not None)
@@ -437,20 +425,18 @@ class Case:
         off = np.nextafter(np.maximum(most - half, half - least), np.inf)
         return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off)
 
-    def _missing(self, *errors: Any, **more: Any) -> VaryingExecution | SpreadExecution:
+    def _missing(self, *errors: Any, **more: Any) -> Missed:
         """Errors in a system that changes with time, over all of its parameters."""
-        law = self.varying
-        if law.box.middle:
-            return SpreadExecution(law, *errors, **more)
-        return VaryingExecution(law.at(()), *errors, **more)
+        if self.flows.box.middle:
+            return MissedOver(self.flows, *errors, **more)
+        return MissedAt(self.flows.at(()), *errors, **more)
 
-    def strayed_at(self, parameter: Sequence[float]) -> VaryingExecution | None:
+    def strayed_at(self, parameter: Sequence[float]) -> Missed | None:
         """`strayed` at one parameter."""
-        found = self.strayed
-        return found.at(parameter) if isinstance(found, SpreadExecution) else found
+        return None if self.strayed is None else self.strayed.at(parameter)
 
     @cached_property
-    def execution(self) -> Execution | VaryingExecution | SpreadExecution | None:
+    def execution(self) -> Missed | None:
         """How exactly the control is delivered, ``None`` where that is as it is commanded; of no control where the
         certificate has none."""
         shares = self.problem.execution
@@ -469,10 +455,9 @@ class Case:
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][: acts.size - 1 if pieces else 0]
         return self._missing(shares, acts, pieces, numb=self.problem.commanded)
 
-    def delivered_at(self, parameter: Sequence[float]) -> Execution | VaryingExecution | None:
+    def delivered_at(self, parameter: Sequence[float]) -> Missed | None:
         """`execution` at one parameter."""
-        found = self.execution
-        return found.at(parameter) if isinstance(found, SpreadExecution) else found
+        return None if self.execution is None else self.execution.at(parameter)
 
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
         """What errors of execution add to ``c'x(t)`` at least, at a parameter: of a command of size 1 on every piece,
@@ -524,7 +509,7 @@ class Case:
         """
         if self.certificate.get("decision") is None:
             return np.zeros(len(rows))
-        if self.looped and not gains.any():
+        if self.answering and not gains.any():
             answers = import_module("sparserob_core.checker.claims.answers")  # which is about a case
             return np.asarray(answers.answers_of(self).sizes(rows))
         d = self.problem.system.states

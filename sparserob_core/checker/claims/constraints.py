@@ -385,7 +385,7 @@ def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
 
 def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
     """What makes the tube of a box of parameters; the cells ``[lower, upper]`` say how far these go."""
-    if case.looped:
+    if case.answering:
         loop_tube = LoopTube(answers_of(case).loop, basis, gains)
         return lambda _: loop_tube
     nu = case.problem.system.parameter_count
@@ -427,14 +427,14 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = RowUnits(case.problem, case.flows, scene, everything, horizon, horizon).sums
     answers, found = answers_of(case), []
-    last = answers.loop.nodes[-1].tolist() if case.looped else _unreached(case, scene)
+    last = answers.loop.nodes[-1].tolist() if case.answering else _unreached(case, scene)
     for state, value in case.equalities:
         if case.several:
             raise Unchecked("the checker knows fixed final states beside disturbances of one class")
-        rests = not case.looped and _rests(case, state)
+        rests = not case.answering and _rests(case, state)
         off, responses = (last[state][0] * 0 if rests else last[state][0]) - balls([value])[0], last[state][1:]
         high, low = off + answers.support(responses), answers.support([-x for x in responses]) - off
-        found.append((high.max(low), float(sums[state]) + (answers.added(state) if case.looped else 0.0)))
+        found.append((high.max(low), float(sums[state]) + (answers.added(state) if case.answering else 0.0)))
     return found
 
 

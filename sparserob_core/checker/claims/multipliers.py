@@ -154,9 +154,7 @@ def _undisturbed(
     if follows(case):
         row = _along_adjoint(case, c, time, limit)
     else:
-        row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.looped)
-        if case.looped and not case.answering:
-            row = replace(row, constant=answers_of(case).disturbed(c, time, limit))
+        row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.answering)
     strayed = case.strayed_at(parameter.tolist())
     if strayed is not None:
         row = replace(row, constant=row.constant + balls([strayed.added(c, time)[0]])[0])

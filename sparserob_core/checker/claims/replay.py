@@ -94,8 +94,6 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
             value = _along(direction, named, rows if piece is None else rows + answers.commands[piece].tolist())
         elif case.strayed is not None:
             value = _farthest(case, window.split(direction), time, parameter.tolist(), piece)
-        elif case.measurable:  # the worst is no signal on pieces: how far all of them reach is enclosed instead
-            value = answers.farthest(*window.split(direction), time, piece)
         else:
             state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
             state += [] if piece is None else case.pieces[piece].entries()
@@ -212,7 +210,7 @@ def _pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
 
 def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains: Array) -> Reached:
     """The states that are reached at a parameter, from the initial state ``begun (d,)`` alone where one is given."""
-    if case.looped:
+    if case.answering:
         return LoopTube(answers_of(case).loop, basis, gains)
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
     flow = case.flows.at(parameter.tolist())

@@ -11,10 +11,9 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.missed import SpreadExecution, VaryingExecution
+from sparserob_core.checker.reach.kernels import Missed
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
@@ -108,7 +107,7 @@ class Beside:
     scene: Scene
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
-    delivered: Sequence[Execution | VaryingExecution | SpreadExecution] = ()
+    delivered: Sequence[Missed] = ()
     _directions: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     def added(
@@ -137,22 +136,14 @@ class Beside:
         enclosed = Enclosed.all(terms, (len(terms), self.basis.shape[0]))
         mid = enclosed.mid @ z.T
         lost = (enclosed.rad + rounding(z.shape[1]) * np.abs(enclosed.mid)) @ np.abs(z).T
-        found = [_plus(poly, mid[:, i], float(lost[:, i].sum())) for i, poly in enumerate(found)]
+        found = [_plus(poly, mid[:, i, None], float(lost[:, i].sum())) for i, poly in enumerate(found)]
         if not self.delivered:
             return list(found)
         directions, off = self.directions(z)
+        times = [start] if start == stop else [start, stop]
         for one in self.delivered:
             rows = zip(found, directions, off, strict=True)
-            if isinstance(one, SpreadExecution):
-                if off.any():
-                    raise Unchecked("errors of execution over parameters are known along directions that are floats")
-                assert within is not None
-                found = [self._spreading(poly, one, c, start, stop, within) for poly, c, _ in rows]
-            else:
-                found = [
-                    _plus(_plus(poly, *self._erring(one, c, start, stop)), *self._beside(one, missed, start, stop))
-                    for poly, c, missed in rows
-                ]
+            found = [self._erring(poly, one, c, missed, times, within) for poly, c, missed in rows]
         return list(found)
 
     def directions(self, z: Array) -> tuple[Array, Array]:
@@ -170,60 +161,40 @@ class Beside:
             self._directions[key] = np.reshape(floats, shape), np.reshape(off, shape)
         return self._directions[key]
 
-    def _beside(
-        self, delivered: Execution | VaryingExecution, off: Array, start: float, stop: float
-    ) -> tuple[Array, float]:
-        """What errors of execution add at most along a direction that is nowhere larger than ``off (d,)``, as
-        `_erring`: it is sublinear in the direction."""
-        total = 0.0
-        for state in np.flatnonzero(off):
-            axis = np.eye(off.size)[state]
-            ends = [self._erring(delivered, c, start, stop) for c in (axis, -axis)]
-            total += off[state] * max(float(np.abs(terms).sum()) + lost for terms, lost in ends)
-        return np.zeros(1), total * OUTWARD
-
-    def _spreading(
-        self,
+    @staticmethod
+    def _erring(
         poly: Polynomial,
-        delivered: SpreadExecution,
+        one: Missed,
         c: Array,
-        start: float,
-        stop: float,
-        within: tuple[Corners, Around],
+        off: Array,
+        times: Sequence[float],
+        within: tuple[Corners, Around] | None,
     ) -> Polynomial:
-        """A polynomial with what errors of execution add to ``c'x`` on ``[start, stop]`` over a box of parameters."""
-        found = delivered.over(c, [start] if start == stop else [start, stop], *within)
-        terms, off = found.ends[:1], found.off
+        """A polynomial with what errors add at most to ``c'x`` between two ``times``, or at one, along a direction that
+        is nowhere off by more than ``off (d,)``: what they add is sublinear in it."""
+        found = one.over(c, times, within)
+        terms, lost = found.ends[:1], found.off
         if len(found.ends) > 1:
             rise = found.ends[1] - found.ends[0]
             terms = np.stack([found.ends[0], rise])
-            off += rounding(8) * float(np.abs(found.ends).sum() + np.abs(rise).sum())
-        added = _plus(poly, terms, off)
-        turning = added.turning + float(found.wide.sum())
+            lost += rounding(8) * float(np.abs(found.ends).sum() + np.abs(rise).sum())
+        for state in np.flatnonzero(off):
+            axis = np.eye(off.size)[state]
+            ends = [one.over(side, times, within) for side in (axis, -axis)]
+            lost += off[state] * max(float(np.abs(part.ends).sum(axis=1).max()) + part.off for part in ends) * OUTWARD
+        added = _plus(poly, terms, lost)
         bent = found.wide if added.bent is None else added.bent + found.wide
+        turning = added.turning + float(found.wide.sum())
         return replace(added, kinks=added.kinks + found.over, turning=turning, bent=bent)
-
-    def _erring(
-        self, delivered: Execution | VaryingExecution, c: Array, start: float, stop: float
-    ) -> tuple[Array, float]:
-        """What errors of execution add to ``c'x`` on ``[start, stop]``, ``c`` one of the basis or its opposite: the
-        terms of a polynomial, and how far it may be off."""
-        ends = [delivered.added(c, time) for time in ([start] if start == stop else [start, stop])]
-        level, off = ends[0][0] + (ends[0][1] - ends[0][0]) / 2.0, max(high - low for low, high in ends)
-        if len(ends) == 1:
-            return np.array([level]), off
-        rise = (ends[1][0] + ends[1][1] - ends[0][0] - ends[0][1]) / 2.0
-        off += delivered.bent(c, start, stop) + rounding(8) * (abs(rise) + abs(ends[0][1]) + abs(ends[1][1]))
-        return np.array([level, rise]), off
 
 
 def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
-    """A polynomial plus one with coefficients ``terms (J, M)``, or ``(J,)`` where it is one in the time alone, that are
-    off by ``lost`` together."""
+    """A polynomial plus one with coefficients ``terms (J, M)``, of the first monomials, that are off by ``lost``
+    together."""
     missing = max(0, len(terms) - poly.coefficients.shape[0])
     coefficients = np.pad(poly.coefficients, ((0, missing), (0, 0)))
-    changed = coefficients[: len(terms), : 1 if terms.ndim == 1 else None]
-    changed += terms.reshape(len(terms), -1)
+    changed = coefficients[: len(terms), : terms.shape[1]]
+    changed += terms
     lost += 2.0 * HALF_ULP * float(np.abs(changed).sum())
     return replace(poly, coefficients=coefficients, error=(poly.error + lost) * OUTWARD)
 

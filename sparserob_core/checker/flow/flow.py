@@ -182,8 +182,8 @@ class Flow:
         """`over` in floats, off by their rounding, of which units of rows are made, and no claim."""
         phases, d = self.plant.phases, self.states
         if d < COARSE or any(phase.timed for phase in phases):
-            Phi, Gamma, Delta = self.over(start, stop)
-            return middles(Phi.matrix), middles(Gamma.matrix), middles(Delta.matrix)
+            of_states, of_controls, of_disturbances = (middles(one.matrix) for one in self.over(start, stop))
+            return of_states, of_controls, of_disturbances
         found = np.hstack([np.eye(d), np.zeros((d, self.plant.inputs))])
         for number, phase in enumerate(phases):
             length = min(stop, phase.until) - max(start, phase.begin)
@@ -192,8 +192,8 @@ class Flow:
                 if key not in self._about:
                     table = phase.called(np.array([phase.begin, *self.box.middle])).astype(float)
                     self._about[key] = held_about(table[:, :d], table[:, d:], length)
-                Phi, pushed = self._about[key]
-                found = Phi @ found
+                onward, pushed = self._about[key]
+                found = onward @ found
                 found[:, d:] += pushed
         return found[:, :d], found[:, d : d + self.driven], found[:, d + self.driven :]
 

@@ -20,6 +20,7 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Clock
 from sparserob_core.checker.reach.adjoint import CENTRED, ORDER, Adjoint, Motion, subtract_times
+from sparserob_core.checker.reach.kernels import Missed
 from sparserob_core.checker.reach.measurable import signed, swept
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -46,7 +47,7 @@ class Ages:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Execution:
+class Execution(Missed):
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for."""
 

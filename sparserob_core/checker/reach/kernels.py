@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from math import comb
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -11,11 +13,52 @@ from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.reach.closed_loop import ORDER, exactly
 from sparserob_core.checker.reach.states import enclosed
+from sparserob_core.checker.reach.tube import Around
+from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb_mat
+
+
+class Added(NamedTuple):
+    """Coefficients ``ends (T, M)`` over a box of parameters of what errors add at times, by how much they are ``off``
+    at most, how far ``over`` the truth in the middle of the box, and how much of it is the width of each parameter."""
+
+    ends: Array
+    off: float
+    over: float
+    wide: Array
+
+
+class Missed(ABC):
+    """What enters at any time and is known by its size alone, in a known system: errors of execution, and measurable
+    disturbances about the middle of their set."""
+
+    @abstractmethod
+    def added(self, c: Array, time: float) -> tuple[float, float]:
+        """What the worst of it adds to ``c'x(t)``, between two numbers."""
+
+    @abstractmethod
+    def least(self, c: Array, time: float) -> Array:
+        """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
+
+    @abstractmethod
+    def bent(self, c: Array, start: float, stop: float) -> float:
+        """How far `added` may be above its chord on ``[start, stop]``, which lies within one piece and one segment."""
+
+    def at(self, parameter: Sequence[float]) -> Missed:
+        """That at one parameter."""
+        return self
+
+    def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
+        """What the worst adds to ``c'x`` at one or two ``times``, between which there is no mark, ``within`` a box of
+        parameters with the monomials on it."""
+        ends = np.array([self.added(c, time) for time in times])
+        off = float((ends[:, 1] - ends[:, 0]).max())
+        bent = self.bent(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
+        return Added(ends.mean(axis=1)[:, None], (off + bent) * OUTWARD, 0.0, np.zeros(0))
 
 
 def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:

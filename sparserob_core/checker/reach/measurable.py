@@ -9,7 +9,7 @@ is best there stands for all, and where another one could be better, by how much
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, final
@@ -24,8 +24,6 @@ from sparserob_core.checker.sets.along import Curve
 from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product, rounding
-from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -237,17 +235,6 @@ class MeasurableLoop(ClosedLoop):
 
     _ways: dict[tuple[object, ...], Kernel] = field(default_factory=dict, repr=False)
 
-    @staticmethod
-    def alone(
-        problem: OptimalControlProblem, grid: list[float], breakpoints: list[float], pieces: int
-    ) -> MeasurableLoop:
-        """What the measurable disturbances of a problem do from 0 on, without a control and whatever else acts."""
-        system, m = _undriven(problem.system), problem.system.controls
-        still = [stacked([[balls([0.0])[0]]] * m)] * pieces
-        none, rest = np.zeros((pieces, pieces, m, system.states)), [0.0] * system.states
-        bound, none_acts = problem.measurable, (0.0,) * m
-        return MeasurableLoop(system, rest, still, none, grid, breakpoints, [], bound, None, none_acts)
-
     @property
     def blocks(self) -> int:
         return len(self.grid) - 1
@@ -405,36 +392,6 @@ class MeasurableLoop(ClosedLoop):
 def as_enclosed(rows: Array | arb_mat) -> Enclosed:
     """Rows of floats, or of balls."""
     return Enclosed(rows, np.zeros_like(rows)) if isinstance(rows, np.ndarray) else Enclosed.of(rows)
-
-
-def _undriven(system: System) -> System:
-    """The system without what is known to act on it."""
-    if isinstance(system, SwitchedSystem):
-        return SwitchedSystem([(until, replace(one, c=None)) for until, one in system.pieces], system.delay)
-    assert isinstance(system, LinearSystem)  # of one that changes with time measurable disturbances are refused
-    return replace(system, c=None)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class LoopBeside(ClosedLoop):
-    """`ClosedLoop` of disturbances that are constant on pieces, and ``beside`` them others that are measurable: what
-    both do adds up, and so do the largest values and what chords may miss."""
-
-    beside: MeasurableLoop | None = None
-
-    @property
-    def _other(self) -> MeasurableLoop:
-        assert self.beside is not None
-        return self.beside
-
-    def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
-        both = super().highest(piece, time, rows, beside), self._other.highest(piece, time, rows)
-        return [one + other for one, other in zip(*both, strict=True)]
-
-    def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
-        both = super().bent(piece, start, stop, rows), self._other.bent(piece, start, stop, rows)
-        return np.asarray((both[0] + both[1]) * OUTWARD)
 
 
 def signed(P: Array, off: Array) -> tuple[Array, Array]:

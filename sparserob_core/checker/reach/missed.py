@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from itertools import product as every_choice
-from typing import TYPE_CHECKING, NamedTuple, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.flows import Flows
 from sparserob_core.checker.flow.law import Box
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.kernels import above_chord, pushes
+from sparserob_core.checker.reach.kernels import Added, Missed, above_chord, pushes
 from sparserob_core.checker.reach.measurable import Side, Together, signed, swept
 from sparserob_core.checker.reach.states import enclosed, ring
 from sparserob_core.checker.reach.tube import Around
@@ -41,7 +41,7 @@ MEANS = 1.0 / np.arange(1.0, 257.0)  # of |u|^p from -1 to 1
 
 @final
 @dataclass(eq=False)
-class VaryingExecution:
+class MissedAt(Missed):
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for. It enters through the columns of ``[B E]`` from the ``first`` one on; the
     errors are known but for ``off (m,)``, and do not reach the ``numb`` states, which add up what is commanded.
@@ -91,19 +91,19 @@ class VaryingExecution:
         return self.side.far
 
     def least(self, c: Array, time: float) -> Array:
-        """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
+        """`Missed.least`."""
         found = np.zeros((self.breakpoints.size - 1, self.shares.size))
         low, _, which = self._integrals(c[None], time, np.arange(len(self.marks) - 1))
         np.add.at(found, self.owner[which], np.maximum(low[:, 0], 0.0))
         return found * self.shares * (1.0 - rounding(which.size))
 
     def added(self, c: Array, time: float) -> tuple[float, float]:
-        """What the worst errors add to ``c'x(t)``, between two numbers."""
+        """`Missed.added`."""
         low, high = self._summed(c[None], time)
         return float(low[0]), float(high[0])
 
     def bent(self, c: Array, start: float, stop: float) -> float:
-        """How far `added` may be above its chord on ``[start, stop]``, which lies within one piece and one segment."""
+        """`Missed.bent`."""
         d = c.size
         begun = self._summed(np.eye(d), start)[1]
         if self.side is not None:
@@ -205,8 +205,8 @@ class VaryingExecution:
 
 @final
 @dataclass(eq=False)
-class SpreadExecution:
-    """`VaryingExecution` of a control, or of disturbances, in a system with parameters that its state is no affine
+class MissedOver(Missed):
+    """`MissedAt` of a control, or of disturbances, in a system with parameters that its state is no affine
     function of.
 
     At one parameter it is that of the known system there. Over a box: of one parameter alone a function ``f`` is
@@ -225,23 +225,36 @@ class SpreadExecution:
     off: Array | None = None
     numb: Sequence[int] = ()
     side: Side | Curve | Together | None = None
-    _at: dict[tuple[float, ...], VaryingExecution] = field(default_factory=dict, repr=False)
+    _at: dict[tuple[float, ...], MissedAt] = field(default_factory=dict, repr=False)
     _kernels: dict[tuple[Flow, float, float], Enclosed] = field(default_factory=dict, repr=False)
     _known: dict[tuple[Flow, float], tuple[Enclosed, Enclosed, np.ndarray]] = field(default_factory=dict, repr=False)
 
-    def at(self, parameter: Sequence[float]) -> VaryingExecution:
+    def at(self, parameter: Sequence[float]) -> MissedAt:
         """That at one parameter."""
         point = tuple(map(float, parameter))
         if point not in self._at:
             if len(self._at) >= PLACES_KEPT:
                 self._at.clear()
             law, enters = self.flows.at(point), (self.first, self.off, self.numb, self.side)
-            self._at[point] = VaryingExecution(law, self.shares, self.breakpoints, self.pieces, *enters)
+            self._at[point] = MissedAt(law, self.shares, self.breakpoints, self.pieces, *enters)
         return self._at[point]
 
-    def over(self, c: Array, times: Sequence[float], box: Corners, flow: Around) -> Spreading:
-        """What the worst errors add to ``c'x`` at one or two ``times``, between which there is no mark, over a ``box``
-        of parameters; ``flow`` has the monomials on it."""
+    def added(self, c: Array, time: float) -> tuple[float, float]:
+        """`Missed.added` in the middle of the parameters."""
+        return self.at(self.flows.box.middle).added(c, time)
+
+    def least(self, c: Array, time: float) -> Array:
+        """`Missed.least` in the middle of the parameters."""
+        return self.at(self.flows.box.middle).least(c, time)
+
+    def bent(self, c: Array, start: float, stop: float) -> float:
+        """`Missed.bent` in the middle of the parameters."""
+        return self.at(self.flows.box.middle).bent(c, start, stop)
+
+    def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
+        """`Missed.over`."""
+        assert within is not None
+        box, flow = within
         low, high, centre, radius = map(np.array, (*box, flow.centre, flow.radius))
         signs = np.array(list(every_choice((-1.0, 1.0), repeat=low.size)))
         corners = np.where(signs > 0.0, high, low).tolist()
@@ -262,7 +275,7 @@ class SpreadExecution:
         least = np.array([self.at(centre.tolist()).added(c, time)[0] for time in times])
         over = max(0.0, float((middle.mean(axis=0) - least).max()))
         total = float(wide.sum()) * OUTWARD
-        return Spreading(ends, (off + rest + total + 2.0 * lost + bent) * OUTWARD, over * OUTWARD, wide)
+        return Added(ends, (off + rest + total + 2.0 * lost + bent) * OUTWARD, over * OUTWARD, wide)
 
     def _curved(self, c: Array, times: Sequence[float], box: Box) -> tuple[Array, float, float]:
         """How far integrals may be above what is linear between the corners of a box, by each parameter, but for what
@@ -334,16 +347,6 @@ class SpreadExecution:
         """How large what enters by every column may be on every piece, ``(K, m)``, at most."""
         known = self.at(self.flows.box.middle)
         return (known.sizes.mid + known.sizes.rad) * known.far * OUTWARD
-
-
-class Spreading(NamedTuple):
-    """Coefficients ``ends (T, M)`` over a box of parameters of what errors add at times, by how much they are ``off``
-    at most, how far ``over`` the truth in the middle of the box, and how much of it is the width of each parameter."""
-
-    ends: Array
-    off: float
-    over: float
-    wide: Array
 
 
 def _carried(rows: Enclosed, steps: Enclosed) -> Enclosed:

@@ -324,8 +324,6 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     from sparserob_core.checker.claims.case import numbers
     from sparserob_core.checker.claims.replay import exceeded
 
-    if case.looped and not case.answering and case.problem.initial_set is not None:
-        raise Unchecked("the worst initial state is followed with disturbances that change at breakpoints only")
     found = [("", *exceeded(case, said))]
     if case.problem.initial_set is not None and not case.answering:
         begun = numbers(_whole(case, said.get("initial_state")), "initial_state")

@@ -292,21 +292,6 @@ def test_a_witness_is_driven_by_its_own_disturbance():
         replay.witnessed(judged, {**data, "disturbance": None})
 
 
-def test_without_control_the_disturbance_adds_up_and_with_it_the_state_and_control_are_seen_together():
-    judged = case_of()
-    assert float(answers_of(judged).disturbed(np.ones(1), 2.0, balls([0.25])[0]).mid()) == pytest.approx(
-        0.5 + 0.5 - 0.25
-    )
-    assert float(answers_of(judged).farthest(np.ones(1), np.zeros(1), 2.0, None).mid()) == pytest.approx(0.975)
-    assert float(answers_of(judged).farthest(np.ones(1), np.zeros(1), 0.5, None).mid()) == pytest.approx(0.65 + 0.125)
-    assert float(answers_of(judged).disturbed(np.ones(1), 0.5, balls([0.25])[0]).mid()) == pytest.approx(
-        0.5 + 0.125 - 0.25
-    )
-    # x(2) + u_1 = 0.4 + w_1
-    assert float(answers_of(judged).farthest(np.ones(1), np.ones(1), 2.0, 1).mid()) == pytest.approx(0.65)
-    assert float(answers_of(judged).farthest(np.ones(1), -np.ones(1), 2.0, 1).mid()) == pytest.approx(0.8 + 0.25 + 0.25)
-
-
 def test_fixed_states_are_met_where_every_deviation_is_answered():
     """``x(2) = 0.6 + (1 + 2 g) delta`` with the gain ``g`` on both pieces: 0.6 for ``g = -1/2`` only."""
     plant = LinearSystem(np.zeros((1, 1)), np.ones((1, 1)))
@@ -456,7 +441,6 @@ def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
     free = replace(judged, problem=replace(judged.problem, system=delayed, disturbance_class="measurable"))
     with pytest.raises(Unchecked, match="undelayed"):
         Answers(free).loop  # noqa: B018
-    assert Answers(replace(free, policy=None)).loop.system.delay == 0.5
     one = LinearSystem(lambda p: p[0] * np.ones((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)), parameters=box(0.1))
     with pytest.raises(Unchecked, match="known systems only"):
         Answers(replace(judged, problem=replace(judged.problem, system=one))).loop  # noqa: B018

@@ -11,22 +11,27 @@ import pytest
 from flint import ctx
 
 from sparserob_core.checker.claims.window import Beside, Window
+from sparserob_core.checker.reach.kernels import Missed
 from sparserob_core.checker.reach.loop_tube import LoopTube
-from sparserob_core.checker.reach.measurable import MeasurableLoop, as_enclosed
+from sparserob_core.checker.reach.measurable import as_enclosed
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid
+from tests.support.undriven import undriven
 
 FAR = np.array([2.0, 0.5, 3.0])
 
 
-class Erring:
+class Erring(Missed):
     """What is added is ``FAR'|c|`` and as much again by a time of 1, and a little more for ``c`` below 0."""
 
     def added(self, c: np.ndarray, time: float) -> tuple[float, float]:
         size = float(FAR @ (np.abs(c) + 0.1 * np.maximum(-c, 0.0))) * (1.0 + time)
         return size, size
+
+    def least(self, c: np.ndarray, time: float) -> np.ndarray:
+        raise NotImplementedError
 
     def bent(self, c: np.ndarray, start: float, stop: float) -> float:
         return 0.01 * float(FAR @ np.abs(c))
@@ -89,7 +94,7 @@ def test_a_loop_under_measurable_disturbances_is_seen_along_balls_as_along_float
         terminal=[Box([-1.0, -1.0], [1.0, 1.0])], disturbance=Box([-0.1, -0.2], [0.1, 0.3]),
         disturbance_class="measurable",
     )  # fmt: skip
-    loop = MeasurableLoop.alone(problem, [0.0, 1.0, 2.0], [0.0, 1.0, 2.0], 2)
+    loop = undriven(problem, [0.0, 1.0, 2.0])
     z, axes, normals = np.array([[0.5, 0.25], [-0.75, 0.5]]), np.eye(2), np.array([[1.0, 0.5], [-0.25, 1.0]])
     summed, alone = (LoopTube(loop, basis, np.zeros((2, 0))) for basis in (normals, z @ normals))
     for piece, start, stop in ((0, 0.0, 0.0), (0, 0.2, 0.5), (1, 1.3, 1.7), (1, 2.0, 2.0)):

@@ -13,11 +13,11 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.claims import cells, claims, constraints, multipliers, replay, units
-from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Duality, Row
 from sparserob_core.checker.flow.flows import Flows
 from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.sets.sets import Box
@@ -72,8 +72,9 @@ def test_a_row_along_its_adjoint_is_the_one_that_exponentials_give(name: str, mo
         for one in cases:
             row, limit = DIRECTIONS[2], arb(0.375)
             found = multipliers._along_adjoint(one, row, time, limit)
-            exact = one.duality.row(row, time, [], limit, disturbed=not one.looped)
-            constant = answers_of(one).disturbed(row, time, limit) if one.measurable else exact.constant
+            exact = one.duality.row(row, time, [], limit)
+            strayed = one.strayed
+            constant = exact.constant if strayed is None else exact.constant + arb(strayed.added(row, time)[1])
             pairs = [(found.constant, constant)]
             pairs += [
                 (a, b)
@@ -378,7 +379,9 @@ def test_what_errors_of_execution_add_beside_a_row_is_near_its_chord() -> None:
     beside = case.beside(case.windows[0], c[None], np.zeros((1, 2)))
     assert beside is not None and case.execution is not None
     for a, b in ((0.125, 0.1875), (0.25, 0.5), (0.75, 1.0), (1.5, 2.0), (1.25, 1.25)):
-        terms, off = beside._erring(case.execution, c, a, b)
+        none, times = Polynomial(np.zeros((1, 1)), 0.0, 0.0, 0.0), [a] if a == b else [a, b]
+        found = beside._erring(none, case.execution, c, np.zeros(2), times, None)
+        terms, off = found.coefficients[:, 0], found.error
         truth = []
         for share in (0.0, 0.25, 0.5, 0.75, 1.0):
             at = fine.weights(c[None], a + share * (b - a)).control

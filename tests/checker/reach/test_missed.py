@@ -22,7 +22,7 @@ from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.execution import Execution
 from sparserob_core.checker.reach.measurable import Side
-from sparserob_core.checker.reach.missed import VaryingExecution
+from sparserob_core.checker.reach.missed import MissedAt
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
 
@@ -36,9 +36,9 @@ WILD = VaryingSystem.of([["-t", 2], [-1, "t"]], [["t^2", 0], ["cos(9*t)", 1]], 3
 C = np.array([1.0, -0.4])
 
 
-def made(system: VaryingSystem, control: Array = CONTROL) -> VaryingExecution:
+def made(system: VaryingSystem, control: Array = CONTROL) -> MissedAt:
     pieces = [stacked([[arb(float(v))] for v in u]) for u in control.T]
-    return VaryingExecution(Flow(Plant.of(system, 3.0), 3.0), SHARES, POINTS, pieces)
+    return MissedAt(Flow(Plant.of(system, 3.0), 3.0), SHARES, POINTS, pieces)
 
 
 def test_a_constant_that_is_dressed_is_the_constant() -> None:
@@ -85,7 +85,7 @@ def test_what_is_large_is_not_enclosed_more_coarsely_than_rounding_does(side: sr
         found = made(ROCKET)
         if side is not None:
             (form,), one = Side.of(side), [stacked([[arb(1)]])] * 6
-            found = VaryingExecution(Flow(Plant.of(ROCKET, 3.0), 3.0), np.ones(1), POINTS, one, side=form)
+            found = MissedAt(Flow(Plant.of(ROCKET, 3.0), 3.0), np.ones(1), POINTS, one, side=form)
         low, high = found.added(np.array([1.0, 0.0]), 3.0)
     assert 0.0 < high - low <= 3e-13 * high
 
@@ -170,18 +170,18 @@ def test_bounds_allow_for_what_is_rounded_and_for_the_size_of_the_control() -> N
         low, high = found.added(C, 2.9)
         assert high - low >= 1e-15 * high
         ball = arb(0.5, 1e-3)
-        wide = VaryingExecution(found.law, SHARES, POINTS, [stacked([[ball], [arb(0)]])] * 6)
+        wide = MissedAt(found.law, SHARES, POINTS, [stacked([[ball], [arb(0)]])] * 6)
         fixed = made(ROCKET, np.tile([[0.501], [0.0]], (1, 6)))
         thin = made(ROCKET, np.tile([[0.499], [0.0]], (1, 6)))
         assert wide.added(C, 2.9)[1] >= fixed.added(C, 2.9)[0]
         assert wide.added(C, 2.9)[0] <= thin.added(C, 2.9)[1]
 
 
-def entering(system: VaryingSystem, off: float = 0.0) -> VaryingExecution:
+def entering(system: VaryingSystem, off: float = 0.0) -> MissedAt:
     """A command of 1 through ``E`` that is missed by 0.25."""
     one, ends = [stacked([[arb(1)]])], np.array([0.0, 3.0])
     lost = np.array([off])
-    return VaryingExecution(Flow(Plant.of(system, 3.0), 3.0), np.array([0.25]), ends, one, system.controls, lost)
+    return MissedAt(Flow(Plant.of(system, 3.0), 3.0), np.array([0.25]), ends, one, system.controls, lost)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.7, 3.0])
@@ -215,10 +215,10 @@ def test_sizes_are_those_of_absolute_values_and_what_shares_are_off_by_counts_fo
     law = Flow(Plant.of(VaryingSystem.of([["0*t"]], [["1", "1"]], 2.0), 2.0), 2.0)
     pieces = [arb_mat([[arb(-1.5, 1e-3)], [arb(0.5, 1e-3)]]), arb_mat([[arb(2.0, 1e-3)], [arb(-4.0, 1e-3)]])]
     shares, off = np.array([0.1, 0.25]), np.array([1e-4, 1e-5])
-    found = VaryingExecution(law, shares, np.array([0.0, 1.0, 2.0]), pieces, off=off).sizes
+    found = MissedAt(law, shares, np.array([0.0, 1.0, 2.0]), pieces, off=off).sizes
     values = np.array([[1.5, 0.5], [2.0, 4.0]])
     assert found.mid == pytest.approx(shares * values, rel=1e-14)
     exact = shares * 1e-3 + off * (values + 1e-3)
     assert (exact <= found.rad).all() and found.rad == pytest.approx(exact, rel=1e-8)
-    plain = VaryingExecution(law, shares, np.array([0.0, 1.0, 2.0]), pieces).sizes
+    plain = MissedAt(law, shares, np.array([0.0, 1.0, 2.0]), pieces).sizes
     assert plain.rad == pytest.approx(np.broadcast_to(shares * 1e-3, (2, 2)), rel=1e-8)

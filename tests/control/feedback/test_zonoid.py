@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from flint import arb, ctx
+from flint import ctx
 from scipy.linalg import expm
 
-from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.flow.units import OwnUnits
-from sparserob_core.checker.reach.measurable import Kernel, Side
+import sparserob_core as sr
+from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.feedback.zonoid import Arc, Pushes, Zonoid, _apart, _shares
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from tests.support.undriven import undriven
 
 DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]])
 SPRING = np.array([[0.0, 1.0], [-2.0, -0.5]])
@@ -166,8 +166,12 @@ def test_the_support_function_is_that_of_the_checker_to_all_digits(name: str) ->
     found = Zonoid.of(Pushes.of(A, E, length), bound)
     a = np.random.default_rng(4).normal(size=(40, found.dimension))
     with ctx.workprec(96):
-        balls = [stacked([[arb(float(v)) for v in row] for row in matrix]) for matrix in (A, E)]
-        kernel = Kernel.of(*balls, arb(length), OwnUnits.of(balls[0], length, np.abs(E).sum(axis=1)))
+        system = sr.LinearSystem(A, np.zeros((len(A), 1)), E)
+        problem = sr.OptimalControlProblem(
+            system=system, horizon=length, initial_state=np.zeros(len(A)), control=Box([0.0], [0.0]),
+            disturbance=bound, disturbance_class="measurable",
+        )  # fmt: skip
+        kernel = undriven(problem, [0.0, length]).kernel(0)
         rows = a @ found.into
         truth = kernel.most(Enclosed(rows, np.zeros_like(rows)), Side.of(bound))
     sizes = np.abs(found.support(a)).max()
