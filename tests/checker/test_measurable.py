@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.checker.claims import claims
 from sparserob_core.control.transcription.provable import remark
 from tests.checker.test_check import DECAY, SPRING, on
 from tests.control.sets.test_sets import ByItsSupport
@@ -99,3 +100,14 @@ def test_of_a_set_that_only_tells_its_support_function_a_run_says_what_is_estima
     assert ["estimated" in remark(problem) for problem in problems] == [True, False]
     costs = [sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4}).cost for problem in problems]
     assert costs[0] == pytest.approx(costs[1], rel=1e-7)
+
+
+def test_a_lower_bound_above_the_cost_of_what_keeps_everything_is_a_contradiction(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two proofs of one run cannot say that; where a derivation is wrong, the check says so."""
+    place, derive = run("box", tmp_path), claims.multiplied
+    monkeypatch.setattr(claims, "multiplied", lambda case, priced: derive(case, priced) * (1 + 1e-3 * priced))
+    found = {claim.name: claim for claim in sr.check(place).claims}
+    assert found["lower bound"].verdict == "holds" and found["status"].verdict == "fails"
+    assert "yet one that keeps every constraint costs" in found["status"].text

@@ -122,7 +122,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "fixed states under two classes": (
         lambda: constraints.missed(test_lists.case_of("of two classes", terminal=[Equality([0.0, None])])),
         Unchecked,
-        "fixed final states beside disturbances of one class",
+        "the uncertainty may reach x1",
     ),
     "times that have no middle": (
         lambda: cells._halves((0, 1.0, JUST_ABOVE_1)),

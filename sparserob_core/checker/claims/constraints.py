@@ -429,8 +429,6 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     answers, found = answers_of(case), []
     last = answers.loop.nodes[-1].tolist() if case.answering else _unreached(case, scene)
     for state, value in case.equalities:
-        if case.several:
-            raise Unchecked("the checker knows fixed final states beside disturbances of one class")
         rests = not case.answering and _rests(case, state)
         off, responses = (last[state][0] * 0 if rests else last[state][0]) - balls([value])[0], last[state][1:]
         high, low = off + answers.support(responses), answers.support([-x for x in responses]) - off

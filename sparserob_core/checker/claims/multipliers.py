@@ -155,9 +155,9 @@ def _undisturbed(
         row = _along_adjoint(case, c, time, limit)
     else:
         row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.answering)
-    strayed = case.strayed_at(parameter.tolist())
-    if strayed is not None:
-        row = replace(row, constant=row.constant + balls([strayed.added(c, time)[0]])[0])
+        strayed = case.strayed_at(parameter.tolist())
+        if strayed is not None:
+            row = replace(row, constant=row.constant + balls([strayed.added(c, time)[0]])[0])
     sizes, given = case.erring(c, time, parameter.tolist())
     row = replace(row, constant=row.constant + given, sizes=sizes)
     if window is not None and window.is_mixed:

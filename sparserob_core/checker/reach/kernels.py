@@ -58,7 +58,7 @@ class Missed(ABC):
         ends = np.array([self.added(c, time) for time in times])
         off = float((ends[:, 1] - ends[:, 0]).max())
         bent = self.bent(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
-        return Added(ends.mean(axis=1)[:, None], (off + bent) * OUTWARD, 0.0, np.zeros(0))
+        return Added(ends.mean(axis=1)[:, None], off + bent, 0.0, np.zeros(0))
 
 
 def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:

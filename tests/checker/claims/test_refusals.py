@@ -65,7 +65,6 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         Unchecked,
         "outputs beside disturbances that are constant on pieces only",
     ),
-    "no flow in time": (lambda: case_of().varying, Unchecked, "does not change with time"),
     "a decision of another shape": (lambda: case_of(decision=((0.5,),)).theta, Broken, r"shape \(1, 1\), expected \(1"),
     "numbers for one": (lambda: number({"time": [1.0, 2.0]}, "time"), Broken, "time: expected a number"),
     "no number at all": (lambda: number({}, "time"), Broken, "time: expected numbers"),
