@@ -538,8 +538,7 @@ class Case:
 
     @cached_property
     def price(self) -> Price:
-        changing = None if self.changing is None else self.changing.at(self.nominal_parameter)
-        return Price(self.problem, self.control, self.clock, changing)
+        return Price(self.problem, self.control, self.flows.at(self.nominal_parameter), self.clock)
 
     @cached_property
     def running(self) -> Running | None:

@@ -1,5 +1,5 @@
-"""The integrals of a quadratic cost along the nominal trajectory, and their slopes, in balls: by exponentials of the
-flow (Van Loan 1978), none of it shared with what solves."""
+"""The integrals of a quadratic cost along the nominal trajectory, and their slopes, in balls: of the polynomials that
+the flow is, none of it shared with what solves."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import around, norm, stacked
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.still import modes_at
-from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.control.problem.cost import Quadratic, nominal_point
+from sparserob_core.checker.arithmetic.balls import balls, rational
+from sparserob_core.checker.arithmetic.series import around, identity, stacked, zeros
+from sparserob_core.checker.flow.flow import Flow, Part
+from sparserob_core.checker.flow.segment import Segment
+from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-EVERY = 1000  # terms of a series, more than there are
+KEPT = 8  # tables of segments, each of which is as large as a hundred matrices
 
 
 @final
@@ -39,26 +39,20 @@ class Walk:
     terms: float
 
 
-def walked(
-    problem: OptimalControlProblem, control: Dictionary, pieces: Sequence[arb_mat], changing: Changing | None
-) -> Walk:
+def walked(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> Walk:
     """``z = (x, 1, u)`` along the nominal trajectory, and back with the costates of what it costs; a control acts on
     the state as late as the system says, and costs when it is given."""
     from flint import arb, arb_mat
 
-    modes, d, m = Nominal.of(problem), problem.system.states, problem.system.controls
-    still = stacked([[arb(0)] for _ in range(m)])
-    x, walked = modes[0].start, []
-    for start, stop, k, leg in _acting(problem, control):
-        if changing is None:
-            flow, weight = modes[leg].over(stop - start, acting=k >= 0)
-        else:
-            flow, weight = changing.over(float(start), float(stop), modes[0].M, k >= 0)
-        z = arb_mat(x.tolist() + (still if k < 0 else pieces[k]).tolist())
+    problem, x, walked = nominal.problem, nominal.begin, []
+    d, m = problem.system.states, problem.system.controls
+    for start, stop, k in _acting(problem, control):
+        flow, weight = nominal.step(start, stop), nominal.weight(start, stop)
+        z = arb_mat(x.tolist() + (nominal.before if k < 0 else pieces[k]).tolist())
         walked.append((k, flow, weight, z))
         x = arb_mat((flow * z).tolist()[: d + 1])
-    costate = modes[0].final * x
-    value, terms = (x.transpose() * costate)[0, 0], _terms(x, modes[0].final)
+    costate = nominal.final * x
+    value, terms = (x.transpose() * costate)[0, 0], _terms(x, nominal.final)
     slope: list[list[arb]] = [[arb(0)] * m for _ in pieces]
     for k, flow, weight, z in reversed(walked):
         own = weight * z
@@ -70,10 +64,10 @@ def walked(
     R = problem.cost.terms[1]
     if R is not None:
         matrix, ends = stacked([balls(row) for row in R.Q]), [Fraction(float(t)) for t in control.breakpoints]
-        for k, (start, stop) in enumerate(pairwise(ends)):
-            push = matrix * pieces[k] * ball_of(stop - start)
+        for k, (begin, end) in enumerate(pairwise(ends)):
+            push = matrix * pieces[k] * rational(end - begin)
             value = value + (pieces[k].transpose() * push)[0, 0]
-            terms += _terms(pieces[k], matrix) * float(stop - start)
+            terms += _terms(pieces[k], matrix) * float(end - begin)
             slope[k] = [g + 2 * entry for g, entry in zip(slope[k], push.entries(), strict=True)]
     sizes = [abs(float(value.mid())), *(abs(float(g.mid())) for entry in slope for g in entry)]
     radii = [float(value.rad()), *(float(g.rad()) for entry in slope for g in entry)]
@@ -82,26 +76,19 @@ def walked(
     return Walk(value, slope, blurred, terms)
 
 
-def nominal_states(
-    problem: OptimalControlProblem, control: Dictionary, pieces: Sequence[arb_mat], changing: Changing | None
-) -> list[arb_mat]:
-    """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and with ``u = 0`` at the end.
+def nominal_states(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
+    """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and at the end.
 
-    Every uncertainty is at its nominal point.
+    Every uncertainty is at its nominal point; ``u = 0`` before the first piece acts, and at the end.
     """
-    from flint import arb, arb_mat
+    from flint import arb_mat
 
-    modes, d, m = Nominal.of(problem), problem.system.states, problem.system.controls
-    still = stacked([[arb(0)] for _ in range(m)])
-    x, seen = modes[0].start, []
-    for start, stop, k, leg in _acting(problem, control):
-        if changing is None:
-            flow = modes[leg].over(stop - start, acting=k >= 0)[0]
-        else:
-            flow = changing.step(float(start), float(stop), k >= 0)
-        seen.append(arb_mat(x.tolist() + (still if k < 0 else pieces[k]).tolist()))
-        x = arb_mat((flow * seen[-1]).tolist()[: d + 1])
-    return [*seen, arb_mat(x.tolist() + still.tolist())]
+    x, still, seen = nominal.begin.tolist(), (nominal.before * 0).tolist(), []
+    for start, stop, k in _acting(nominal.problem, control):
+        u = nominal.before if k < 0 else pieces[k]
+        seen.append(arb_mat(x + (still if k < 0 else u.tolist())))
+        x = (nominal.step(start, stop) * arb_mat(x + u.tolist())).tolist()[: len(x)]
+    return [*seen, arb_mat(x + still)]
 
 
 def _terms(z: arb_mat, M: arb_mat) -> float:
@@ -111,182 +98,125 @@ def _terms(z: arb_mat, M: arb_mat) -> float:
     return float(size @ weight @ size)
 
 
-def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[Fraction, Fraction, int, int]]:
-    """The intervals of time on which one piece of the control acts on one of the systems that take turns, with their
-    numbers; -1 before the first piece acts."""
+def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[float, float, int]]:
+    """The intervals of time on which one piece of the control acts on one of the systems that take turns, with its
+    number; -1 before the first piece acts."""
     delay, horizon = problem.system.delay, float(control.breakpoints[-1])
     begins = [(float(t) + delay, k) for k, t in enumerate(control.breakpoints[:-1]) if float(t) + delay < horizon]
     begins = begins if delay == 0.0 else [(0.0, -1), *begins]
-    times, switches = [t for t, _ in begins], problem.system.switches
-    points = sorted({*times, *switches, horizon})
-    return [
-        (Fraction(start), Fraction(stop), begins[bisect_right(times, start) - 1][1], bisect_right(switches, start))
-        for start, stop in pairwise(points)
-    ]
+    times = [t for t, _ in begins]
+    points = sorted({*times, *problem.system.switches, horizon})
+    return [(start, stop, begins[bisect_right(times, start) - 1][1]) for start, stop in pairwise(points)]
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """``z' = F z`` for ``z = (x, 1, u)``, with every uncertainty at its nominal point; ``waiting``: the same while the
-    control before time 0 still acts. The cost ``z'M z`` per time, ``start = (x(0), 1)``, and the final cost of
-    ``(x, 1)``."""
-
-    F: arb_mat
-    waiting: arb_mat
-    M: arb_mat
-    start: arb_mat
-    final: arb_mat
-    _known: dict[tuple[Fraction, bool], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
-
-    @staticmethod
-    def of(problem: OptimalControlProblem) -> list[Nominal]:
-        """Those of the systems that take turns."""
-        parameters = problem.system.parameters
-        point = () if parameters is None else tuple(map(float, nominal_point(parameters)))
-        return [Nominal._of(problem, mode) for mode in modes_at(problem.system, point)]
-
-    @staticmethod
-    def _of(problem: OptimalControlProblem, parts: dict[str, arb_mat]) -> Nominal:
-        from flint import arb
-
-        d, m, zero = problem.system.states, problem.system.controls, arb(0)
-        A, B, E = (parts[name].tolist() for name in ("A", "B", "E"))
-        w = [] if problem.disturbance is None else balls(nominal_point(problem.disturbance))
-        pushed = [sum((e * v for e, v in zip(row, w, strict=True)), zero) if w else zero for row in E]
-        drift = [sum(row[m:], push) for row, push in zip(B, pushed, strict=True)]  # further inputs are 1
-        early = [0.0] * m if problem.initial_control is None else np.asarray(problem.initial_control).tolist()
-        waiting = [
-            sum((b * u for b, u in zip(row[:m], balls(early), strict=True)), c) for row, c in zip(B, drift, strict=True)
-        ]
-        below = [[zero] * (d + 1 + m) for _ in range(1 + m)]
-        M = [[zero] * (d + 1 + m) for _ in range(d + 1 + m)]
-        for i, row in enumerate(_deviation(problem.cost.terms[0], d)):
-            M[i][: d + 1] = row
-        begin = balls(np.asarray(problem.initial_state))
-        if problem.initial_set is not None:
-            begin = [x + e for x, e in zip(begin, balls(nominal_point(problem.initial_set)), strict=True)]
-        start = [[x] for x in (*begin, arb(1))]
-        return Nominal(
-            stacked([[*A[i], drift[i], *B[i][:m]] for i in range(d)] + below),
-            stacked([[*A[i], waiting[i], *[zero] * m] for i in range(d)] + below),
-            stacked(M),
-            stacked(start),
-            stacked(_deviation(problem.cost.terms[2], d)),
-        )
-
-    def over(self, length: Fraction, acting: bool) -> tuple[arb_mat, arb_mat]:
-        """What a time does to ``z``, and what it costs."""
-        if (length, acting) not in self._known:
-            self._known[length, acting] = integrated(self.F if acting else self.waiting, self.M, length)
-        return self._known[length, acting]
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Changing:
-    """`Nominal` of a system that changes with time, of which ``law`` is the flow."""
+    """The motion of ``z = (x, 1, u)`` with every uncertainty at its nominal point, of which ``flow`` is the flow there,
+    and the cost of the states. A control stays the same; before the first piece acts it is ``before (m, 1)``."""
 
     problem: OptimalControlProblem
-    law: Flow
-    _known: dict[tuple[float, float], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+    flow: Flow
+    _steps: dict[tuple[object, ...], arb_mat] = field(default_factory=dict, repr=False)
+    _weights: dict[tuple[object, ...], arb_mat] = field(default_factory=dict, repr=False)
+    _tables: dict[Segment, tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
 
-    def step(self, start: float, stop: float, acting: bool) -> arb_mat:
-        """What the time from ``start`` to ``stop`` does to ``z``."""
-        Phi, Gamma, Delta = self.law.over(start, stop)
-        return self._of(Phi.beside(Gamma).beside(Delta).matrix, True, acting)
+    @cached_property
+    def begin(self) -> arb_mat:
+        """``(x, 1)`` at time 0."""
+        x, deviations = balls(np.asarray(self.problem.initial_state)), self.problem.initial_set
+        if deviations is not None:
+            x = [a + b for a, b in zip(x, balls(nominal_point(deviations)), strict=True)]
+        return stacked([[a] for a in [*x, *balls([1.0])]])
 
-    def over(self, start: float, stop: float, M: arb_mat, acting: bool) -> tuple[arb_mat, arb_mat]:
-        """What the time from ``start`` to ``stop`` does to ``z``, and what it costs, segment by segment of the law;
-        ``acting``: a control of the decision acts, not the one before time 0."""
-        if (start, stop) not in self._known:
-            parts = [self._within(*ends, M, acting) for ends in pairwise(self.law.marks([start, stop]))]
-            flow, weight = parts[0]
-            for onward, cost in parts[1:]:
-                weight = weight + flow.transpose() * cost * flow
-                flow = onward * flow
-            self._known[start, stop] = flow, weight
-        return self._known[start, stop]
+    @cached_property
+    def before(self) -> arb_mat:
+        """The control that acts before the first piece does."""
+        known = self.problem.initial_control
+        u = np.zeros(self.problem.system.controls) if known is None else np.asarray(known)
+        return stacked([[x] for x in balls(u)])
 
-    def _within(self, start: float, stop: float, M: arb_mat, acting: bool) -> tuple[arb_mat, arb_mat]:
-        """`over` within one segment, by the integrals of the products of all terms of the flow's series; what this
-        leaves out is in a ball at every time."""
+    @cached_property
+    def running(self) -> arb_mat:
+        """The cost per time as a quadratic form of ``z``."""
+        corner, d, m = self._deviation(0).tolist(), self.problem.system.states, self.problem.system.controls
+        return stacked([[*row, *balls(np.zeros(m))] for row in corner] + [balls(np.zeros(d + 1 + m))] * m)
+
+    @cached_property
+    def final(self) -> arb_mat:
+        """The cost of the final state as a quadratic form of ``(x, 1)``."""
+        return self._deviation(2)
+
+    def _deviation(self, which: int) -> arb_mat:
+        """A term ``(x - r)'Q (x - r)`` of the cost as a matrix on ``(x, 1)``."""
+        term, d = self.problem.cost.terms[which], self.problem.system.states
+        if term is None:
+            return zeros(d + 1, d + 1)
+        Q, r = stacked([balls(row) for row in term.Q]), stacked([[x] for x in balls(term.reference)])
+        side, corner = (-(Q * r)).entries(), (r.transpose() * Q * r)[0, 0]
+        return stacked([*([*row, b] for row, b in zip(Q.tolist(), side, strict=True)), [*side, corner]])
+
+    def step(self, start: float, stop: float) -> arb_mat:
+        """Return what an interval makes of ``z``, a square matrix."""
+        key = self.flow.alike(start, stop)
+        if key not in self._steps:
+            Phi, Gamma, Delta = self.flow.over(start, stop)
+            self._steps[key] = self._lift(Phi.beside(Gamma).beside(Delta).matrix, 1)
+        return self._steps[key]
+
+    def weight(self, start: float, stop: float) -> arb_mat:
+        """Return what an interval costs as a quadratic form of the ``z`` at its beginning."""
+        key, size = self.flow.alike(start, stop), self.running.nrows()
+        if key not in self._weights:
+            whole, passed = zeros(size, size), identity(size)
+            for part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():
+                step, cost = self._integrate(part)
+                for _ in range(part.doublings):
+                    step, cost = step * step, cost + step.transpose() * cost * step
+                whole, passed = whole + passed.transpose() * cost * passed, step * passed
+            self._weights[key] = whole
+        return self._weights[key]
+
+    def _integrate(self, part: Part) -> tuple[arb_mat, arb_mat]:
+        """Return what a share of a segment makes of ``z``, and what that costs.
+
+        Up to the share the flow is ``sum_n X_n x^n``, and what this leaves out is in a ball at every ``x``. With ``M``
+        the cost per time, the terms cost ``sum_ij X_i' M X_j x^(i + j) / (i + j + 1)`` per time.
+        """
+        from flint import arb, arb_mat
+
+        (terms, priced, off), share, M = self._tabulate(part.segment), part.share, self.running
+        size, count = M.nrows(), terms.nrows()
+        powers = arb_mat([[x**n for n in range(count)] for x in (share, arb(0).union(share))]) * terms
+        step, seen = (arb_mat(size, size, row) for row in powers.tolist())
+        missed = off.transpose() * M * (seen + off) + seen.transpose() * M * off
+        integrals = [share**k * part.length / (k + 1) for k in range(2 * count - 1)]
+        pushed = arb_mat([integrals[i : i + count] for i in range(count)]) * priced
+        every, pushed = (arb_mat(count * size, size, table.entries()) for table in (terms, pushed))
+        return step + off, every.transpose() * pushed + missed * part.length
+
+    def _tabulate(self, segment: Segment) -> tuple[arb_mat, arb_mat, arb_mat]:
+        """Return the terms of a segment's flow on ``z`` and their products with the cost per time, a row for each; and
+        what they leave out."""
+        from flint import arb_mat
+
+        if segment not in self._tables:
+            if len(self._tables) >= KEPT:
+                self._tables.clear()
+            terms = [self._lift(X.matrix, int(not n)) for n, X in enumerate(segment.terms)]
+            table, priced = ([X.entries() for X in some] for some in (terms, [self.running * X for X in terms]))
+            self._tables[segment] = arb_mat(table), arb_mat(priced), self._lift(around(segment.off), 0)
+        return self._tables[segment]
+
+    def _lift(self, term: arb_mat, one: int) -> arb_mat:
+        """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square one on ``z``, of
+        which the 1 and the control are multiplied by ``one``."""
         from flint import arb
 
-        terms, off = self.law.within(start, stop, start, stop, EVERY)
-        every = [self._of(term.matrix, n == 0, acting) for n, term in enumerate(terms)]
-        left = self._of(around(off), False, acting)
-        flow = every[0]
-        for term in every[1:]:
-            flow = flow + term
-        if M == M * 0:
-            return flow + left, M
-        seen, share, pushed = every[0], arb(0).union(arb(1)), [M * term for term in every]
-        for term in every[1:]:
-            seen = seen + term * share
-        weight = left.transpose() * M * (seen + left) + seen.transpose() * M * left
-        for i, term in enumerate(every):
-            along = term.transpose()
-            for j, other in enumerate(pushed):
-                weight = weight + along * other / (i + j + 1)
-        return flow + left, weight * (arb(stop) - arb(start))
-
-    def _of(self, term: arb_mat, first: bool, acting: bool) -> arb_mat:
-        """A term on states, controls and disturbances as one on ``z``."""
-        from flint import arb
-
-        problem, d, m = self.problem, self.problem.system.states, self.problem.system.controls
-        w = balls(np.ones(term.ncols() - d - m))  # a drift, whose input is 1
-        mw = problem.system.disturbances
-        point = np.zeros(mw) if problem.disturbance is None else nominal_point(problem.disturbance)
-        w[len(w) - mw :] = balls(point)
-        early = balls(np.zeros(m) if acting or problem.initial_control is None else np.asarray(problem.initial_control))
-        given = [*early, *w]  # the columns of a control that does not act yet meet zeros
-        rows = [
-            [*row[:d], sum((e * v for e, v in zip(row[d:], given, strict=True)), arb(0)), *row[d : d + m]]
-            for row in term.tolist()
-        ]
-        below = [[arb(int(first and i == j)) for j in range(d + 1 + m)] for i in range(d, d + 1 + m)]
-        return stacked([*rows, *below])
-
-
-def _deviation(term: Quadratic | None, size: int) -> list[list[arb]]:
-    """``(x - r)'Q (x - r)`` as a matrix on ``(x, 1)``."""
-    from flint import arb
-
-    if term is None:
-        return [[arb(0)] * (size + 1) for _ in range(size + 1)]
-    Q, r = stacked([balls(row) for row in term.Q]), stacked([[x] for x in balls(term.reference)])
-    beside = -(Q * r)
-    corner = (r.transpose() * Q * r)[0, 0]
-    rows = [[*row, side] for row, (side,) in zip(Q.tolist(), beside.tolist(), strict=True)]
-    return [*rows, [*(side for (side,) in beside.tolist()), corner]]
-
-
-def integrated(F: arb_mat, M: arb_mat, length: Fraction) -> tuple[arb_mat, arb_mat]:
-    """``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``: one exponential for a short time, then doubled."""
-    from flint import arb, arb_mat
-
-    n, zero = F.nrows(), arb(0)
-    doublings, size = 0, norm(F) * ball_of(length)
-    while not size <= 1:
-        doublings, size = doublings + 1, size / 2
-        if doublings > 200:
-            raise Unchecked("the system is too fast for its horizon")
-    turned = (-F.transpose()).tolist()
-    rows = [[*a, *b] for a, b in zip(turned, M.tolist(), strict=True)]
-    rows += [[zero] * n + row for row in F.tolist()]
-    whole = (stacked(rows) * ball_of(length / 2**doublings)).exp().tolist()
-    flow = arb_mat([row[n:] for row in whole[n:]])
-    weight = flow.transpose() * arb_mat([row[n:] for row in whole[:n]])
-    for _ in range(doublings):
-        weight = weight + flow.transpose() * weight * flow
-        flow = flow * flow
-    return flow, weight
-
-
-def ball_of(value: Fraction) -> arb:
-    """The ball of a rational number."""
-    from flint import arb, fmpq
-
-    return arb(fmpq(value.numerator, value.denominator))
+        system, bound = self.problem.system, self.problem.disturbance
+        d, m, mw = system.states, system.controls, system.disturbances
+        w = np.zeros(mw) if bound is None else nominal_point(bound)
+        given = balls([*np.ones(term.ncols() - d - m - mw), *w])  # the input of a drift is 1
+        rows = [[*row[:d], sum((e * v for e, v in zip(row[d + m :], given, strict=True)), arb(0)), *row[d : d + m]]
+                for row in term.tolist()]  # fmt: skip
+        return stacked(rows + (identity(d + 1 + m) * one).tolist()[d:])

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import balls, rational
 from sparserob_core.checker.arithmetic.series import norm, stacked
-from sparserob_core.checker.cost.nominal import Changing, Walk, ball_of, nominal_states, walked
+from sparserob_core.checker.cost.nominal import Nominal, Walk, nominal_states, walked
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.sets.known import known
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 ENOUGH = 1e-20  # of the sizes that are added up: how closely the quadratic terms are wanted
-MOST_BITS = 8192
+MOST_BITS = 512  # a guess of the flow has no more terms than show in half of them
 KEPT = 3  # walks: of the control, of another one beside it, and of the one that stays 0
 
 
@@ -48,14 +48,10 @@ class Price:
 
     problem: OptimalControlProblem
     control: Dictionary
+    flow: Flow
     clock: Clock = NO_LIMIT
-    varying: Flow | None = None
     _latest: deque[tuple[Sequence[arb_mat], int, Walk]] = field(default_factory=lambda: deque(maxlen=KEPT))
-
-    @cached_property
-    def _changing(self) -> Changing | None:
-        """The nominal motion of a system that changes with time."""
-        return None if self.varying is None else Changing(self.problem, self.varying)
+    _nominals: dict[int, Nominal] = field(default_factory=dict)
 
     @cached_property
     def _lengths(self) -> list[Fraction]:
@@ -81,7 +77,7 @@ class Price:
             total, now, row = [arb(0)] * len(rows[0]), begin, first
             while now < end:
                 until = min(end, times[row + 1]) if row + 1 < len(times) else end
-                total = [one + w * ball_of(until - now) for one, w in zip(total, rows[row], strict=True)]
+                total = [one + w * rational(until - now) for one, w in zip(total, rows[row], strict=True)]
                 now, row = until, row + 1
             found.append([l1 * one for one in total])
         return found
@@ -149,7 +145,7 @@ class Price:
         parts = zip(self.costs, pieces, strict=True)
         norms = lengths
         if norms is None:
-            norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), ball_of(Fraction(0)))
+            norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), rational(Fraction(0)))
         if not self.is_quadratic:
             return float(norms.mid())
         found = self._quadratic(pieces)
@@ -187,9 +183,19 @@ class Price:
     def _terms(self) -> tuple[Quadratic | None, ...]:
         return self.problem.cost.terms
 
+    @property
+    def _nominal(self) -> Nominal:
+        """The nominal motion, in numbers of as many bits as are used now, or more."""
+        from flint import ctx
+
+        if not any(bits >= ctx.prec for bits in self._nominals):
+            flow = self.flow.sharper(2.0**-ctx.prec) if self._nominals else self.flow
+            self._nominals[int(ctx.prec)] = Nominal(self.problem, flow)
+        return next(nominal for bits, nominal in self._nominals.items() if bits >= ctx.prec)
+
     def nominal_states(self, pieces: Sequence[arb_mat]) -> list[arb_mat]:
         """Return the nominal ``(x, 1, u)`` of a control where every piece begins to act, and at the end."""
-        return nominal_states(self.problem, self.control, pieces, self._changing)
+        return nominal_states(self._nominal, self.control, pieces)
 
     def convex(self) -> None:
         """Show that every matrix is positive semidefinite; raises `Broken`."""
@@ -205,12 +211,12 @@ class Price:
         return [stacked([[arb(0)]] * self.problem.system.controls)] * len(self._lengths)
 
     def _quadratic(self, pieces: Sequence[arb_mat]) -> Walk:
-        """The quadratic terms and their slopes, with as many bits as it takes. The latest are kept: a cost, what is
-        added up to it and what rounding is a share of are asked of one control."""
+        """The quadratic terms and their slopes, with as many bits as it takes, or more. The latest are kept: a cost,
+        what is added up to it and what rounding is a share of are asked of one control."""
         from flint import ctx
 
         for control, bits, found in self._latest:
-            if control is pieces and bits == ctx.prec:
+            if control is pieces and bits >= ctx.prec:
                 return found
         self._latest.append((pieces, int(ctx.prec), self._resolved(pieces, int(ctx.prec))))
         return self._latest[-1][2]
@@ -220,7 +226,7 @@ class Price:
 
         while True:
             with ctx.workprec(bits):
-                found = walked(self.problem, self.control, pieces, self._changing)
+                found = walked(self._nominal, self.control, pieces)
             if found.blurred <= ENOUGH:
                 return found
             bits *= 2

@@ -4,7 +4,7 @@ same."""
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -18,7 +18,7 @@ from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, middles, products, zeros
 from sparserob_core.checker.flow.law import Box, Law, Stretch
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.segment import LONGER, ROUGH, Segment, solve
+from sparserob_core.checker.flow.segment import LONGER, ROUGH, SHARP, Segment, solve
 from sparserob_core.checker.flow.still import held_about
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
@@ -47,17 +47,30 @@ class Weights:
 
 
 @final
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A ``share`` of a ``segment``, which takes a time of this ``length``, so many ``doublings`` of it: the flow of two
+    times is that of one twice."""
+
+    segment: Segment
+    share: arb
+    length: arb
+    doublings: int = 0
+
+
+@final
 @dataclass(eq=False)
 class Flow:
     """The system ``x' = A x + B u + E w`` from 0 to ``until``, at every parameter of a ``box``; a drift is one more
     column of ``B``, whose input is always 1. To a ``degree`` in the parameters, of which there may be none; between
-    the marks of a ``timing`` where there is one."""
+    the marks of a ``timing`` where there is one. ``sharp``: of the states, what a guess may leave out."""
 
     plant: Plant
     until: float
     box: Box = Box()  # noqa: RUF009  immutable
     degree: int = 0
     timing: Law | None = None
+    sharp: float = SHARP
     _segments: dict[tuple[float, float], Segment] = field(default_factory=dict, repr=False)
     _longest: dict[float, float] = field(default_factory=dict, repr=False)
     _over: dict[tuple[object, ...], tuple[Series, Series]] = field(default_factory=dict, repr=False)
@@ -76,6 +89,10 @@ class Flow:
                 self._points.clear()
             self._points[point] = Flow(self.plant, self.until, Box(point, (0.0,) * len(point)))
         return self._points[point]
+
+    def sharper(self, sharp: float) -> Flow:
+        """The flow anew, of whose states a guess leaves out less."""
+        return Flow(self.plant, self.until, self.box, self.degree, self.timing, min(self.sharp, sharp))
 
     @cached_property
     def law(self) -> Law:
@@ -129,7 +146,7 @@ class Flow:
 
         stretch = self.law.stretches[self._place(start, stop)]
         if stretch.is_still:
-            share = (arb(stop) - arb(start)) / arb(stretch.stride)  # exactly, by a power of two
+            share = (arb(stop) - arb(start)) / stretch.stride
             if not share <= LONGER:
                 raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
             return self._still(stretch), share
@@ -138,7 +155,7 @@ class Flow:
             if len(self._segments) >= KEPT:
                 self._segments.clear()
                 self._longest.clear()
-            self._segments[start, stop] = solve(*stretch.between(start, stop), stretch.units)
+            self._segments[start, stop] = solve(*stretch.between(start, stop), stretch.units, self.sharp)
             longest = self._longest[start] = stop
         if longest == start:
             return self._segments[start, longest], arb(1)
@@ -163,13 +180,14 @@ class Flow:
     def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
         """What an interval makes of a state, of controls that stay the same (a drift among them), and of such
         disturbances."""
-        if not 0.0 <= start <= stop <= self.until:
-            raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
         key = self.alike(start, stop)
         if key not in self._over:
             whole: tuple[Series, Series] | None = None
-            for a, b in pairwise([start, *(one for one in self._begins if start < one < stop), stop]):
-                Phi, pushed = self._through(a, b)
+            for part in self.parts(start, stop):
+                both = part.segment.at(part.share)
+                Phi, pushed = both.columns(0, self.states), both.columns(self.states, None)
+                for _ in range(part.doublings):
+                    Phi, pushed = Phi * Phi, Phi * pushed + pushed
                 whole = (Phi, pushed) if whole is None else (Phi * whole[0], Phi * whole[1] + pushed)
             assert whole is not None
             if len(self._over) >= KEPT:
@@ -197,29 +215,25 @@ class Flow:
                 found[:, d:] += pushed
         return found[:, :d], found[:, d : d + self.driven], found[:, d + self.driven :]
 
-    def _through(self, start: float, stop: float) -> tuple[Series, Series]:
-        """What an interval within one stretch makes of states, and of inputs: of what does not change with time by
-        what half of it, a quarter, ... makes."""
+    def parts(self, start: float, stop: float) -> Iterator[Part]:
+        """Yield the parts of an interval, one after another."""
         from flint import arb
 
-        stretch, halvings = self.law.stretches[self._place(start, stop)], 0
-        if not stretch.is_still:
-            part = self.step(start, stop)
-            return part.columns(0, self.states), part.columns(self.states, None)
-        share = (arb(stop) - arb(start)) / arb(stretch.stride)
-        while not share <= 1:
-            share, halvings = share / 2, halvings + 1
-        part = self._still(stretch).at(share)
-        Phi, pushed = part.columns(0, self.states), part.columns(self.states, None)
-        for _ in range(halvings):
-            Phi, pushed = Phi * Phi, Phi * pushed + pushed
-        return Phi, pushed
+        for a, b in pairwise([start, *(one for one in self._begins if start < one < stop), stop]):
+            stretch, doublings, length = self.law.stretches[self._place(a, b)], 0, arb(b) - arb(a)
+            if not stretch.is_still:
+                yield Part(*self.segment(a, b), length)
+                continue
+            share = length / stretch.stride
+            while not share <= 1:
+                share, length, doublings = share / 2, length / 2, doublings + 1
+            yield Part(self._still(stretch), share, length, doublings)
 
     def _still(self, stretch: Stretch) -> Segment:
         """The flow of a stretch on which nothing changes with time."""
         key = (-1.0, stretch.start)
         if key not in self._segments:
-            self._segments[key] = solve(*stretch.between(0.0, stretch.stride), stretch.units)
+            self._segments[key] = solve(*stretch.between(0.0, stretch.stride), stretch.units, self.sharp)
         return self._segments[key]
 
     def within(self, begin: float, end: float, start: float, stop: float, order: int) -> tuple[list[Series], Array]:

@@ -28,7 +28,7 @@ SHARP = 2.0**-100  # of the system's numbers, what a guess leaves out; 2^-10 wou
 ROUGH = 2.0**-70  # the same over a box of parameters, where less is known anyway, and of kernels, which become floats
 AT_ONCE = 4  # terms after which it is looked whether more are needed
 TERMS = 64  # of a guess, at most
-LONGER = 1.0 + 2.0**-30  # shares up to which a flow is verified: of times whose ends are rounded some are above 1
+LONGER = 1.0 + 2.0**-30  # than 1, shares for which a flow is verified: parts of time have ends that are rounded
 FAR = 300.0  # of the exponent in Gronwall's inequality: beyond, nothing is known
 
 
@@ -151,9 +151,10 @@ def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series
 
 
 def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
-    """By how much a polynomial is off from the flow at most, ``(d, d + w)``; raises `Unchecked` where that is not
-    known."""
+    """By how much a polynomial is off from the flow at most up to a share of `LONGER`, ``(d, d + w)``; raises
+    `Unchecked` where that is not known."""
     A, F, last, d = equation.A, equation.F, len(terms) - 1, len(units)
+    longer = LONGER ** (last + max(len(A), len(F)) + 1) * OUTWARD
     defects = [terms[n + 1].scaled(_exact(n + 1)) - equation.slope(terms, n) for n in range(last)]
     orders = np.array([1.0, *range(1, last + 1)])[:, None, None]
     missed = (sizes_of([terms[0] - equation.begin, *defects]) / orders).sum(axis=0)
@@ -163,11 +164,10 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
             missed = missed + paces[k] @ sizes[n - k] / (n + 1)
         if n < len(F):
             missed[:, d:] += drives[n] / (n + 1)
-    highest = LONGER ** (2 * TERMS + len(A) + len(F))  # no power of a share is above this
-    growth = sum(pace(one, units) / (k + 1) for k, one in enumerate(paces)) * highest * OUTWARD
+    growth = sum(pace(one, units) / (k + 1) for k, one in enumerate(paces)) * longer
     if not growth <= FAR:
         raise Unchecked("the system is too fast for a part of its horizon")
-    worst = (missed / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * highest * OUTWARD)
+    worst = (missed / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * longer)
     return np.asarray(units[:, None] * worst * OUTWARD)
 
 

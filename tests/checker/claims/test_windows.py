@@ -24,7 +24,6 @@ from sparserob_core.checker.claims import claims, constraints, multipliers, repl
 from sparserob_core.checker.claims.case import Case, numbers
 from sparserob_core.checker.claims.causal import _shared, causal_bound
 from sparserob_core.checker.claims.cells import Place, _cut
-from sparserob_core.checker.cost.nominal import integrated
 from sparserob_core.checker.cost.price import _semidefinite
 from sparserob_core.checker.outcome import RESOLVED, Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.reach.tube import Polynomial
@@ -605,19 +604,6 @@ def test_a_matrix_is_positive_semidefinite_in_rational_numbers():
         ([[4.0, 2.0, 1.0], [2.0, 1.0, 0.0], [1.0, 0.0, 9.0]], False),
     ):
         assert _semidefinite(Quadratic(np.array(Q), np.zeros(len(Q)))) is well
-
-
-def test_an_integral_of_a_flow_is_the_closed_form_however_often_it_is_doubled():
-    """``int_0^h e^{-2 a t} dt = (1 - e^{-2 a h}) / (2 a)``."""
-    from fractions import Fraction
-
-    for a, h in ((0.3, 1.0), (3.0, 2.0), (40.0, 1.5)):
-        flow, weight = integrated(stacked([balls([-a])]), stacked([balls([1.0])]), Fraction(h))
-        assert float(flow[0, 0].mid()) == pytest.approx(math.exp(-a * h))
-        assert float(weight[0, 0].mid()) == pytest.approx((1 - math.exp(-2 * a * h)) / (2 * a))
-        assert (2 * a * weight[0, 0] + (-2 * arb(a) * arb(h)).exp() - 1).contains(0)
-    with pytest.raises(Unchecked):
-        integrated(stacked([balls([1e70])]), stacked([balls([1.0])]), Fraction(1))
 
 
 def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it_can_reach():

@@ -131,6 +131,7 @@ def test_an_interval_of_what_does_not_change_is_no_longer_than_its_polynomial() 
         stride = flow.law.stretches[0].stride
         assert stride == 0.5
         flow.segment(1.0, 1.5)
+        flow.segment(1.0, float(np.nextafter(1.5, 2.0)))  # an end that is rounded
         with pytest.raises(Unchecked, match="no polynomial"):
             flow.segment(1.0, 1.5 + 1e-6)
         assert flow.kind(0.0, 0.25) == flow.kind(1.0, 1.25) != flow.kind(0.0, 0.5)
