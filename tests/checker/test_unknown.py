@@ -112,7 +112,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "errors of execution of a policy": (
         lambda: replace(kind("alone").case(execution=np.array([0.1, 0.2])), policy=AffinePolicy()).execution,
         Unchecked,
-        "of known systems, without feedback",
+        "errors of execution without feedback",
     ),
     "parameters in no box beside errors of execution": (
         lambda: in_turns(forced(test_lists.case_of("of two classes"), execution=[0.1], system=UNSURE).problem),

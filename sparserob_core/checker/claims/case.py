@@ -276,11 +276,6 @@ class Case:
         """The flows of the system, over boxes of its parameters and at single ones."""
         return Flows.of(self.problem.system, self.grid[-1])
 
-    @property
-    def changing(self) -> Flows | None:
-        """`varying`; ``None`` where the system does not change with time."""
-        return self.flows if isinstance(self.problem.system, VaryingSystem) else None
-
     @cached_property
     def marks(self) -> list[float]:
         """The times from each of which to the next the state is a polynomial of the time."""
@@ -443,10 +438,10 @@ class Case:
         if shares is None:
             return None
         system, shares = self.problem.system, np.asarray(shares, dtype=float)
-        if self.answering or (system.parameter_count and self.changing is None):
-            raise Unchecked("the checker knows errors of execution of known systems, without feedback")
+        if self.answering:
+            raise Unchecked("the checker knows errors of execution without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
-        if self.changing is None:
+        if self.still is not None:
             return Execution(self.problem, shares, self.control.breakpoints, pieces, self.clock)
         acts = self.control.breakpoints
         if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
