@@ -420,6 +420,41 @@ def test_an_infeasible_run_has_no_empty_panel_and_no_bound(infeasible: sr.Outcom
     assert "violated" not in page and "holds" not in page
 
 
+def test_a_single_strip_has_the_width_of_the_screen_and_several_have_a_column() -> None:
+    for strips, kind in ((1, rrb.Vertical), (4, rrb.Horizontal)):
+        shown = Shown(None, 1, False, False, clash=extent([_Strip] * strips), drawn=False)  # type: ignore[list-item]
+        first = layout(shown).root_container.contents[0]
+        assert isinstance(first, kind)
+    assert "push" not in words.page("T", "infeasible", 0.0, 1.0, []) and "push" in words.page(
+        "T", "certified", 0.0, 1.0, []
+    )
+
+
+class _Strip:
+    """One strip of a clash, of which only their number counts."""
+
+
+def test_the_lane_is_named_after_the_verdict_which_has_no_width_on_it() -> None:
+    def names(part: Any) -> list[str]:
+        below = [name for one in getattr(part, "contents", ()) if not isinstance(one, str) for name in names(one)]
+        return [str(part.name), *below]
+
+    for searches in (True, False):
+        live, over = (layout(Shown(None, 1, searches, True, verdict=one)).root_container for one in ("", "certified"))
+        assert "What is going on" in names(live) and "What has gone on; at the end: certified" in names(over)
+    assert "Decisions, the newest first" in names(live.contents[1])  # on the tab of the exchange too
+
+
+@pytest.mark.parametrize("unit", ["", "s", "min"])
+def test_the_name_of_the_time_axis_is_within_the_panel_of_the_violation(unit: str) -> None:
+    drawing = Drawing()
+    axes = Axes(rounds.LEFT, 0.0, rounds.WIDTH, rounds.HEIGHT, (0.0, 1.0), (-1.0, 1.0))
+    name = f"t in {unit}" if unit else "t"
+    drawing.frame(axes, "", name, room=rounds.ROOM)
+    place = next(at for at, said, _ in drawing.labels if said == name)
+    assert place[0] + 7.0 * len(name) < rounds.extent(2, True, unit)[1]
+
+
 @pytest.mark.parametrize(("units", "told"), [(["m", "m/s"], "v in m/s over x in m"), ([], "v over x")])
 def test_a_plane_is_in_units_where_they_are_known(units: list[str], told: str, small: sr.Outcome) -> None:
     names = sr.Names(states=["x", "v"], state_units=units)

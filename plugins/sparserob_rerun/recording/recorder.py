@@ -131,7 +131,7 @@ class Recorder:
 
     def _conclude(self, event: sr.RunFinished) -> None:
         """Say how the run has ended."""
-        self.concluded = True
+        self.concluded, self.shown = True, replace(self.shown, verdict=event.status)
         result, known = event.result, dict[str, Any](status=[event.status], seconds=[event.seconds])
         if result is not None:
             known |= {"lower_bound": [result.lower_bound], "upper_bound": [result.upper_bound]}
