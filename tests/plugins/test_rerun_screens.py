@@ -328,8 +328,18 @@ def test_a_share_has_the_whole_of_its_range_upwards() -> None:
 def test_the_headings_of_narrow_climbs_are_short() -> None:
     from sparserob_rerun.search.views import climb
 
-    plots = climb(rrb, [(0, 0.1), (1500, 1e-3), (3000, 2.5e-4), (4500, 1e-6)], 1500).contents
+    plots = climb(rrb, [(0, 0.1, 0.0), (1500, 1e-3, 2.0), (3000, 2.5e-4, 4.0), (4500, 1e-6, 7.0)], 1500).contents
     assert [one.name for one in plots] == ["ε 0.1", "ε 1e-3", "ε 2.5e-4", "ε 1e-6"]
+
+
+def test_the_climb_of_every_weight_is_that_of_its_own_evaluations_and_of_its_own_seconds() -> None:
+    from sparserob_rerun.search.views import climb
+
+    plots = climb(rrb, [(0, 0.1, 0.0), (1500, 1e-3, 2.5)], 1500).contents
+    for plot, (evaluation, seconds) in zip(plots, ((1, 0.0), (1501, 2.5)), strict=True):
+        ranges = plot.properties["VisibleTimeRanges"].ranges.as_arrow_array().to_pylist()
+        starts = {one["timeline"]: one["range"]["start"] for one in ranges}
+        assert starts["evaluation"] == evaluation and starts["time"] == pytest.approx(seconds * 1e9)
 
 
 WIDE, HIGH = 5.8, 25.0  # pixels of a letter, and of a line of words, on a screen of 1600 by 1000
@@ -441,7 +451,7 @@ def test_the_lane_is_named_after_the_verdict_which_has_no_width_on_it() -> None:
 
     for searches in (True, False):
         live, over = (layout(Shown(None, 1, searches, True, verdict=one)).root_container for one in ("", "certified"))
-        assert "What is going on" in names(live) and "What has gone on; at the end: certified" in names(over)
+        assert "What is going on" in names(live) and "certified: what went on" in names(over)
     assert "Decisions, the newest first" in names(live.contents[1])  # on the tab of the exchange too
 
 

@@ -29,8 +29,8 @@ PHASE = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the phase
 class Shown:
     """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
     the landscape; of a search what the maximiser has ``told`` of itself, the coordinates that have ``moved``, and of
-    every search, once all are over (``stages``), the evaluations before it and its weight epsilon; ``budget``: the
-    evaluations of one, 0 where that is not known.
+    every search, once all are over (``stages``), the evaluations before it, its weight epsilon and the seconds before
+    it; ``budget``: the evaluations of one, 0 where that is not known.
     ``clash``, once a run is infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn;
     ``drawn``: whether there were decisions before that; ``maps``: how many families have a map of their violation;
     ``answers``: whether the control answers what it measures; ``verdict``: how it ended, once it has."""
@@ -45,7 +45,7 @@ class Shown:
     drawn: bool = True
     maps: int = 0
     answers: bool = False
-    stages: tuple[tuple[int, float], ...] = ()
+    stages: tuple[tuple[int, float, float], ...] = ()
     budget: int = 0
     verdict: str = ""
 
@@ -132,7 +132,7 @@ def _lane(rrb: Any, shown: Shown) -> Any:
 
     everything = rrb.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=TimeRange(start=everything, end=everything))
-    name = f"What has gone on; at the end: {shown.verdict}" if shown.verdict else "What is going on"
+    name = f"{shown.verdict}: what went on" if shown.verdict else "What is going on"
     return rrb.StateTimelineView(origin="/state", name=name, time_view=whole)
 
 
