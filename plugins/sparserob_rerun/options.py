@@ -21,7 +21,7 @@ class LandscapeOptions(sr.Options):
     """Evaluations of g that all landscapes of a run may take; for the last quarter of them they stay coarse."""
 
     share: float = Field(default=0.15, gt=0.0, le=1.0)
-    """Share of the time during which it may work on one core during the run, beside a first, coarse drawing for each
+    """Share of the processor time of one core that it may take during the run, beside a first, coarse drawing for each
     weight epsilon; finer grids take a third of it, a coarse one after a gain all."""
 
     patience: float = Field(default=2.0, ge=0.0, le=600.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -534,16 +533,3 @@ def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of
     assert levels(lambda slots: 3.0 + slots[0, 0])[1] == (8, 2.0)
     spent.clear()  # of a policy, each value of which is a robust program, a few come first
     assert levels(lambda slots: 3.0 + slots[0, 0], interchangeable=False)[0] == (16, 1.0) and spent[0] <= 16
-
-
-def test_where_others_want_the_processor_too_the_landscape_takes_as_much_less_of_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    from sparserob_rerun.options import LandscapeOptions
-    from sparserob_rerun.search.explorer import Explorer
-
-    explorer = Explorer(lambda *_: None, None, LandscapeOptions(share=0.5))
-    explorer.left = 1
-    monkeypatch.setattr(explorer, "_step", lambda: time.sleep(0.05))  # by the clock, and nothing of the processor
-    explorer.step(hurry=True)
-    assert 0.05 <= explorer.used < 5.0

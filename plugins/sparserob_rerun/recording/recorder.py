@@ -30,8 +30,8 @@ from sparserob_rerun.search.way import Stage
 
 SEEN = 10  # evaluations between two pictures of the way
 PICTURE_EVERY, SPARE = 1.0, 10.0
-"""Seconds between them, and how many times as long as one takes. Ten times as many, and the control stands still for
-seconds; a tenth, and pictures take as much of a processor as the search."""
+"""Seconds between them, and how many times the processor time of one. Ten times as many, and the control stands still
+for seconds; a tenth, and pictures take as much of a processor as the search."""
 ARRANGED = 100
 """Evaluations of a search after which its panels are arranged: then the maximiser has told all that it tells. With a
 tenth they are arranged again for every word of it, in as many kilobytes as a minute of the search takes; with ten times
@@ -234,7 +234,7 @@ class Recorder:
 
     def _way(self) -> None:
         """Draw how far the search has come: the climb, and its way on the landscape."""
-        self.unseen, began = 0, time.monotonic()
+        self.unseen, began = 0, time.thread_time()
         if not self.stages:
             return
         stage, self.way = self.stages[-1], True
@@ -250,7 +250,7 @@ class Recorder:
             line = f"search {max(1, stage.number)}: {weight}evaluation {done}{of}; best g {stage.best_value:.8g}"
             self.lower = max(self.lower, stage.lower_bound)
             self._page("solving", [line])
-        self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.monotonic() - began))
+        self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.thread_time() - began))
 
     def _control(self, stage: Stage) -> None:
         """Draw the control that is optimal for the best tuple so far, where its g is visibly higher."""

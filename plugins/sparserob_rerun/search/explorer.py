@@ -60,8 +60,7 @@ class Explorer:
 
     A landscape of another weight epsilon is given up at once, for a coarse one of the new weight, which waits for
     nothing. After a gain of `LARGE` a coarse one follows, as soon as the share of a core that the options allow has
-    grown again; what is left of it refines. What it has used is counted by the clock: where others want the processor
-    too, it takes as much less of it as the search does.
+    grown again; what is left of it refines. The share is of processor time, which is what it takes from others.
     """
 
     def __init__(
@@ -121,13 +120,13 @@ class Explorer:
     def step(self, hurry: bool = False) -> None:
         """Work for a moment, if the share allows it or in a ``hurry``."""
         if self.left > 0 and (hurry or self.rest == 0.0):
-            before = time.monotonic()
+            before = time.thread_time()
             try:
                 self._step()
             except sr.SparseRobError as error:  # of this tuple: the next one may have a map
                 self.aimed, self.wrong = None, f"no landscape: {error}"
             finally:
-                self.used += time.monotonic() - before
+                self.used += time.thread_time() - before
 
     def finish(self, seconds: float, level: int = 1, work: float = 0.0) -> None:
         """Work for some seconds, until the landscape of the tuple that was asked for last has a level; some seconds of
