@@ -127,10 +127,8 @@ class TupleValue:
     def at(self, point: Array) -> float:
         """``g`` at one point ``(D width,)``."""
         self._owed = None
-        acting = self.imposed.positions[self.imposed.multipliers > 0.0]
-        rested_on = self._rows(acting)
         changed = self._move(point.reshape(self.slots.shape))
-        if self._unmoved(changed) and all(map(np.array_equal, rested_on, self._rows(acting))):
+        if self._unmoved(changed):
             return value_of(self.solution)
         rows, self._solved_for = self._kinds.size, np.nan
         self.imposed, self.solution = self.relaxed.lazily(
@@ -259,18 +257,11 @@ class TupleValue:
             cuts.append(Cut(family.name, index, int(kind - first), float(multiplier), family.formulation))
         return Rows(self._G[slots, kinds], self._h[slots, kinds], tuple(cuts))
 
-    def _rows(self, positions: np.ndarray) -> tuple[Array, Array]:
-        """Return the rows at some positions, as copies."""
-        slots, kinds = np.divmod(positions, self._h.shape[1])
-        return self._G[slots, kinds], self._h[slots, kinds]
-
     def _unmoved(self, changed: np.ndarray) -> bool:
-        """Return whether the last optimum keeps the rows of the ``changed`` indices.
-
-        It is an optimum of the new tuple then, if none of the rows changed on which it rests. An index may move and
-        leave a row as it is, such as one at the end of the horizon.
-        """
+        """Whether the last optimum still is one: of its rows none has changed, and it keeps the changed ones."""
         if self.solution.status != "optimal" or self._solved_for != self.epsilon:
+            return False
+        if ((self.imposed.positions // self._h.shape[1])[:, None] == changed).any():
             return False
         return bool((self._G[changed] @ self.solution.x - self._h[changed] <= LAZY * self._norms[changed]).all())
 

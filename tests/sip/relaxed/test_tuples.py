@@ -174,24 +174,6 @@ def test_what_the_optimum_keeps_is_not_solved_again(tools):
     assert after == value(program, tools, 4).at(point)
 
 
-def test_an_index_that_leaves_the_row_on_which_the_optimum_rests_as_it_is_is_not_solved_again(tools):
-    program = oscillator("reduced")
-    g = value(program, tools, 4)
-    point = np.array([0.4, 1.8, 2.5, 3.5])
-    g.at(point)
-    terminal = next(first for family, first, _ in g._columns if family.name == "terminal")
-    slots, kinds = np.divmod(g.imposed.positions[g.imposed.multipliers > 0.0], 6)
-    by_end, by_path = (np.setdiff1d(slots[mine], slots[~mine]) for mine in (kinds >= terminal, kinds < terminal))
-    assert by_end.size and by_path.size
-    solves = g.relaxed.solves
-    point[by_end[0]] += 0.01  # its own row on the path moves, the one at the end of the horizon does not
-    assert g.at(point) == pytest.approx(value(program, tools, 4).at(point), rel=1e-12)
-    assert g.relaxed.solves == solves
-    point[by_path[0]] += 0.01
-    assert g.at(point) == pytest.approx(value(program, tools, 4).at(point), rel=1e-9)
-    assert g.relaxed.solves > solves
-
-
 @pytest.mark.parametrize("formulation", ["reduced", "literal"])
 def test_without_what_does_not_act_the_value_is_the_same_and_without_what_does_it_is_less(tools, formulation):
     program = oscillator(formulation)
