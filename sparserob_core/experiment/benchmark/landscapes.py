@@ -113,14 +113,14 @@ def _standard(
     return Landscape(name, Target(function, box), maximum, number, suite)
 
 
-def bbob(instance: int = 1) -> Iterator[Landscape]:
-    """The 24 functions of BBOB (Hansen, Finck, Ros and Auger 2009), negated, in dimensions 2 and 5, by ioh."""
+def bbob(instance: int = 1, dimensions: Sequence[int] = BBOB_DIMENSIONS) -> Iterator[Landscape]:
+    """The 24 functions of BBOB (Hansen, Finck, Ros and Auger 2009), negated, in so many dimensions, by ioh."""
     if find_spec("ioh") is None:
         raise InputError(f"suite: bbob needs a package: {not_installed('ioh')}")
     import ioh
 
     for number in range(1, 25):
-        for dimension in BBOB_DIMENSIONS:
+        for dimension in dimensions:
             problem: Any = ioh.get_problem(
                 number, instance=instance, dimension=dimension, problem_class=ioh.ProblemClass.BBOB
             )

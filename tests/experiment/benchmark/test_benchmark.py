@@ -51,7 +51,7 @@ def test_all_but_one_classic_function_are_solved_by_somebody():
 @pytest.mark.skipif(find_spec("ioh") is None, reason="ioh, of the extra bench, is not installed")
 def test_bbob_functions_have_their_maximum_where_ioh_says():
     found = list(bbob())
-    assert len(found) == 48
+    assert len(found) == 48 and {one.target.domain.dimension for one in bbob(2, [3])} == {3}
     for landscape in found[:8]:
         values = landscape.target.function(
             np.random.default_rng(0).uniform(-5.0, 5.0, (50, landscape.target.domain.dimension))
