@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -157,6 +158,9 @@ class Plugin:
         if options is None:
             factory = self.resolved()
             options = factory if isinstance(factory, type) and issubclass(factory, Options) else Options
+        hidden = self._hidden(options)
+        if hidden:
+            raise PluginError(f"{self.origin}: the option {hidden!r} bears a name that its class uses; rename it")
         taken = self.taken(options)
         if taken:
             raise PluginError(
@@ -170,6 +174,21 @@ class Plugin:
         """The options, sorted, that bear a reserved name."""
         fields = options.model_fields
         return sorted(cls.reserved & {*fields, *(field.alias for field in fields.values() if field.alias)})
+
+    def _hidden(self, options: type[Options]) -> str:
+        """An option of a class of its own that bears the name of a method or a property of the component's class, or of
+        anything that the framework says of it; empty where there is none, or a lazy factory is not imported yet."""
+        factory = self.factory
+        if not isinstance(factory, type) or factory is options:
+            return ""
+        module, _, attribute = self.component.partition(":")
+        kind = getattr(import_module(module), attribute)
+        for key in sorted(options.model_fields):
+            owner = next((one for one in factory.__mro__ if key in vars(one)), object)
+            value = vars(owner).get(key)
+            if inspect.isroutine(value) or inspect.isdatadescriptor(value) or (value is not None and owner is kind):
+                return key
+        return ""
 
     @property
     def switches(self) -> frozenset[str]:
