@@ -33,6 +33,11 @@ class Portfolio(sr.Maximiser, sr.Options):
 
     _resolved: list[sr.Maximiser | sr.UnknownPluginError] = PrivateAttr(default_factory=list)
 
+    @property
+    def whole(self) -> bool:  # type: ignore[override]
+        """Whether every member makes sense of whole numbers."""
+        return all(member.whole for member in self._resolved if not isinstance(member, sr.UnknownPluginError))
+
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
         members = self._built()

@@ -86,6 +86,12 @@ def test_options_of_members_are_checked_where_a_config_is_read(tmp_path):
     assert load_config(config, [names.replace("repeat:", "repeats:")]).config.maximiser.name == "portfolio"
 
 
+def test_a_member_that_makes_no_sense_of_whole_numbers_is_refused_with_them():
+    with pytest.raises(sr.InputError, match="integer: expected none, or a maximiser that compares values"):
+        sr.ask_tell(BOX, Portfolio(members=["sequool", "gradient_ascent"]), budget=20, integer=[0])
+    assert not sr.ask_tell(BOX, Portfolio(members=["sequool"]), budget=20, integer=[0]).done
+
+
 def test_members_that_find_nothing_left_to_gain_end_the_search():
     class Once(sr.Maximiser):
         """Evaluates the middle."""
