@@ -124,10 +124,10 @@ class SpentError(Exception):
     """The budget of a peer is spent."""
 
 
-def contenders(peers: Sequence[str]) -> Iterator[tuple[str, Search]]:
+def contenders(peers: Sequence[str], names: Sequence[str] = NAMES) -> Iterator[tuple[str, Search]]:
     """Every search that is installed."""
     needs = {"cma": "cma", "nevergrad": "nevergrad"}
-    for name in NAMES:
+    for name in names:
         if find_spec(needs.get(name, "numpy")):
             yield f"`{name}`", ours(name)
     if peers:
@@ -192,12 +192,12 @@ def of_bbob(dimensions: Sequence[int]) -> str:
     return table(lines)
 
 
-def of_g(cases: Sequence[tuple[int, Formulation, int]], budgets: Sequence[int]) -> str:
+def of_g(cases: Sequence[tuple[int, Formulation, int]], budgets: Sequence[int], names: Sequence[str] = NAMES) -> str:
     """One row for each search: the least share of the certified maximum of g over all seeds."""
     landscapes = [_of_experiment(*case) for case in cases]
     titles = [f"{experiment}, {formulation}, {size}" for experiment, formulation, size in cases]
     lines = [["", *(f"{title}: {' / '.join(map(str, budgets))}" for title in titles)]]
-    for name, search in contenders(()):
+    for name, search in contenders((), names):
         row = measured(name, search, landscapes, budgets)
         least = [[min(row.values[one.name, budget]) / one.maximum for budget in budgets] for one in landscapes]
         lines.append([name, *(" / ".join(map(shown, cell)) for cell in least)])
@@ -224,6 +224,17 @@ def table(lines: Sequence[Sequence[str]]) -> str:
     """Lines of cells as Markdown."""
     head, *rows = (f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([head, f"|{'---|' * len(lines[0])}", *rows])
+
+
+def joined(name: str, text: str) -> str:
+    """The table in the page with the rows of ``text``; the others stay where the columns are the same."""
+    head, dashes, *rows = text.split("\n")
+    page = PAGE.read_text(encoding="utf-8").partition(f"<!-- {name}: by docs/build_maximisers.py -->\n")[2]
+    old = page.partition("\n<!-- end of")[0].split("\n")
+    kept = old[2:] if old[0] == head else []
+    place = {f"`{one}`": position for position, one in enumerate(NAMES)}
+    found = {row.split(" | ")[0].removeprefix("| "): row for row in [*kept, *rows]}
+    return "\n".join([head, dashes, *(found[one] for one in sorted(found, key=lambda one: place.get(one, len(place))))])
 
 
 def put(name: str, text: str) -> None:
@@ -253,7 +264,8 @@ TABLES: dict[str, Callable[[], str]] = {
 
 @click.command()
 @click.argument("tables", nargs=-1, type=click.Choice(list(TABLES)))
-def main(tables: tuple[str, ...]) -> None:
+@click.option("--only", multiple=True, type=click.Choice(NAMES), help="Of the tables of g, the rows of this search.")
+def main(tables: tuple[str, ...], only: tuple[str, ...]) -> None:
     """Write the TABLES anew: all of them unless some are named."""
     sys.path.insert(0, str(ROOT))
     warnings.simplefilter("ignore")
@@ -261,7 +273,9 @@ def main(tables: tuple[str, ...]) -> None:
         if name == "bbob" and not find_spec("ioh"):
             click.echo(f"bbob: left as it is, since it needs a package: {not_installed('ioh')}", err=True)
             continue
-        put(name, TABLES[name]())
+        if only and name not in CASES:
+            raise InputError(f"{name}: expected a table of g with --only, since this one compares times or peers")
+        put(name, joined(name, of_g(CASES[name], (100, 300), only)) if only else TABLES[name]())
 
 
 if __name__ == "__main__":

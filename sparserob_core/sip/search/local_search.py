@@ -11,6 +11,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import Objective
 from sparserob_core.sip.search.block_ascent import IdleBlocks
+from sparserob_core.sip.search.separable import separable_maxima
 from sparserob_core.sip.search.trust_region import TrustRegion
 
 MODELLED = 30
@@ -18,6 +19,8 @@ MODELLED = 30
 APART = 0.03
 """Starts differ by this share of the box at least, in some coordinate."""
 STARTS = 30
+AFFORDED = 8
+"""Evaluations left for each coordinate, of which a crossing takes one: with fewer the next start gains more."""
 CONSIDERED = 2000
 """Best evaluated points among which starts and neighbours are looked for."""
 LONGEST = 20.0
@@ -188,11 +191,23 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array, most: 
 
 
 def _climb(seen: _Seen) -> None:
-    """The trust region from every start; what a start found is crossed with the best."""
-    for start in seen.starts():
-        found = _climb_from(seen, start)
-        while _cross(seen, found):
-            found = _climb_from(seen, seen.top)
+    """The trust region from every start; what a start found is crossed with the best.
+
+    After the first, the maxima of a separable function that goes through the values are crossed likewise: of one that
+    is separable, or nearly so, these are near the highest hill, however many hills there are.
+    """
+    _climb_and_cross(seen, seen.top)
+    for guess in separable_maxima(seen.points, seen.values):
+        if seen.objective.remaining >= AFFORDED * seen.dimension and _cross(seen, guess):
+            _climb_and_cross(seen, seen.top)
+    for start in seen.starts()[1:]:
+        _climb_and_cross(seen, start)
+
+
+def _climb_and_cross(seen: _Seen, start: Array) -> None:
+    found = _climb_from(seen, start)
+    while _cross(seen, found):
+        found = _climb_from(seen, seen.top)
 
 
 def _climb_from(seen: _Seen, start: Array) -> Array:
