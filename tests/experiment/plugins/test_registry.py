@@ -210,6 +210,25 @@ def test_options_of_a_class_of_their_own_bear_no_name_of_the_component_s(
     load(plugin(code.replace(option + ": float", "other: float").format(factory="Greedy, options=Own")))
 
 
+def test_a_lazy_factory_is_looked_at_when_it_builds(plugin: Callable[[str], Path]) -> None:
+    file = plugin(
+        "import sparserob_core as sr\n"
+        "class Own(sr.Options):\n"
+        "    search: float = 7.0\n"
+        "@sr.hookimpl\n"
+        "def sparserob_maximisers():\n"
+        "    place = 'tests.experiment.plugins.test_registry:Searching'\n"
+        "    yield sr.MaximiserPlugin(name='greedy', factory=place, options=Own, summary='g')\n"
+    )
+    with pytest.raises(sr.PluginError, match=r"the option 'search' bears a name that its class uses"):
+        load(file).build("maximiser", "greedy", {})
+
+
+class Searching(sr.Maximiser):
+    def search(self, objective: sr.Objective, rng: object) -> float:
+        return float("inf")
+
+
 class Lazy(sr.Options):
     budget: float = 7.0
 
