@@ -82,7 +82,9 @@ def _usual() -> Sequence[str]:
 
 
 def _member(registry: Any, entry: str | Mapping[str, Any]) -> sr.Maximiser | sr.UnknownPluginError:
-    name = entry if isinstance(entry, str) else str(entry.get("name"))
+    name = entry if isinstance(entry, str) else entry.get("name")
+    if not isinstance(name, str):
+        raise sr.InputError(f"members: expected the name of a maximiser in each mapping, got {entry!r}")
     options = {} if isinstance(entry, str) else {key: value for key, value in entry.items() if key != "name"}
     try:
         built: sr.Maximiser = registry.build("maximiser", name, options)

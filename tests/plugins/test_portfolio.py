@@ -45,6 +45,8 @@ def test_members_have_options_of_their_own_and_unknown_ones_are_named():
         search(members=[{"name": "direct", "ep": 0.1}])
     with pytest.raises(sr.UnknownPluginError, match="simulated_annealing"):
         search(members=["simulated_anealing"])
+    with pytest.raises(sr.InputError, match="expected the name of a maximiser in each mapping"):
+        search(members=[{"openings": 3}])
 
 
 MINE = """

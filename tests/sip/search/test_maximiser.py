@@ -350,3 +350,8 @@ def test_no_points_known_from_before_are_none():
         sr.maximise(lambda x: x.sum(axis=1), SLOPE, "sequool", budget=30, known=known) for known in (None, nothing)
     ]
     assert np.array_equal(reports[0].trace.points, reports[1].trace.points)
+
+
+def test_sides_whose_length_is_no_finite_number_are_refused():
+    with pytest.raises(sr.InputError, match=r"sides whose length is a finite number, got -1e\+308 to 1e\+308"):
+        sr.maximise(lambda x: x[:, 0], sr.Box([0.0, -1e308], [1.0, 1e308]), "direct", budget=10)
