@@ -20,8 +20,8 @@ import click
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_core.errors import InputError
-from sparserob_core.experiment.benchmark.landscapes import Formulation, Landscape, classic, landscape_of, standard
+from sparserob_core.errors import InputError, not_installed
+from sparserob_core.experiment.benchmark.landscapes import Formulation, Landscape, bbob, classic, landscape_of, standard
 from sparserob_core.experiment.solve import component
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.search.search import Rules, maximise
@@ -51,9 +51,16 @@ YARDSTICKS = ("sobol", "random_search")
 CASES: dict[str, tuple[tuple[int, Formulation, int], ...]] = {
     "g1": ((1, "reduced", 50), (1, "literal", 50), (1, "reduced", 250), (1, "literal", 250)),
     "g23": ((2, "reduced", 50), (3, "reduced", 50), (3, "literal", 50)),
+    "g250": ((2, "reduced", 250), (3, "reduced", 250), (3, "literal", 250)),
 }
 """Landscapes of g: the experiment of the paper, how an index is written, and how many pieces and indices there are. The
 second experiment has no disturbance, and so no literal form of its own."""
+DIMENSIONS = (2, 5, 10, 20)
+"""Of the functions of BBOB."""
+EACH = 50
+"""Evaluations of a function of BBOB, for each coordinate."""
+INSTANCES = 3
+"""Of every function of BBOB, with the seeds 1, 2, ...; slow searches have the first."""
 MANY = 50_000  # coordinates in which a search has two seeds, as the slow ones have
 Search = Callable[[Landscape, int, int], float]
 
@@ -77,7 +84,10 @@ def ours(name: str) -> Search:
         target = (landscape if landscape.fresh is None else landscape.fresh()).target
         as_in_runs = target.gradient is not None or target.linear is not None
         rules = Rules(polish=None if as_in_runs else maximiser.polished)
-        return maximise(target, maximiser, budget, np.random.default_rng(seed), rules).best_value
+        try:
+            return maximise(target, maximiser, budget, np.random.default_rng(seed), rules).best_value
+        except InputError:  # it has a limit, as sobol has of coordinates
+            return np.nan
 
     return search
 
@@ -111,10 +121,10 @@ class SpentError(Exception):
     """The budget of a peer is spent."""
 
 
-def contenders(peers: Sequence[str]) -> Iterator[tuple[str, Search]]:
+def contenders(peers: Sequence[str], names: Sequence[str] = NAMES) -> Iterator[tuple[str, Search]]:
     """Every search that is installed."""
     needs = {"cma": "cma", "nevergrad": "nevergrad"}
-    for name in NAMES:
+    for name in names:
         if find_spec(needs.get(name, "numpy")):
             yield f"`{name}`", ours(name)
     if peers:
@@ -160,12 +170,31 @@ def of_functions(landscapes: Sequence[Landscape], budgets: Sequence[int], peers:
     return table(lines)
 
 
-def of_g(cases: Sequence[tuple[int, Formulation, int]], budgets: Sequence[int]) -> str:
+def of_bbob(dimensions: Sequence[int]) -> str:
+    """One row for each search: how many of the 24 functions of BBOB are solved in each dimension, in the mean of the
+    instances."""
+    lines = [["", *(f"{dimension} coordinates" for dimension in dimensions)]]
+    for name, search in contenders(PEERS):
+        started, instances = time.process_time(), 1 if name.strip("`") in SLOW else INSTANCES
+        cells = []
+        for dimension in dimensions:
+            solved = 0
+            for instance in range(1, 1 + instances):
+                for one in bbob(instance, [dimension]):
+                    least = one.maximum - ACCURACY * (one.maximum - one.begin(0))
+                    solved += search(one, EACH * dimension, instance) >= least
+            cells.append(f"{solved / instances:.1f}")
+        lines.append([name, *cells])
+        click.echo(f"{lines[-1]}, {time.process_time() - started:.0f} s", err=True)
+    return table(lines)
+
+
+def of_g(cases: Sequence[tuple[int, Formulation, int]], budgets: Sequence[int], names: Sequence[str] = NAMES) -> str:
     """One row for each search: the least share of the certified maximum of g over all seeds."""
     landscapes = [_of_experiment(*case) for case in cases]
     titles = [f"{experiment}, {formulation}, {size}" for experiment, formulation, size in cases]
     lines = [["", *(f"{title}: {' / '.join(map(str, budgets))}" for title in titles)]]
-    for name, search in contenders(()):
+    for name, search in contenders((), names):
         row = measured(name, search, landscapes, budgets)
         least = [[min(row.values[one.name, budget]) / one.maximum for budget in budgets] for one in landscapes]
         lines.append([name, *(" / ".join(map(shown, cell)) for cell in least)])
@@ -184,7 +213,10 @@ def _of_experiment(experiment: int, formulation: Formulation, size: int) -> Land
 
 
 def shown(least: float) -> str:
-    """A share of the maximum, rounded down, so that no 1 is told of what falls short by more than 1e-6."""
+    """A share of the maximum, rounded down, so that no 1 is told of what falls short by more than 1e-6; a dash for who
+    does not search there."""
+    if np.isnan(least):
+        return "-"
     return "1" if least >= 1.0 - 1e-6 else f"{np.floor(least * 1e4) / 1e4:.4f}"
 
 
@@ -192,6 +224,17 @@ def table(lines: Sequence[Sequence[str]]) -> str:
     """Lines of cells as Markdown."""
     head, *rows = (f"| {' | '.join(line)} |" for line in lines)
     return "\n".join([head, f"|{'---|' * len(lines[0])}", *rows])
+
+
+def joined(name: str, text: str) -> str:
+    """The table in the page with the rows of ``text``; the others stay where the columns are the same."""
+    head, dashes, *rows = text.split("\n")
+    page = PAGE.read_text(encoding="utf-8").partition(f"<!-- {name}: by docs/build_maximisers.py -->\n")[2]
+    old = page.partition("\n<!-- end of")[0].split("\n")
+    kept = old[2:] if old[0] == head else []
+    place = {f"`{one}`": position for position, one in enumerate(NAMES)}
+    found = {row.split(" | ")[0].removeprefix("| "): row for row in [*kept, *rows]}
+    return "\n".join([head, dashes, *(found[one] for one in sorted(found, key=lambda one: place.get(one, len(place))))])
 
 
 def put(name: str, text: str) -> None:
@@ -213,19 +256,27 @@ PEERS = (
 )
 TABLES: dict[str, Callable[[], str]] = {
     "functions": lambda: of_functions([*standard(), *classic()], (100, 300, 1000), PEERS),
+    "bbob": lambda: of_bbob(DIMENSIONS),
     "g1": lambda: of_g(CASES["g1"], (100, 300)),
     "g23": lambda: of_g(CASES["g23"], (100, 300)),
+    "g250": lambda: of_g(CASES["g250"], (100, 300)),
 }
 
 
 @click.command()
 @click.argument("tables", nargs=-1, type=click.Choice(list(TABLES)))
-def main(tables: tuple[str, ...]) -> None:
+@click.option("--only", multiple=True, type=click.Choice(NAMES), help="Of the tables of g, the rows of this search.")
+def main(tables: tuple[str, ...], only: tuple[str, ...]) -> None:
     """Write the TABLES anew: all of them unless some are named."""
     sys.path.insert(0, str(ROOT))
     warnings.simplefilter("ignore")
     for name in tables or TABLES:
-        put(name, TABLES[name]())
+        if name == "bbob" and not find_spec("ioh"):
+            click.echo(f"bbob: left as it is, since it needs a package: {not_installed('ioh')}", err=True)
+            continue
+        if only and name not in CASES:
+            raise InputError(f"{name}: expected a table of g with --only, since this one compares times or peers")
+        put(name, joined(name, of_g(CASES[name], (100, 300), only)) if only else TABLES[name]())
 
 
 if __name__ == "__main__":

@@ -37,6 +37,10 @@ FEEDBACK = ["watch", "configs/experiment1_feedback.yaml"]
 INFEASIBLE = ["watch", "configs/experiment2_repaired.yaml", "problem.path.0.from=1.0"]
 STUDY = ["sweep", "configs/double_integrator.yaml", "problem.horizon=3:6:7", "problem.control.box=0.6:1.6:6"]
 RENDEZVOUS = ["watch", "configs/atv_box.yaml"]
+SIDE_BY_SIDE = [
+    *("sweep", "configs/experiment1_reduced.yaml", "maximiser.name=simulated_annealing,lipo"),
+    *("maximiser.budget=200", "continuation.stop=1e-2"),
+]
 MARGIN = ["margin", "configs/experiment1_repaired.yaml", "--curve", "10"]
 RUNS: dict[str, tuple[list[str], dict[str, str]]] = {
     "exchange": (EXCHANGE, {"Overview": "exchange", "Exchange": "exchange_tab"}),
@@ -45,6 +49,7 @@ RUNS: dict[str, tuple[list[str], dict[str, str]]] = {
     "infeasible": (INFEASIBLE, {"Overview": "infeasible"}),
     "rendezvous": (RENDEZVOUS, {"Overview": "rendezvous"}),
     "study": (STUDY, {"Study": "study"}),
+    "side_by_side": (SIDE_BY_SIDE, {"Runs side by side": "side_by_side"}),
     "margin": (MARGIN, {"Study": "margin"}),
 }
 """What is run, and which of its tabs become which pictures."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 import textwrap
+import warnings
 from collections.abc import Iterator, Mapping
 from functools import cache
 from itertools import pairwise
@@ -30,7 +32,15 @@ class Checked(ModelMetaclass):
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **keywords: Any) -> type:
         if not isinstance(namespace.get("model_config", {}), Mapping):
             raise InputError(f"{name}: the option 'model_config' bears a name that pydantic uses; rename it")
-        made: type = super().__new__(mcs, name, bases, namespace, **keywords)
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Field name .* shadows")  # what is hidden is an error below
+                made: type = super().__new__(mcs, name, bases, namespace, **keywords)
+        except (ValueError, NameError) as error:  # by pydantic, whose classes differ
+            hidden = re.search(r"Field ['\"](\w+)['\"] conflicts with member", str(error))
+            if hidden is None:
+                raise
+            raise InputError(f"{name}: the option {hidden[1]!r} bears a name that pydantic uses; rename it") from None
         for key, owner in _names_in_use(made):
             raise InputError(f"{name}: the option {key!r} bears a name that {owner} uses; rename it")
         return made

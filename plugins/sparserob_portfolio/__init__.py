@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 
 import sparserob_core as sr
 
@@ -24,12 +24,19 @@ class Portfolio(sr.Maximiser, sr.Options):
     Notes ``member``, the number of the one that searches, from 1.
     """
 
-    members: Sequence[str | Mapping[str, Any]] = Field(default=("sequool", "simulated_annealing", "cma"), min_length=1)
-    """Names of maximisers, or mappings with their options; ``cma`` is left out where its package is missing and it was
-    not asked for."""
+    members: Sequence[str | Mapping[str, Any]] | None = Field(default=None, min_length=1)
+    """Names of maximisers, or mappings with their options, those of the config's ``plugins`` too; ``null``:
+    ``sequool``, ``simulated_annealing``, and ``cma`` where its package is installed."""
 
     trial: float = Field(default=0.5, gt=0.0, lt=1.0)
     """Share of the budget that they try with, in equal parts."""
+
+    _resolved: list[sr.Maximiser | sr.UnknownPluginError] = PrivateAttr(default_factory=list)
+
+    @property
+    def whole(self) -> bool:  # type: ignore[override]
+        """Whether every member makes sense of whole numbers."""
+        return all(member.whole for member in self._resolved if not isinstance(member, sr.UnknownPluginError))
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
@@ -53,17 +60,37 @@ class Portfolio(sr.Maximiser, sr.Options):
             idle = 0 if rest.found else idle + 1
         return float("inf")
 
+    @model_validator(mode="after")
+    def _resolve(self, info: ValidationInfo) -> Portfolio:
+        """Build the members from the components among which this one was chosen. One that is unknown there stands for
+        its error until it is to search: whoever reads another's directory knows only his own components."""
+        registry: Any = (info.context or {}).get("registry") or sr.load_registry()
+        self._resolved = [_member(registry, entry) for entry in (_usual() if self.members is None else self.members)]
+        return self
+
     def _built(self) -> list[sr.Maximiser]:
-        registry = sr.load_registry()
         built = list[sr.Maximiser]()
-        for entry in self.members:
-            name = entry if isinstance(entry, str) else str(entry.get("name"))
-            options = {} if isinstance(entry, str) else {key: value for key, value in entry.items() if key != "name"}
-            needs = registry.get("maximiser", name).needs
-            if needs and find_spec(needs[0]) is None and "members" not in self.model_fields_set:
-                continue
-            built.append(registry.build("maximiser", name, options))
+        for member in self._resolved:
+            if isinstance(member, sr.UnknownPluginError):
+                raise member
+            built.append(member)
         return built
+
+
+def _usual() -> Sequence[str]:
+    return ("sequool", "simulated_annealing", *(["cma"] if find_spec("cma") else []))
+
+
+def _member(registry: Any, entry: str | Mapping[str, Any]) -> sr.Maximiser | sr.UnknownPluginError:
+    name = entry if isinstance(entry, str) else entry.get("name")
+    if not isinstance(name, str):
+        raise sr.InputError(f"members: expected the name of a maximiser in each mapping, got {entry!r}")
+    options = {} if isinstance(entry, str) else {key: value for key, value in entry.items() if key != "name"}
+    try:
+        built: sr.Maximiser = registry.build("maximiser", name, options)
+    except sr.UnknownPluginError as error:
+        return error
+    return built
 
 
 def _joined(*batches: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 Choice: TypeAlias = str | Mapping[str, Any]
 logger = logging.getLogger("sparserob")
 PIECES = {"name": "piecewise_constant", "pieces": 100}
+ASKED = {"integer", "logarithmic", "minimise", "state"}  # arguments of `ask_tell` alone
 
 
 def maximise(
@@ -68,6 +70,10 @@ def maximise(
     from sparserob_core.sip.search.search import Rules, Target
     from sparserob_core.sip.search.search import maximise as search
 
+    for key in ASKED & options.keys():
+        raise InputError(f"{key}: expected an argument of maximise, got one of ask_tell, which takes it")
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback: expected a function of points and values, got {callback!r}")
     chosen, share = _chosen(box, name, options, polish)
     limit, told = as_seconds(seconds), _Told(f, callback)
     rules = Rules(polish=share, seconds=np.inf if limit is None else limit, halt=told.halted, **_ends(target, patience))
@@ -159,7 +165,7 @@ def ask_tell(
     begin = None if first is None else ranges.hidden(first)
 
     def run(function: Callable[[Array], Array]) -> Report:
-        return search(
+        report = search(
             Target(function, ranges.searched),
             chosen,
             calls,
@@ -168,6 +174,10 @@ def ask_tell(
             start=begin,
             known=None if earlier is None else (ranges.hidden(earlier[0]), sign * earlier[1]),
         )
+        if not minimise or "target" not in ends:
+            return report
+        mirrored, meant = (f"the target {one:.9g} is" for one in (rules.target, ends["target"]))
+        return replace(report, stopped=report.stopped.replace(mirrored, meant))
 
     keywords: dict[str, Any] = dict(options)
     again = partial(
@@ -229,6 +239,8 @@ def _known(known: Any, box: Box) -> tuple[Array, Array] | None:
         numbers: Array = np.array(values, dtype=float, ndmin=1)
     except (TypeError, ValueError):
         raise InputError(f"known: expected points and their values, got {known!r}") from None
+    if not numbers.size and not np.size(points):
+        return None
     placed = _placed(points, box, "known")
     if placed is None or numbers.shape != (len(placed),):
         raise InputError(f"known: expected a value for each point, got shapes {np.shape(points)} and {numbers.shape}")

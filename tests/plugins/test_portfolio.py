@@ -9,7 +9,9 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.benchmark.landscapes import Landscape, classic
+from sparserob_core.experiment.config.load import load_config
 from sparserob_portfolio import Portfolio
+from tests.support.places import CONFIGS
 
 BOX = sr.Box(np.array([-1.0, -2.0]), np.array([2.0, 1.0]))
 LOST_BY_SOME = ("needle", "hartmann 3", "shekel", "hartmann 6", "ellipsoid")
@@ -43,6 +45,53 @@ def test_members_have_options_of_their_own_and_unknown_ones_are_named():
         search(members=[{"name": "direct", "ep": 0.1}])
     with pytest.raises(sr.UnknownPluginError, match="simulated_annealing"):
         search(members=["simulated_anealing"])
+    with pytest.raises(sr.InputError, match="expected the name of a maximiser in each mapping"):
+        search(members=[{"openings": 3}])
+
+
+MINE = """
+import sparserob_core as sr
+
+class Mine(sr.Maximiser, sr.Options):
+    'Evaluates the lower corner.'
+
+    repeats: int = 1
+
+    def search(self, objective, rng):
+        for _ in range(self.repeats):
+            objective.evaluate(objective.domain.lower[None])
+        return float('inf')
+
+@sr.hookimpl
+def sparserob_maximisers():
+    yield sr.MaximiserPlugin(name='mine', factory=Mine, summary='the lower corner')
+"""
+
+
+def test_members_come_from_the_plugins_that_a_config_names(tmp_path):
+    (tmp_path / "mine.py").write_text(MINE)
+    members = ["mine", {"name": "mine", "repeats": 3}]
+    chosen = sr.load_registry([tmp_path / "mine.py"]).build("maximiser", "portfolio", {"members": members})
+    assert np.unique(sr.maximise(bowl, BOX, chosen, budget=50, polish=0).trace.points, axis=0).tolist() == [[-1, -2]]
+    with pytest.raises(sr.UnknownPluginError, match="no maximiser is named 'mine'"):
+        search(members=members)
+
+
+def test_options_of_members_are_checked_where_a_config_is_read(tmp_path):
+    (tmp_path / "mine.py").write_text(MINE)
+    config = tmp_path / "config.yaml"
+    base = CONFIGS / "experiment1_repaired.yaml"
+    config.write_text(f"extends: {base}\nplugins: [mine.py]\n")
+    names = "maximiser={name: portfolio, members: [sequool, {name: mine, repeat: 3}]}"
+    with pytest.raises(sr.ConfigError, match=r"mine: repeat: unknown key; did you mean 'repeats'"):
+        load_config(config, [names])
+    assert load_config(config, [names.replace("repeat:", "repeats:")]).config.maximiser.name == "portfolio"
+
+
+def test_a_member_that_makes_no_sense_of_whole_numbers_is_refused_with_them():
+    with pytest.raises(sr.InputError, match="integer: expected none, or a maximiser that compares values"):
+        sr.ask_tell(BOX, Portfolio(members=["sequool", "gradient_ascent"]), budget=20, integer=[0])
+    assert not sr.ask_tell(BOX, Portfolio(members=["sequool"]), budget=20, integer=[0]).done
 
 
 def test_members_that_find_nothing_left_to_gain_end_the_search():

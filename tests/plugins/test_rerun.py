@@ -216,7 +216,7 @@ def test_what_is_arranged_otherwise_has_another_place_in_the_viewer() -> None:
     seen = [shown_of(inspection(f"{config}.yaml", {}), LandscapeOptions()) for config in configs]
     names = [one.application for one in seen]
     assert len(set(names)) == len(names) and all(name.startswith("sparserob ") for name in names)
-    assert names[1] == replace(seen[1], told=frozenset({"depth"}), stages=((0, 1.0),)).application
+    assert names[1] == replace(seen[1], told=frozenset({"depth"}), stages=((0, 1.0, 0.0),)).application
 
 
 def test_the_chunks_of_a_recording_are_as_few_as_the_format_wants_and_nothing_is_lost(

@@ -328,8 +328,18 @@ def test_a_share_has_the_whole_of_its_range_upwards() -> None:
 def test_the_headings_of_narrow_climbs_are_short() -> None:
     from sparserob_rerun.search.views import climb
 
-    plots = climb(rrb, [(0, 0.1), (1500, 1e-3), (3000, 2.5e-4), (4500, 1e-6)], 1500).contents
+    plots = climb(rrb, [(0, 0.1, 0.0), (1500, 1e-3, 2.0), (3000, 2.5e-4, 4.0), (4500, 1e-6, 7.0)], 1500).contents
     assert [one.name for one in plots] == ["ε 0.1", "ε 1e-3", "ε 2.5e-4", "ε 1e-6"]
+
+
+def test_the_climb_of_every_weight_is_that_of_its_own_evaluations_and_of_its_own_seconds() -> None:
+    from sparserob_rerun.search.views import climb
+
+    plots = climb(rrb, [(0, 0.1, 0.0), (1500, 1e-3, 2.5)], 1500).contents
+    for plot, (evaluation, seconds) in zip(plots, ((1, 0.0), (1501, 2.5)), strict=True):
+        ranges = plot.properties["VisibleTimeRanges"].ranges.as_arrow_array().to_pylist()
+        starts = {one["timeline"]: one["range"]["start"] for one in ranges}
+        assert starts["evaluation"] == evaluation and starts["time"] == pytest.approx(seconds * 1e9)
 
 
 WIDE, HIGH = 5.8, 25.0  # pixels of a letter, and of a line of words, on a screen of 1600 by 1000
@@ -418,6 +428,41 @@ def test_an_infeasible_run_has_no_empty_panel_and_no_bound(infeasible: sr.Outcom
     page = words.page("T", "infeasible", 0.3, np.inf, words.verdict_lines(event))
     assert "no bound yet" not in page and "≤" not in page
     assert "violated" not in page and "holds" not in page
+
+
+def test_a_single_strip_has_the_width_of_the_screen_and_several_have_a_column() -> None:
+    for strips, kind in ((1, rrb.Vertical), (4, rrb.Horizontal)):
+        shown = Shown(None, 1, False, False, clash=extent([_Strip] * strips), drawn=False)  # type: ignore[list-item]
+        first = layout(shown).root_container.contents[0]
+        assert isinstance(first, kind)
+    assert "push" not in words.page("T", "infeasible", 0.0, 1.0, []) and "push" in words.page(
+        "T", "certified", 0.0, 1.0, []
+    )
+
+
+class _Strip:
+    """One strip of a clash, of which only their number counts."""
+
+
+def test_the_lane_is_named_after_the_verdict_which_has_no_width_on_it() -> None:
+    def names(part: Any) -> list[str]:
+        below = [name for one in getattr(part, "contents", ()) if not isinstance(one, str) for name in names(one)]
+        return [str(part.name), *below]
+
+    for searches in (True, False):
+        live, over = (layout(Shown(None, 1, searches, True, verdict=one)).root_container for one in ("", "certified"))
+        assert "What is going on" in names(live) and "certified: what went on" in names(over)
+    assert "Decisions, the newest first" in names(live.contents[1])  # on the tab of the exchange too
+
+
+@pytest.mark.parametrize("unit", ["", "s", "min"])
+def test_the_name_of_the_time_axis_is_within_the_panel_of_the_violation(unit: str) -> None:
+    drawing = Drawing()
+    axes = Axes(rounds.LEFT, 0.0, rounds.WIDTH, rounds.HEIGHT, (0.0, 1.0), (-1.0, 1.0))
+    name = f"t in {unit}" if unit else "t"
+    drawing.frame(axes, "", name, room=rounds.ROOM)
+    place = next(at for at, said, _ in drawing.labels if said == name)
+    assert place[0] + 7.0 * len(name) < rounds.extent(2, True, unit)[1]
 
 
 @pytest.mark.parametrize(("units", "told"), [(["m", "m/s"], "v in m/s over x in m"), ([], "v over x")])

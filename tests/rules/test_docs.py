@@ -118,6 +118,23 @@ def test_links_between_pages_lead_somewhere() -> None:
     assert not [f"{relative(page)}: {link}" for page, link in inside if not (page.parent / link).exists()]
 
 
+LONGEST = 40  # words of a sentence; 25 are many
+PLAIN = [ROOT / "docs" / "live.md"]
+"""Pages whose sentences are counted; others join them as they are written anew."""
+
+
+@pytest.mark.parametrize("page", PLAIN, ids=relative)
+def test_no_sentence_is_longer_than_a_reader_can_follow(page: Path) -> None:
+    text = FENCE.sub("", page.read_text())
+    parts = (part for block in re.split(r"\n\s*\n|^[-#|] *", text, flags=re.MULTILINE) for part in split(block))
+    assert not [sentence for sentence in parts if len(sentence.split()) > LONGEST]
+
+
+def split(block: str) -> list[str]:
+    """Return the sentences of a paragraph: what ends with a full stop, a colon or a semicolon ends one."""
+    return re.split(r"(?<=[.!?:;])\s+", " ".join(block.split()))
+
+
 def cells(line: str) -> int:
     return len(re.split(r"(?<!\\)\|", line.strip().strip("|")))
 

@@ -23,7 +23,7 @@ the panel is wide; more of them are smaller, and their words are not."""
 
 def extent(strips: Sequence[sr.Strip]) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of the drawing."""
-    return 0.0, LEFT + WIDTH + 40.0, -64.0, max(len(strips), 2) * (HEIGHT + GAP)
+    return 0.0, LEFT + WIDTH + 40.0, -64.0, max(len(strips), 1) * (HEIGHT + GAP)
 
 
 def draw_clash(rr: Any, stream: Any, strips: Sequence[sr.Strip]) -> None:

@@ -20,6 +20,7 @@ FAMILIES = 3  # that are drawn: of four plots above one another the words cover 
 LATTICE = 27  # points at most for the coordinates that are not drawn
 LEFT, WIDTH, HEIGHT = 60.0, 640.0, 112.0
 GAP, NUMBERS = 52.0, 24.0  # between two plots, and as much more where each has the numbers of an axis of its own
+LETTER = 10.0  # room of a letter of the name of the axis across, at its end
 ROOM = 1.15  # of words, in a panel that is smaller than its drawing
 SMALLEST = 1e-12
 ACROSS, UPWARDS = 4.0, 16.0  # how large a cell of a map is: about as wide as high, for the numbers of them
@@ -32,10 +33,16 @@ SERIES = {
 }
 
 
-def extent(families: int, shared: bool) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of the violation plots; ``shared``: over one axis, that of time."""
+def extent(families: int, shared: bool, unit: str = "") -> tuple[float, float, float, float]:
+    """Left, right, top and bottom of the violation plots; ``shared``: over one axis, that of time, in its ``unit``."""
     bottom = max(1, min(FAMILIES, families)) * _below(shared) - (GAP if shared else GAP + NUMBERS)
-    return -42.0, LEFT + WIDTH + 76.0, -40.0, bottom + 60.0
+    letters = len(_named(shared, unit)) - 1
+    return -42.0, LEFT + WIDTH + 76.0 + LETTER * letters, -40.0, bottom + 60.0
+
+
+def _named(shared: bool, unit: str) -> str:
+    """The name of the axis across."""
+    return ("t" + (f" in {unit}" if unit else "")) if shared else "index"
 
 
 def extent_of_maps(maps: int) -> tuple[float, float, float, float]:
@@ -152,8 +159,8 @@ class Rounds:
         shared, (place, last) = problem is not None, where
         limits = (-reach, max(0.35 * reach, 1.15 * float(worst.max())))
         axes = Axes(LEFT, place * _below(shared), WIDTH, HEIGHT, ends, limits)
-        unit = "" if problem is None or not problem.names.time else f" in {problem.names.time}"
-        drawing.frame(axes, words, f"t{unit}" if shared else "index", last or not shared, room=ROOM)
+        unit = "" if problem is None else problem.names.time
+        drawing.frame(axes, words, _named(shared, unit), last or not shared, room=ROOM)
         drawing.hatched("hatch", axes, axes.x, (0.0, axes.y[1]), ink.HATCH)
         if across.size > 1:
             drawing.line("curve", axes.at(across, worst), ink.SKY, 2.0)

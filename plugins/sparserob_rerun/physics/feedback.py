@@ -18,6 +18,13 @@ SIDE, GAP, LEFT, TOP = 190.0, 62.0, 70.0, 80.0  # of the pictures, in the units 
 PIXELS = 240  # of a picture's side
 CHANNELS, STATES = 4, 6  # at most, of which there are pictures
 DRAWS = 1000
+WORDS = """
+**gain**: how much the control of a time changes for a unit of what a measurement of an earlier time has brought as new,
+an *innovation*. **What moved it in the worst case**: the gain times the innovation, in the worst case of the constraint
+that is nearest to its bound.
+
+Black is what is not measured yet: a control answers what was seen before it. What is pale is not answered.
+"""
 
 
 def extent(channels: int, states: int) -> tuple[float, float, float, float]:
@@ -45,6 +52,7 @@ def draw_feedback(rr: Any, stream: Any, data: sr.FigureData) -> None:
     words = f"across: when it was seen; upwards: when it is answered; {data.worst_case}"
     drawing.text(LEFT + 1.5 * SIDE, TOP - 46.0, words)
     drawing.log(rr, stream, "feedback/frames", layers=("frame",))
+    stream.log("feedback/words", rr.TextDocument(WORDS, media_type="text/markdown"), static=True)
 
 
 def pictures(data: sr.FigureData) -> Iterator[tuple[str, tuple[int, int], str, Floats]]:

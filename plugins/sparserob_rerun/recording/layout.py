@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     import sparserob_core as sr
 
 
+WIDE = 2.0
+"""How many times as wide as high a drawing is that has the whole width of the screen. With ten times as much a single
+strip fills half of its panel; with a tenth many strips are narrow and high above the words."""
 PHASE = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the phase plane
 
 
@@ -26,11 +29,11 @@ PHASE = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the phase
 class Shown:
     """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
     the landscape; of a search what the maximiser has ``told`` of itself, the coordinates that have ``moved``, and of
-    every search, once all are over (``stages``), the evaluations before it and its weight epsilon; ``budget``: the
-    evaluations of one, 0 where that is not known.
+    every search, once all are over (``stages``), the evaluations before it, its weight epsilon and the seconds before
+    it; ``budget``: the evaluations of one, 0 where that is not known.
     ``clash``, once a run is infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn;
     ``drawn``: whether there were decisions before that; ``maps``: how many families have a map of their violation;
-    ``answers``: whether the control answers what it measures."""
+    ``answers``: whether the control answers what it measures; ``verdict``: how it ended, once it has."""
 
     problem: sr.OptimalControlProblem | None
     families: int
@@ -42,8 +45,14 @@ class Shown:
     drawn: bool = True
     maps: int = 0
     answers: bool = False
-    stages: tuple[tuple[int, float], ...] = ()
+    stages: tuple[tuple[int, float, float], ...] = ()
     budget: int = 0
+    verdict: str = ""
+
+    @property
+    def violations(self) -> tuple[float, float, float, float]:
+        """Left, right, top and bottom of the plots of the violation."""
+        return rounds.extent(self.families, self.problem is not None, self.problem.names.time if self.problem else "")
 
     @property
     def application(self) -> str:
@@ -95,7 +104,7 @@ def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
     plots = [] if shown.problem is None else [_plots(shown.problem, shown.searches)]
     if shown.searches:  # the search is what is seen first: its map has more than half of the screen
         terrain = [_terrain(shown)] if shown.landscape else []
-        below = rrb.Horizontal(search.climb(rrb, shown.stages, shown.budget), _lane(rrb), column_shares=[3, 1])
+        below = rrb.Horizontal(search.climb(rrb, shown.stages, shown.budget), _lane(rrb, shown), column_shares=[3, 1])
         left = rrb.Vertical(*terrain, below, row_shares=[4, 1][-1 - len(terrain) :])
         right = [rrb.Horizontal(*words, *map_words), *plots, *plane]
         return [left, rrb.Vertical(*right, row_shares=[11, 12, 9][: len(right)])], [9, 5]
@@ -106,7 +115,7 @@ def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
         else rrb.Vertical(*numbers)
     )
     words = [*words, *plane, *map_words, _decisions(rrb)]
-    heights = [13, *([9] if plane else []), *([6] if map_words else []), 8]
+    heights = [12, *([9] if plane else []), *([9] if map_words else []), 6]
     return [*plots, middle, rrb.Vertical(*words, row_shares=heights)], ([5, 4, 3] if plots else [4, 3])
 
 
@@ -116,13 +125,15 @@ def _plots(problem: sr.OptimalControlProblem, searches: bool) -> Any:
     return view(f"/{first.path}", heading(problem, searches), physics.extent(count, physics.height(count, searches)))
 
 
-def _lane(rrb: Any) -> Any:
-    """The lane of states, from the beginning of the run on whatever timeline is shown."""
+def _lane(rrb: Any, shown: Shown) -> Any:
+    """The lane of states, from the beginning of the run on whatever timeline is shown. The verdict, which comes at its
+    end, has no width there, and is in its name."""
     from rerun.encodings import TimeRange
 
     everything = rrb.TimeRangeBoundary.infinite()
     whole = rrb.TimeAxis(view_range=TimeRange(start=everything, end=everything))
-    return rrb.StateTimelineView(origin="/state", name="What is going on", time_view=whole)
+    name = f"{shown.verdict}: what went on" if shown.verdict else "What is going on"
+    return rrb.StateTimelineView(origin="/state", name=name, time_view=whole)
 
 
 def _terrain(shown: Shown) -> Any:
@@ -174,8 +185,9 @@ def _further(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
 
 def _feedback(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     limits = feedback.extent(problem.system.controls, problem.system.states)
-    name = "How the control answers what is measured: red adds, blue takes away"
-    return rrb.Horizontal(view("/feedback", name, limits), name="Feedback")
+    pictures = view("/feedback", "How the control answers what is measured: red adds, blue takes away", limits)
+    words = rrb.TextDocumentView(origin="/feedback/words", name="Reading the pictures")
+    return rrb.Vertical(pictures, words, name="Feedback", row_shares=[3, 1])
 
 
 def _signals(rrb: Any, answers: bool) -> Any:
@@ -200,11 +212,9 @@ def _signals(rrb: Any, answers: bool) -> Any:
 
 def _infeasible(rrb: Any, shown: Shown, clash: tuple[float, ...]) -> Any:
     """Instead of a control that there is not: why there is none."""
-    words = rrb.Vertical(
-        rrb.TextDocumentView(origin="/verdict", name="What is known"), _decisions(rrb), row_shares=[3, 2]
-    )
+    words = [rrb.TextDocumentView(origin="/verdict", name="What is known"), _decisions(rrb)]
     if not clash:
-        return rrb.Horizontal(words, name="Overview")
+        return rrb.Horizontal(rrb.Vertical(*words, row_shares=[3, 2]), name="Overview")
     left, right, top, bottom = clash
     drawing = view(
         "/clash",
@@ -212,7 +222,9 @@ def _infeasible(rrb: Any, shown: Shown, clash: tuple[float, ...]) -> Any:
         "yellow, what the worst disturbance makes of the best",
         (left, right, top, bottom),
     )
-    return rrb.Horizontal(drawing, words, name="Overview", column_shares=[5, 3])
+    if right - left > WIDE * (bottom - top):
+        return rrb.Vertical(drawing, rrb.Horizontal(*words), name="Overview", row_shares=[3, 2])
+    return rrb.Horizontal(drawing, rrb.Vertical(*words, row_shares=[3, 2]), name="Overview", column_shares=[5, 3])
 
 
 def _bounds(rrb: Any) -> Any:
@@ -223,7 +235,7 @@ def _violation(rrb: Any, shown: Shown) -> Any:
     return view(
         "/violation/plots",
         "Violation (up) along the indices (across): orange dots are new cuts",
-        rounds.extent(shown.families, shown.problem is not None),
+        shown.violations,
     )
 
 
@@ -241,5 +253,6 @@ def _exchange(rrb: Any, shown: Shown) -> Any:
         name = "Violation over time and the first parameter: red is forbidden"
         extent = rounds.extent_of_maps(shown.maps)
         right.append(view("/violation", name, extent, "/violation/maps/** /violation/names/**"))
-    right.append(_lane(rrb))
-    return rrb.Horizontal(left, rrb.Vertical(*right), name="Exchange")
+    below = [_lane(rrb, shown)] if shown.searches else [_decisions(rrb), _lane(rrb, shown)]
+    heights = [5] * len(right) + [2] * len(below)
+    return rrb.Horizontal(left, rrb.Vertical(*right, *below, row_shares=heights), name="Exchange")

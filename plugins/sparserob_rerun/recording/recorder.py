@@ -131,7 +131,7 @@ class Recorder:
 
     def _conclude(self, event: sr.RunFinished) -> None:
         """Say how the run has ended."""
-        self.concluded = True
+        self.concluded, self.shown = True, replace(self.shown, verdict=event.status)
         result, known = event.result, dict[str, Any](status=[event.status], seconds=[event.seconds])
         if result is not None:
             known |= {"lower_bound": [result.lower_bound], "upper_bound": [result.upper_bound]}
@@ -223,7 +223,7 @@ class Recorder:
             if self.stages:
                 self._way()
             base = self.timelines.evaluation
-            self.stages.append(Stage(event.round, event.epsilon, base - (event.total - event.count)))
+            self.stages.append(Stage(event.round, event.epsilon, base - (event.total - event.count), self.began))
             weight = f": epsilon {event.epsilon:.3g}" if np.isfinite(event.epsilon) else ""
             self.say(f"search {max(1, event.round)} begins{weight}")
         return self.stages[-1]
@@ -272,7 +272,7 @@ class Recorder:
     def _arrange(self, stage: Stage) -> None:
         """Give what the search has told since the last arrangement its panels."""
         told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
-        begun = tuple((one.base, one.epsilon) for one in self.stages) if self.concluded else ()
+        begun = tuple((one.base, one.epsilon, one.began) for one in self.stages) if self.concluded else ()
         if not (told <= self.shown.told and moved <= self.shown.moved and begun == self.shown.stages):
             told, moved = self.shown.told | told, self.shown.moved | moved
             self.shown = replace(self.shown, told=told, moved=moved, stages=begun, budget=stage.budget)

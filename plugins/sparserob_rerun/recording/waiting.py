@@ -41,7 +41,7 @@ class Waiting:
         self._write(
             VIOLATIONS,
             "violation/plots",
-            rounds.extent(shown.families, shown.problem is not None),
+            shown.violations,
             f"drawn when {first}",
         )
         if shown.maps:

@@ -21,6 +21,11 @@ Hatched red: forbidden. Yellow: the worst case. Pink: when a constraint is activ
 control: it acts where the push leaves the dashed band, and nowhere else.
 """
 
+CLASHES = """
+**Reading the picture.** Hatched red: forbidden. Blue: where the control can bring the quantity.
+White line: the best of it. Yellow: what the worst disturbance makes of the best.
+"""
+
 
 STATES: dict[str, Colour] = {
     "search": ink.SKY,
@@ -99,7 +104,9 @@ def page(title: str, status: str, lower: float, upper: float, more: list[str]) -
         bounds = "no bound yet" if status == "solving" else "no bound is known"
     known = math.isfinite(lower) and math.isfinite(upper) and status != "infeasible"
     gap = f"; {(upper - lower) / max(abs(upper), 1e-12):.2g} of it apart" if known and upper > lower else ""
-    return "\n\n".join([f"**{status}**: {bounds}{gap}", *more, f"*{title}*", LEGEND])
+    return "\n\n".join(
+        [f"**{status}**: {bounds}{gap}", *more, f"*{title}*", CLASHES if status == "infeasible" else LEGEND]
+    )
 
 
 def _decide(count: int) -> str:

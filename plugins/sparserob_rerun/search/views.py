@@ -41,21 +41,25 @@ MOST = 4  # searches whose climbs are beside one another; of more the last ones
 CLIMB = ("tried", "refused", "walk", "best", "exact")
 
 
-def climb(rrb: Any, stages: Sequence[tuple[int, float]], budget: int) -> Any:
+def climb(rrb: Any, stages: Sequence[tuple[int, float, float]], budget: int) -> Any:
     """The climb: of a search that goes on the last evaluations, as many as its ``budget`` (0: all of them); of one that
-    is over a plot for each of its ``stages``, of which each has how many evaluations there were before it, and its
-    weight epsilon."""
+    is over a plot for each of its ``stages``, of which each has how many evaluations there were before it, its weight
+    epsilon, and how many seconds there were before it."""
     contents = [f"+ /search/g/{one}" for one in CLIMB]
     if len(stages) < 2:
         cursor = rrb.TimeRangeBoundary.cursor_relative
-        window = (cursor(seq=-budget), cursor(seq=0)) if budget else None
-        return series(rrb, "/search/g", "g over the last evaluations", contents, evaluations=window)
+        window = rrb.VisibleTimeRange("evaluation", start=cursor(seq=-budget), end=cursor(seq=0))
+        return series(rrb, "/search/g", "g over the last evaluations", contents, ranges=[window] if budget else ())
     shown, plots = list(stages)[-MOST:], []
-    place = rrb.TimeRangeBoundary.absolute
-    ends = [place(seq=base) for base, _ in shown[1:]] + [rrb.TimeRangeBoundary.infinite()]
-    for (base, epsilon), end in zip(shown, ends, strict=True):
+    place, last = rrb.TimeRangeBoundary.absolute, rrb.TimeRangeBoundary.infinite()
+    ends = [(place(seq=base), place(seconds=before)) for base, _, before in shown[1:]] + [(last, last)]
+    for (base, epsilon, before), (end, over) in zip(shown, ends, strict=True):
         name = f"ε {_short(epsilon)}" if np.isfinite(epsilon) and epsilon > 0.0 else "g over the evaluations"
-        plots.append(series(rrb, "/search/g", name, contents, evaluations=(place(seq=base + 1), end)))
+        ranges = [
+            rrb.VisibleTimeRange("evaluation", start=place(seq=base + 1), end=end),
+            rrb.VisibleTimeRange("time", start=place(seconds=before), end=over),
+        ]
+        plots.append(series(rrb, "/search/g", name, contents, ranges=ranges))
     return rrb.Horizontal(*plots)
 
 
@@ -72,17 +76,15 @@ def series(
     contents: list[str] | None = None,
     legend: Literal["left", "right", "below"] = "right",
     limits: tuple[float, float] | None = None,
-    evaluations: tuple[Any, Any] | None = None,
+    ranges: Sequence[Any] = (),
 ) -> Any:
     """A plot against the timeline that shows the whole of it, however long it is. ``legend``: the corner in which
     the names of its lines are, an upper one or the lower left one; ``limits``: of the axis upwards, where they are
-    known before; ``evaluations``: the first and the last that are shown, and decide its height."""
+    known before; ``ranges``: what is shown on some timelines, which decides its height, in the place of the whole."""
     from rerun.encodings import TimeRange
 
     everything = rrb.TimeRangeBoundary.infinite()
-    start, end = evaluations or (everything, everything)
-    whole = evaluations is None  # a range of evaluations is none of another timeline
-    shown = [rrb.VisibleTimeRange("evaluation", start=start, end=end)] if evaluations else None
+    whole = None if ranges else rrb.TimeAxis(view_range=TimeRange(start=everything, end=everything))
     return rrb.TimeSeriesView(
         origin=origin,
         contents=contents or ["+ $origin/**"],
@@ -93,8 +95,8 @@ def series(
             ],
             visible=contents is None,
         ),
-        axis_x=rrb.TimeAxis(view_range=TimeRange(start=start, end=end)) if whole else None,
-        time_ranges=shown,
+        axis_x=whole,  # a range of evaluations is none of another timeline
+        time_ranges=list(ranges) or None,
         axis_y=None if limits is None else rrb.ScalarAxis(range=limits),
     )
 

@@ -19,13 +19,15 @@ POINTS = 100_000  # tuples whose places are remembered; a tenth of it forgets a 
 class Stage:
     """One search: ``values (n,)`` of its evaluations, which are numbers ``base + 1, ...`` of the run.
 
+    ``began``: the seconds of the run before it.
+
     ``notes``: what the maximiser noted, one column ``(n,)`` for each name, NaN where it noted nothing.
     ``places (m, 2, c)``: of the last of them where the two indices were that decided most, in the ``coordinates (c,)``
     of an index; ``pair``: which they were in the best tuple, () where that is not known.
     """
 
-    def __init__(self, number: int, epsilon: float, base: int) -> None:
-        self.number, self.epsilon, self.base = number, epsilon, base
+    def __init__(self, number: int, epsilon: float, base: int, began: float = 0.0) -> None:
+        self.number, self.epsilon, self.base, self.began = number, epsilon, base, began
         self.values: Floats = np.zeros(0)
         self.notes: dict[str, Floats] = {}
         self.coordinates: tuple[int, ...] = ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import shorten
 from typing import Any, final
@@ -18,6 +18,8 @@ from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing, view
 from sparserob_rerun.study import board
 from sparserob_rerun.study.board import Board, number
+from sparserob_rerun.study.side_by_side import SideBySide, folder_of_runs
+from sparserob_rerun.study.side_by_side import tab as side_by_side
 from sparserob_rerun.study.statuses import mark, named, plainly, said
 
 LAYERS = ("hatch", "curve", "frame", "bounds", "marks")
@@ -45,7 +47,8 @@ class StudyOpening:
     @property
     def application(self) -> str:
         """The name of the viewer's application: it keeps one arrangement for each."""
-        return f"sparserob study {crc32(repr((list(self.event.axes), self.event.arrangement)).encode()):08x}"
+        kind = "comparison" if self.event.arrangement == "runs" else "study"
+        return f"sparserob {kind} {crc32(repr((list(self.event.axes), self.event.arrangement)).encode()):08x}"
 
 
 @final
@@ -61,12 +64,16 @@ class StudyRecorder:
         self.newest: deque[int] = deque(self.rows, maxlen=board.LINES)
         self.running: dict[int, tuple[int, float, float]] = {}
         searched = self.event.arrangement == "search"
+        folder = folder_of_runs(self.event)
+        self.beside = None if folder is None else SideBySide(rr, stream, folder)
         self.text = "its points are found on the way" if searched else self._done()
         self.over = ""
         self.seconds, self.next = 0.0, 0.0
+        if self.beside is not None:  # what is told is seen on the timeline of their evaluations too
+            stream.set_time("evaluation", sequence=0)
         stream.send_recording_name(self.event.title)
         stream.send_property("study", rr.AnyValues(title=[self.event.title], axes=list(self.event.axes)))
-        self._tell(f"study: {self.event.title}")
+        self._tell(f"{self._noun}: {self.event.title}")
         if self.rows:
             self._tell(f"{len(self.rows)} points were finished before")
         self._picture()
@@ -97,7 +104,7 @@ class StudyRecorder:
     @property
     def arrangement(self) -> Any:
         """How everything is arranged."""
-        return layout(self.opening)
+        return layout(self.opening, self.beside)
 
     def idle(self) -> None:
         """Draw what came since the last picture."""
@@ -110,6 +117,10 @@ class StudyRecorder:
 
     def finish(self) -> None:
         """Nothing is left to be done after the last event."""
+
+    @property
+    def _noun(self) -> str:
+        return {"search": "search", "runs": "comparison"}.get(self.event.arrangement, "study")
 
     def _done(self) -> str:
         return f"{len(self.rows)} of {len(self.event.points)} points done"
@@ -142,11 +153,13 @@ class StudyRecorder:
         fresh = [place for place in event.rows if place not in self.rows]
         self.rows, self.running = dict(event.rows), {}
         self.newest = deque([*fresh, *(one for one in self.newest if one in self.rows)], maxlen=board.LINES)
-        what = "search" if self.event.arrangement == "search" else "study"
-        self.over = f"stopped: {event.stopped}" if event.stopped else f"the {what} is over"
+        self.over = f"stopped: {event.stopped}" if event.stopped else f"the {self._noun} is over"
         self.text = event.answer or f"{len(self.rows)} of {len(self.event.points)} points have an answer or an error"
         self._move(event.seconds)
         self._picture()
+        if self.beside is not None:
+            self._draw("the runs side by side", self.beside.finish)
+            self._draw("the arrangement", lambda: self.stream.send_blueprint(self.arrangement))
         self.say(f"{self.over}; {self.text}: {self._counts()}", "WARN" if event.stopped else "INFO")
 
     def _picture(self) -> None:
@@ -157,17 +170,27 @@ class StudyRecorder:
             ("the bounds", self._bounds),
             ("what is known", self._page),
             ("the newest points", self._lists),
+            ("the runs side by side", self._runs),
         ):
-            if panel not in self.broken:
-                try:
-                    task()
-                except Exception as error:  # noqa: BLE001  a panel less is better than no recording
-                    self.broken[panel] = f"{panel} could not be drawn: {type(error).__name__}: {error}"
-                    self.say(f"{self.broken[panel]}; the rest goes on", "WARN")
+            self._draw(panel, task)
         spent = time.thread_time() - spent
         large = max(1.0, len(self.event.points) / LARGE)
         pause = max(PICTURE_EVERY, large * min(SHARE * self.seconds, RAREST), SPARE * spent)
         self.next = time.monotonic() + pause
+
+    def _draw(self, panel: str, task: Callable[[], object]) -> None:
+        """Draw a panel; one that fails is named in the log, once, and is left out from then on."""
+        if panel in self.broken:
+            return
+        try:
+            task()
+        except Exception as error:  # noqa: BLE001  a panel less is better than no recording
+            self.broken[panel] = f"{panel} could not be drawn: {type(error).__name__}: {error}"
+            self.say(f"{self.broken[panel]}; the rest goes on", "WARN")
+
+    def _runs(self) -> None:
+        if self.beside is not None:
+            self.beside.draw(self.rows)
 
     def _map(self) -> None:
         if self.board.kind == "table":
@@ -301,11 +324,30 @@ class StudyRecorder:
         self.stream.log(path, self.rr.TextDocument(text, media_type="text/markdown"))
 
 
-def layout(opening: StudyOpening) -> Any:
-    """The blueprint: the map and the bounds, beside them what is known in words; the log."""
+def layout(opening: StudyOpening, beside: SideBySide | None = None) -> Any:
+    """The blueprint: of a study its map and its bounds, beside them what is known in words; of runs of one problem what
+    is known of them side by side; the log."""
     import rerun.blueprint as rrb
 
-    if Board(opening.event).kind == "table":
+    compared = opening.event.arrangement == "runs"
+    tabs = [] if compared else [_study(rrb, opening.event)]
+    tabs += [side_by_side(beside)] if folder_of_runs(opening.event) is not None else []
+    log = rrb.TextLogView(
+        origin="/log",
+        name="Log",
+        columns=rrb.TextLogColumns(timeline_columns=["points"], text_log_columns=["Body"]),
+    )
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, log, active_tab=0),
+        rrb.TimePanel(state="collapsed", timeline="evaluation" if compared else "time", play_state="following"),
+        auto_layout=False,
+        auto_views=False,
+        collapse_panels=True,
+    )
+
+
+def _study(rrb: Any, event: sr.SweepStarted) -> Any:
+    if Board(event).kind == "table":
         first = rrb.TextDocumentView(origin="/study/table", name="The newest points of the study")
     else:
         first = view("/study/map", "Status, cost J and relative gap of every point", board.EXTENT)
@@ -315,15 +357,4 @@ def layout(opening: StudyOpening) -> Any:
         row_shares=[1, 1],
     )
     pictures = rrb.Vertical(first, view("/study/bounds", "Bounds on the cost", EXTENT), row_shares=[3, 2])
-    log = rrb.TextLogView(
-        origin="/log",
-        name="Log",
-        columns=rrb.TextLogColumns(timeline_columns=["points"], text_log_columns=["Body"]),
-    )
-    return rrb.Blueprint(
-        rrb.Tabs(rrb.Horizontal(pictures, words, name="Study", column_shares=[5, 3]), log, active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline="time", play_state="following"),
-        auto_layout=False,
-        auto_views=False,
-        collapse_panels=True,
-    )
+    return rrb.Horizontal(pictures, words, name="Study", column_shares=[5, 3])

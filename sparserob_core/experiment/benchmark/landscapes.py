@@ -113,14 +113,14 @@ def _standard(
     return Landscape(name, Target(function, box), maximum, number, suite)
 
 
-def bbob(instance: int = 1) -> Iterator[Landscape]:
-    """The 24 functions of BBOB (Hansen, Finck, Ros and Auger 2009), negated, in dimensions 2 and 5, by ioh."""
+def bbob(instance: int = 1, dimensions: Sequence[int] = BBOB_DIMENSIONS) -> Iterator[Landscape]:
+    """The 24 functions of BBOB (Hansen, Finck, Ros and Auger 2009), negated, in so many dimensions, by ioh."""
     if find_spec("ioh") is None:
         raise InputError(f"suite: bbob needs a package: {not_installed('ioh')}")
     import ioh
 
     for number in range(1, 25):
-        for dimension in BBOB_DIMENSIONS:
+        for dimension in dimensions:
             problem: Any = ioh.get_problem(
                 number, instance=instance, dimension=dimension, problem_class=ioh.ProblemClass.BBOB
             )
@@ -140,15 +140,15 @@ def landscape_of(
     indices: int = INDICES,
     overrides: Mapping[str, Any] | None = None,
 ) -> Landscape:
-    """``g`` at tuples of so many indices of a config, at a small weight of the regulariser; its maximum is the value
-    that the exchange certifies at that weight. ``overrides``: what is another in the config.
+    """``g`` at tuples of so many indices of a config, at a small weight of the regulariser, in the units in which the
+    methods search; its maximum is the value that the exchange certifies at that weight. ``overrides``: what is another
+    in the config.
 
     Raises `InputError` where the exchange certifies none, for then the maximum is not known, and for literal indices
     without a disturbance.
     """
     from sparserob_core.experiment.assemble import assemble, build, tools_of
     from sparserob_core.experiment.config.load import load_config
-    from sparserob_core.sip.methods.own_units import solve_in_own_units
     from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
     from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 
@@ -156,10 +156,12 @@ def landscape_of(
     method = {"name": "exchange", "exact": False}
     loaded = load_config(str(config), {**(overrides or {}), "method": method, "continuation": fixed})
     experiment, tools = assemble(loaded), tools_of(loaded)
-    result = solve_in_own_units(build(loaded, "method", loaded.config.method), experiment.program, tools)
-    if result.status not in ("certified", "verified") or not experiment.program.families:
+    own = experiment.program.own_units
+    sought = experiment.program if own is None else own.program  # in whose units the regulariser weighs
+    result = build(loaded, "method", loaded.config.method).solve(sought, tools)
+    if result.status not in ("certified", "verified") or not sought.families:
         raise InputError(f"{config}: expected a config whose value is certified, got {result.status}: {result.message}")
-    program = imposed_program(experiment.program, formulation)
+    program = imposed_program(sought, formulation)
 
     def made() -> Landscape:
         g = TupleValue(program, RelaxedProgram(program, tools.solver, tools.regulariser), indices)

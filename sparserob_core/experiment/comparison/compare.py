@@ -3,7 +3,7 @@ these take."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from sparserob_core.experiment.comparison.profiles_figure import write_profiles
 from sparserob_core.experiment.comparison.studies import ACCURACY, SLACK, is_study, read_profiles
 from sparserob_core.experiment.config.plain import difference, value_text
 from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
+from sparserob_core.experiment.run.events import Broadcast, Event, Observer, SweepFinished, SweepStarted
 from sparserob_core.experiment.run.given import GivenRun, as_run
 
 SHARES = (0.1, 0.01, 0.001)
@@ -31,6 +32,7 @@ def compare(
     *,
     accuracy: float = ACCURACY,
     measure: Measure | None = None,
+    observers: Iterable[Observer] = (),
 ) -> Comparison | Profiles:
     """Read runs (`as_run`), or studies, and draw them into the picture ``out`` (.png, .pdf or .svg) when it is given:
     what ``sparserob compare`` does.
@@ -38,11 +40,12 @@ def compare(
     Runs of one problem give a `Comparison`. Studies (what ``sparserob sweep`` leaves) give `Profiles` of their
     contenders over all of their problems: a run has solved its problem within ``accuracy``, relative to the exact
     value, and what it took is measured in evaluations, or in seconds; unless ``measure`` says which, in evaluations
-    where all runs search. Where matplotlib is missing there is no picture, and the remarks say so.
+    where all runs search. Where matplotlib is missing there is no picture, and the remarks say so. ``observers`` are
+    shown the runs, as the points of a study that is over.
 
     Raises `InputError` when one of them is no run directory and no study, when runs are not all of one problem on the
-    same dictionaries, when studies are not finished or have one contender only, when there is nothing to draw, and when
-    the picture cannot be written.
+    same dictionaries, when studies are not finished or have one contender only, when there is nothing to draw, when
+    the picture cannot be written, and when there are observers of studies.
     """
     if isinstance(runs, str | Path) or not runs:
         raise InputError(f"runs: expected a list of at least one run directory, got {runs!r}")
@@ -50,20 +53,55 @@ def compare(
         require_writable(Path(out))
     places = [as_run(run)[0] for run in runs]
     studies = [place for place in places if is_study(place)]
+    broadcast = Broadcast([(type(observer).__name__, observer) for observer in observers])
+    if studies and broadcast.heard:
+        raise InputError(
+            f"{studies[0]}: expected runs to be watched side by side, got a study; it is watched as it runs"
+        )
     if studies and len(studies) < len(places):
         other = next(place for place in places if place not in studies)
         raise InputError(f"{other}: expected a study beside {studies[0]}; a study is compared with studies only")
     found: Comparison | Profiles
     found = read_profiles(studies, accuracy, measure) if studies else _side_by_side(places)
-    if out is None:
-        return found
-    if missing := missing_matplotlib():
-        return replace(found, undrawn=missing)
-    if isinstance(found, Profiles):
+    if out is not None and (missing := missing_matplotlib()):
+        found = replace(found, undrawn=missing)
+    elif out is not None and isinstance(found, Profiles):
         write_profiles(Path(out), found)
-    else:
+    elif out is not None and isinstance(found, Comparison):
         write_comparison(Path(out), found)
+    if broadcast.heard and isinstance(found, Comparison):
+        for event in events_of(found):
+            broadcast(event)
     return found
+
+
+def events_of(comparison: Comparison) -> Iterator[Event]:
+    """Yield what observers of a study would have heard whose points are the runs of a comparison."""
+    seconds = max((curve.all_seconds for curve in comparison.curves if np.isfinite(curve.all_seconds)), default=0.0)
+    yield SweepStarted(
+        title=comparison.title or "runs of one problem",
+        directory=Path(),
+        axes=["run"],
+        logarithmic=[False],
+        points=[(label,) for label in comparison.labels],
+        arrangement="runs",
+        runs=Path(),
+    )
+    rows = {place: _row(curve) for place, curve in enumerate(comparison.curves)}
+    yield SweepFinished(rows=rows, seconds=seconds, answer=next(comparison_remarks(comparison)))
+
+
+def _row(curve: Curve) -> dict[str, Any]:
+    """The row of a run, as in the table of a study; what is not known is null."""
+    known = {
+        "cost": curve.cost,
+        "lower_bound": curve.lower_bound,
+        "upper_bound": curve.upper_bound,
+        "gap": curve.gap,
+        "seconds": curve.all_seconds,
+    }
+    numbers = {name: value if np.isfinite(value) else None for name, value in known.items()}
+    return {"run": str(curve.directory.resolve()), "status": curve.status, "message": curve.message, **numbers}
 
 
 def _side_by_side(places: Sequence[Path]) -> Comparison:

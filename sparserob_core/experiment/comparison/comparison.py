@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from sparserob_core.brief import brief
 from sparserob_core.experiment.comparison.curve import Curve
+from sparserob_core.experiment.config.plain import BESIDE, value_text
 
 
 @final
@@ -23,9 +24,9 @@ class Comparison:
     exact: float = np.nan
     certified: int | None = None
     undrawn: str = ""
+    """Why there is no figure, where one was asked for."""
 
     __repr__ = brief
-    """Why there is no figure, where one was asked for."""
 
     @property
     def title(self) -> str:
@@ -48,3 +49,23 @@ class Comparison:
         """The evaluations after which the curve came within that share of the exact value; nan when it never did."""
         needed = curve.reached(self.exact - share * abs(self.exact))
         return needed if np.isfinite(needed) else np.nan
+
+    @property
+    def differences(self) -> list[tuple[str, list[str]]]:
+        """The keys in which the configs differ, each with its value in every run. Of components with different names
+        the name stands for all of their options."""
+        configs = [{key: part for key, part in curve.config.items() if key not in BESIDE} for curve in self.curves]
+        return list(_differences("", configs))
+
+
+def _differences(path: str, values: Sequence[Any]) -> Iterator[tuple[str, list[str]]]:
+    """The keys below ``path`` at which the ``values`` differ; a missing one is none."""
+    if all(value == values[0] for value in values):
+        return
+    if not all(isinstance(value, Mapping) for value in values):
+        yield path, [value_text(value) for value in values]
+    elif len({value.get("name") for value in values}) > 1:
+        yield path, [str(value.get("name")) for value in values]
+    else:
+        for key in dict.fromkeys(key for value in values for key in value):
+            yield from _differences(f"{path}.{key}" if path else key, [value.get(key) for value in values])

@@ -18,7 +18,7 @@ from sparserob_core.experiment.config.reading.overrides import Override, apply_o
 from sparserob_core.experiment.config.reading.reader import Source, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.plugins.components import Registry
-from sparserob_core.experiment.plugins.messages import NOT_TEXT, Complaint, complaints, malformed, models_in
+from sparserob_core.experiment.plugins.messages import NOT_PLAIN, NOT_TEXT, Complaint, complaints, malformed, models_in
 from sparserob_core.experiment.plugins.registry import load_registry
 
 KEPT = {*MaximiserEntry.model_fields} - {"name"}  # keys of a maximiser that are the framework's own
@@ -199,7 +199,8 @@ def _line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -
     change = _override(source, changes, complaint)
     if change is None:
         return f"{source.where(complaint.path)}: {complaint}"
-    hint = f"; as text it is written {change.quoted}" if complaint.message.startswith(NOT_TEXT) else ""
+    unquoted = any(said in complaint.message for said in (NOT_TEXT, NOT_PLAIN))
+    hint = f"; as text it is written {change.quoted}" if unquoted else ""
     return f"override {change.text}: {complaint}{hint}"
 
 

@@ -35,6 +35,7 @@ MUST_BE = {
     "finite_number": "a finite number",
 }
 NOT_TEXT = f"must be {MUST_BE['string_type']}"
+NOT_PLAIN = "must be a number, a text, a list or a mapping"  # such as a date
 
 
 @dataclass(frozen=True)
@@ -191,4 +192,4 @@ def malformed(data: object, path: Path = (), above: tuple[int, ...] = ()) -> Ite
         for position, value in enumerate(data):
             yield from malformed(value, (*path, position), (*above, id(data)))
     elif not isinstance(data, str | int | float | None):
-        yield Complaint(path, f"must be a number, a text, a list or a mapping (got {shown(data)})")
+        yield Complaint(path, f"{NOT_PLAIN} (got {shown(data)})")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -157,6 +158,7 @@ class Plugin:
         if options is None:
             factory = self.resolved()
             options = factory if isinstance(factory, type) and issubclass(factory, Options) else Options
+        self._refuse_hidden(options, self.factory)
         taken = self.taken(options)
         if taken:
             raise PluginError(
@@ -171,6 +173,19 @@ class Plugin:
         fields = options.model_fields
         return sorted(cls.reserved & {*fields, *(field.alias for field in fields.values() if field.alias)})
 
+    def _refuse_hidden(self, options: type[Options], factory: object) -> None:
+        """Raise `PluginError` where an option of a class of its own bears the name of a method or a property of the
+        component's class, or of anything that the framework says of it. A lazy factory is looked at when it builds."""
+        if not isinstance(factory, type) or factory is options:
+            return
+        module, _, attribute = self.component.partition(":")
+        kind = getattr(import_module(module), attribute)
+        for key in sorted(options.model_fields):
+            owner = next((one for one in factory.__mro__ if key in vars(one)), object)
+            value = vars(owner).get(key)
+            if inspect.isroutine(value) or inspect.isdatadescriptor(value) or (value is not None and owner is kind):
+                raise PluginError(f"{self.origin}: the option {key!r} bears a name that its class uses; rename it")
+
     @property
     def switches(self) -> frozenset[str]:
         """The words, entry point and distribution, each of which disables it; none for a file and for the core."""
@@ -182,6 +197,7 @@ class Plugin:
         """The component for validated options, checked to be of this kind."""
         self._refuse_missing()
         factory = self.resolved()
+        self._refuse_hidden(type(options), factory)
         module, _, attribute = self.component.partition(":")
         expected = getattr(import_module(module), attribute)
         if factory is type(options):

@@ -108,7 +108,9 @@ class SweepStarted(Event):
 
     The first event for an observer of a study. ``rows``: what was finished before, by the place of the point.
     ``arrangement``: how the points were chosen (``grid``, ``zip``, ``random``, ``sobol``; ``search``: a margin, whose
-    points are told as they are found, `SweepProgress`). ``parallel``: the runs are
+    points are told as they are found, `SweepProgress`; ``runs``: finished runs of one problem, which are compared).
+    ``runs``: the folder in which the rows name the directories of their runs (``run``), where these are kept.
+    ``parallel``: the runs are
     made elsewhere, and nothing is heard of them (`PointProgress`) before they end. ``sense``: the *largest* or the
     *smallest* value of the only axis is sought at which something is feasible, and what is proven infeasible at one
     value is so beyond it; empty where nothing is."""
@@ -122,6 +124,7 @@ class SweepStarted(Event):
     rows: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     parallel: bool = False
     sense: Literal["", "largest", "smallest"] = ""
+    runs: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

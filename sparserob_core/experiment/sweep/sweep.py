@@ -322,6 +322,7 @@ class _Walk:
             arrangement=self.plan.points,
             rows=self._known(self.pending),
             parallel=self.parallel,
+            runs=self.directory / RUNS,
         )
 
     def ending(self) -> SweepFinished:

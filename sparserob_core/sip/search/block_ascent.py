@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import LinearBlocks, Objective
 
 GAIN = 1e-9  # relative: what a step must gain to count as one
@@ -29,7 +29,7 @@ def block_ascent(objective: Objective, start: Array | None = None) -> bool:
     linear = objective.linear
     if linear is None or (start is None and not np.isfinite(objective.best_value)):
         return False
-    climb = _Climb(objective, linear)
+    idle = IdleBlocks(objective.domain, objective.block, linear)
     best, still, tried = objective.best_point if start is None else start, 0, 0.0
     value = float(objective.evaluate(best[np.newaxis])[0])
     if not np.isfinite(value):
@@ -37,10 +37,10 @@ def block_ascent(objective: Objective, start: Array | None = None) -> bool:
     while still < PATIENCE or tried < 2.0 * OCTAVES:
         acts = linear.acting()
         objective.note(acting=float(acts.sum()))
-        trial = linear.steepest(climb.placed(best, acts))
+        trial = linear.steepest(idle.placed(best, acts))
         reached = float(objective.evaluate(trial[np.newaxis])[0])
         gained = reached > value + GAIN * abs(value)
-        still, tried = (0, 0.0) if gained else (still + 1, tried + climb.neighbours(acts))
+        still, tried = (0, 0.0) if gained else (still + 1, tried + idle.neighbours(acts))
         if reached >= value:
             best, value = trial, reached
         else:  # by rounding only: see the last point's inner solution again
@@ -48,14 +48,25 @@ def block_ascent(objective: Objective, start: Array | None = None) -> bool:
     return bool(np.isfinite(tried))
 
 
-class _Climb:
-    """Where the blocks that do not act are placed."""
+class IdleBlocks:
+    """Where the blocks of a function are placed that do not act: beside those that do, and spread over the box.
 
-    def __init__(self, objective: Objective, linear: LinearBlocks) -> None:
-        domain = objective.domain
-        shape = (-1, objective.block)
+    Parameters
+    ----------
+    domain : Box
+        The box ``(d,)`` of the function.
+    block : int
+        Coordinates of a block.
+    linear : LinearBlocks, optional
+        The coordinates that are not placed, since they are linear; none of them without it.
+    """
+
+    def __init__(self, domain: Box, block: int, linear: LinearBlocks | None = None) -> None:
+        shape = (-1, block)
         self.lower, self.upper = domain.lower.reshape(shape), domain.upper.reshape(shape)
-        self.others = np.flatnonzero(~linear.coordinates.reshape(shape)[0] & (self.upper > self.lower)[0])
+        moves = (self.upper > self.lower)[0]
+        self.others = np.flatnonzero(moves if linear is None else moves & ~linear.coordinates.reshape(shape)[0])
+        self.faces = linear is None  # half of those that are spread go there: no uniform point is near a vertex
         self.beside, self.spread = 0, 0  # how many of each have been placed
         self.shares = _kronecker(self.others.size)
 
@@ -82,7 +93,10 @@ class _Climb:
             blocks[beside, axes] += np.where(pair % 2, 1.0, -1.0) * (upper - lower)[beside, axes] * 2.0**-octave
         number = self.spread + np.arange(spread.size)
         where = np.ix_(spread, self.others)
-        blocks[where] = lower[where] + np.mod(0.5 + np.outer(number, self.shares), 1.0) * (upper - lower)[where]
+        shares = np.mod(0.5 + np.outer(number, self.shares), 1.0)
+        if self.faces:
+            shares[::2] = np.clip(2.0 * shares[::2] - 0.5, 0.0, 1.0)
+        blocks[where] = lower[where] + shares * (upper - lower)[where]
         self.beside, self.spread = self.beside + beside.size, self.spread + spread.size
         return np.clip(blocks, lower, upper).ravel()
 

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
 import numpy as np
 
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import Objective
+from sparserob_core.sip.search.block_ascent import IdleBlocks
+from sparserob_core.sip.search.separable import separable_maxima
 from sparserob_core.sip.search.trust_region import TrustRegion
 
 MODELLED = 30
@@ -13,6 +19,8 @@ MODELLED = 30
 APART = 0.03
 """Starts differ by this share of the box at least, in some coordinate."""
 STARTS = 30
+AFFORDED = 8
+"""Evaluations left for each coordinate, of which a crossing takes one: with fewer the next start gains more."""
 CONSIDERED = 2000
 """Best evaluated points among which starts and neighbours are looked for."""
 LONGEST = 20.0
@@ -23,10 +31,10 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     """Climb from the best of the evaluated ``points (k, d)`` with ``values (k,)`` until the budget is spent or nothing
     is left to gain.
 
-    With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995). Then,
-    up to 30 coordinates, the derivative-free `TrustRegion`; beyond, a compass search that moves one coordinate, hence
-    one block, at a time. Starts are the best points, then the next best that lie apart; one that its recent progress
-    cannot bring to the top is given up. Nothing is done without a finite value.
+    With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995), first in the blocks that act, where these are known.
+    Then, up to 30 coordinates, the derivative-free `TrustRegion`; beyond, a compass search that moves one coordinate,
+    hence one block, at a time. Starts are the best points, then the next best that lie apart; one that its recent
+    progress cannot bring to the top is given up. Nothing is done without a finite value.
     """
     finite = np.isfinite(values)
     if not finite.any():
@@ -34,6 +42,8 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     order = np.flatnonzero(finite)[np.argsort(-values[finite], kind="stable")][:CONSIDERED]
     seen = _Seen(objective, points[order], values[order])
     if objective.differentiable:
+        if objective.acting is not None:
+            _ascend_with_idle_blocks(seen, objective.acting)
         _ascend(seen)
     if seen.dimension <= MODELLED:
         _climb(seen)
@@ -99,39 +109,105 @@ class _Seen:
 
 def _ascend(seen: _Seen) -> None:
     """L-BFGS-B from every start; a value of ``-inf`` is shown to it as the lowest that is finite."""
-    from scipy.optimize import minimize
-
     lowest = float(seen.values.min())
 
     def descent(scaled: Array) -> tuple[float, Array]:
         value, gradient = seen.with_gradient(scaled / LONGEST)
         return -max(value, lowest), -gradient / LONGEST
 
-    box = [(0.0, LONGEST)] * seen.dimension
     for start in seen.starts():
         if not seen.objective.remaining:
             return
-        minimize(
-            descent,
-            start * LONGEST,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=box,
-            options={
-                "maxfun": seen.objective.remaining,
-                "maxiter": seen.objective.remaining,
-                "ftol": 1e-16,
-                "gtol": 0.0,
-            },
-        )
+        _minimise(descent, start, seen.objective.remaining)
+
+
+def _ascend_with_idle_blocks(seen: _Seen, acting: Callable[[], np.ndarray]) -> None:
+    """L-BFGS-B in the blocks that act, from the best point, while the idle ones are placed anew for every evaluation
+    (`IdleBlocks`).
+
+    A value rests on few blocks of many, and the gradient in the others is 0. To move these costs nothing. Wherever `g`
+    is below its maximum, some index is violated, so that an idle block that comes near it acts; it then joins the
+    ascent. Nothing is done where every block acts.
+    """
+    if not seen.objective.remaining:
+        return
+    idle = IdleBlocks(Box(np.zeros(seen.dimension), np.ones(seen.dimension)), seen.objective.block)
+    best = seen.top
+    value, _ = seen.with_gradient(best)
+    acts = acting()
+    while seen.objective.remaining and acts.any() and not acts.all():
+        ascent = _BlockLoss(seen, acting, idle, _Standing(best, value, acts))
+        with suppress(_NewcomerError):
+            _minimise(ascent, best[ascent.free], seen.objective.remaining)
+        best, value, acts = ascent.best.point, ascent.best.value, ascent.best.acts
+
+
+class _NewcomerError(Exception):
+    """An idle block acts at the best point."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Standing:
+    """A point ``(d,)`` of the unit box, its value, and the blocks ``(D,)`` that act there."""
+
+    point: Array
+    value: float
+    acts: np.ndarray
+
+
+class _BlockLoss:
+    """The loss in the coordinates ``free (d,)`` of the blocks that act at a point ``start``, and its slope; ``best`` is
+    the best point until now."""
+
+    def __init__(self, seen: _Seen, acting: Callable[[], np.ndarray], idle: IdleBlocks, start: _Standing) -> None:
+        self.seen, self.acting, self.idle, self.start, self.best = seen, acting, idle, start, start
+        self.free = np.repeat(start.acts, seen.objective.block)
+        self.lowest = float(seen.values.min())
+
+    def __call__(self, scaled: Array) -> tuple[float, Array]:
+        point = self.start.point.copy()
+        point[self.free] = scaled / LONGEST
+        point = self.idle.placed(point, self.start.acts)
+        value, gradient = self.seen.with_gradient(point)
+        if value > self.best.value:
+            self.best = _Standing(point, value, self.acting())
+            if (self.best.acts & ~self.start.acts).any():
+                raise _NewcomerError
+        return -max(value, self.lowest), -gradient[self.free] / LONGEST
+
+
+def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array, most: int) -> None:
+    """L-BFGS-B in the unit box from ``start (c,)``, with ``most`` evaluations."""
+    from scipy.optimize import minimize
+
+    minimize(
+        loss,
+        start * LONGEST,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(0.0, LONGEST)] * start.size,
+        options={"maxfun": most, "maxiter": most, "ftol": 1e-16, "gtol": 0.0},
+    )
 
 
 def _climb(seen: _Seen) -> None:
-    """The trust region from every start; what a start found is crossed with the best."""
-    for start in seen.starts():
-        found = _climb_from(seen, start)
-        while _cross(seen, found):
-            found = _climb_from(seen, seen.top)
+    """The trust region from every start; what a start found is crossed with the best.
+
+    After the first, the maxima of a separable function that goes through the values are crossed likewise: of one that
+    is separable, or nearly so, these are near the highest hill, however many hills there are.
+    """
+    _climb_and_cross(seen, seen.top)
+    for guess in separable_maxima(seen.points, seen.values):
+        if seen.objective.remaining >= AFFORDED * seen.dimension and _cross(seen, guess):
+            _climb_and_cross(seen, seen.top)
+    for start in seen.starts()[1:]:
+        _climb_and_cross(seen, start)
+
+
+def _climb_and_cross(seen: _Seen, start: Array) -> None:
+    found = _climb_from(seen, start)
+    while _cross(seen, found):
+        found = _climb_from(seen, seen.top)
 
 
 def _climb_from(seen: _Seen, start: Array) -> Array:

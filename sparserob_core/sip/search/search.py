@@ -46,6 +46,13 @@ class Target:
             raise InputError(
                 f"domain: expected a bounded box, got lower {domain.lower.tolist()}, upper {domain.upper.tolist()}"
             )
+        with np.errstate(over="ignore"):
+            too_long = ~np.isfinite(domain.upper - domain.lower)
+        if too_long.any():
+            raise InputError(
+                f"domain: expected sides whose length is a finite number, got {float(domain.lower[too_long][0])!r} to "
+                f"{float(domain.upper[too_long][0])!r}"
+            )
         if self.block < 1 or domain.dimension % self.block:
             raise InputError(f"block: expected a divisor of the dimension {domain.dimension}, got {self.block!r}")
 

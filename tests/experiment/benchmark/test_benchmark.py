@@ -13,7 +13,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.benchmark.landscapes import Landscape, bbob, classic, landscape_of, landscapes, standard
 from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 from sparserob_core.experiment.comparison.profiles import Instance, Profiles
-from sparserob_core.sip.search.search import Target
+from sparserob_core.sip.search.search import Target, maximise
 from tests.support.places import CONFIGS
 
 
@@ -51,7 +51,7 @@ def test_all_but_one_classic_function_are_solved_by_somebody():
 @pytest.mark.skipif(find_spec("ioh") is None, reason="ioh, of the extra bench, is not installed")
 def test_bbob_functions_have_their_maximum_where_ioh_says():
     found = list(bbob())
-    assert len(found) == 48
+    assert len(found) == 48 and {one.target.domain.dimension for one in bbob(2, [3])} == {3}
     for landscape in found[:8]:
         values = landscape.target.function(
             np.random.default_rng(0).uniform(-5.0, 5.0, (50, landscape.target.domain.dimension))
@@ -123,6 +123,31 @@ def test_nobody_exceeds_the_certified_maximum_of_a_landscape_of_g_and_the_gradie
     )
     assert found.expected_running_time(0, "gradient_ascent") <= 200
     assert found.searches[0].best[-1] <= found.searches[0].landscape.maximum * (1 + 1e-6)
+
+
+def pieces(count, *dictionaries):
+    return {f"dictionaries.{name}": {"name": "piecewise_constant", "pieces": count} for name in dictionaries}
+
+
+def test_the_maximum_of_g_is_certified_in_the_units_in_which_g_is_searched():
+    config = CONFIGS / "experiment3_repaired.yaml"  # whose control has a unit of its own, hence the regulariser too
+    landscape = landscape_of(config, 1, "reduced", 20, pieces(20, "control", "disturbance"))
+    found = [search(landscape, name, 100, 0) for name in ("random_search", "sequool")]
+    assert max(found) <= landscape.maximum * (1 + 1e-6) and found[1] >= landscape.maximum * (1 - 1e-6)
+
+
+def test_where_few_indices_of_many_act_searches_with_their_defaults_find_what_chance_does_not():
+    landscape = landscape_of(CONFIGS / "experiment2_repaired.yaml", 1, "reduced", 50, pieces(50, "control"))
+    for seed in range(2):
+        assert search(landscape, "random_search", 100, seed) < 0.95 * landscape.maximum
+        for name in ("simulated_annealing", "sequool", "portfolio"):
+            assert search(landscape, name, 100, seed) > 0.9999 * landscape.maximum
+
+
+def search(landscape, name, budget, seed):
+    """The best value of a search with its defaults, as a run has them."""
+    maximiser = sr.load_registry().build("maximiser", name, {})
+    return maximise(landscape.fresh().target, maximiser, budget, np.random.default_rng(seed)).best_value
 
 
 @pytest.mark.parametrize(

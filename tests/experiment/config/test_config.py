@@ -208,6 +208,9 @@ def test_a_missing_file_and_a_directory_are_told_apart(tmp_path: Path) -> None:
         ("title=@file", """as text it is written 'title="@file"'"""),
         ("title=012", """title: must be text (got 12); as text it is written 'title="012"'"""),
         ("title=1e3", """must be text (got 1000.0); as text it is written 'title="1e3"'"""),
+        ("title=|", """'|' reads as an empty text; as text it is written 'title="|"'"""),
+        ("title=2024-11-28", """(got datetime.date(2024, 11, 28)); as text it is written 'title="2024-11-28"'"""),
+        ("title=?", """a key must be text (got null); as text it is written 'title="?"'"""),
         ("problem.terminal.3.box=1", "problem.terminal is a list with 1 entries"),
         ("problem.terminal.first.box=1", "expected a number of at most 1, got 'first'"),
         ("problem.horizon.x=1", "problem.horizon is 2.0, which has no key 'x'"),
@@ -217,7 +220,7 @@ def test_an_override_at_fault_is_told_like_a_key_at_fault(config: Path, override
     assert said in refusal(config, override)
 
 
-@pytest.mark.parametrize("text", ["run #5", "#5", "*", "@file", "012", "1e3", 'a "b" # c', "it's", "a\\b #"])
+@pytest.mark.parametrize("text", ["run #5", "#5", "*", "@file", "012", "1e3", 'a "b" # c', "it's", "a\\b #", "|"])
 def test_a_value_that_is_written_as_the_refusal_says_is_that_text(text: str, config: Path) -> None:
     (argument,) = shlex.split(quoted(f"title={text}"))
     assert load_config(config, [argument]).config.title == text

@@ -173,10 +173,12 @@ def sparserob_maximisers():
 """
 
 
-@pytest.mark.filterwarnings("ignore:Field name")
 @pytest.mark.parametrize(
     "option",
-    ["budget", "polish", "name", "seed", "callback", "search", "polished", "copy", "model_config", "helper", "origin"],
+    [
+        *("budget", "polish", "name", "seed", "callback", "search", "polished", "copy", "model_config", "helper"),
+        *("origin", "json", "model_fields", "model_dump"),
+    ],
 )
 def test_an_option_that_bears_a_name_in_use_is_refused_when_its_plugin_is_loaded(
     option: str, plugin: Callable[[str], Path]
@@ -193,6 +195,38 @@ def test_an_alias_in_use_and_the_options_of_a_lazy_factory_are_refused_too(plugi
     lazy = SEARCH.format(option="budget: float", factory='"tests.experiment.plugins.test_registry:Lazy"')
     with pytest.raises(sr.PluginError, match="the option 'budget' bears a name"):
         load(plugin(lazy)).check("maximiser", "greedy", {})
+
+
+@pytest.mark.parametrize("option", ["search", "polished", "scaled", "helper"])
+def test_options_of_a_class_of_their_own_bear_no_name_of_the_component_s(
+    option: str, plugin: Callable[[str], Path]
+) -> None:
+    apart = SEARCH.replace("Greedy(sr.Maximiser, sr.Options)", "Greedy(sr.Maximiser)").replace(
+        "    {option} = 7.0\n", "    step = 1.0\n"
+    )
+    code = f"{apart}\nclass Own(sr.Options):\n    step: float = 1.0\n    {option}: float = 7.0\n"
+    with pytest.raises(sr.PluginError, match=rf"the option '{option}' bears a name that its class uses"):
+        load(plugin(code.format(factory="Greedy, options=Own")))
+    load(plugin(code.replace(option + ": float", "other: float").format(factory="Greedy, options=Own")))
+
+
+def test_a_lazy_factory_is_looked_at_when_it_builds(plugin: Callable[[str], Path]) -> None:
+    file = plugin(
+        "import sparserob_core as sr\n"
+        "class Own(sr.Options):\n"
+        "    search: float = 7.0\n"
+        "@sr.hookimpl\n"
+        "def sparserob_maximisers():\n"
+        "    place = 'tests.experiment.plugins.test_registry:Searching'\n"
+        "    yield sr.MaximiserPlugin(name='greedy', factory=place, options=Own, summary='g')\n"
+    )
+    with pytest.raises(sr.PluginError, match=r"the option 'search' bears a name that its class uses"):
+        load(file).build("maximiser", "greedy", {})
+
+
+class Searching(sr.Maximiser):
+    def search(self, objective: sr.Objective, rng: object) -> float:
+        return float("inf")
 
 
 class Lazy(sr.Options):

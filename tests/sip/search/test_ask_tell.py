@@ -478,7 +478,7 @@ def test_target_patience_and_known_points_hold_by_hand_too():
         points = search.ask(1)
         search.tell(points, -bowl(points))
     assert search.best_value <= 0.5
-    assert search.evaluations < 300
+    assert search.evaluations < 300 and search.report().stopped == "the target 0.5 is reached"
     known = (np.array([[0.0, 0.0], [-1.0, 2.0]]), [3.0, 1.0])
     search = sr.ask_tell(BOX, "simulated_annealing", budget=50, minimise=True, known=known, patience=5, polish=0)
     while not search.done:

@@ -111,6 +111,46 @@ def test_gradients_are_used_where_there_are_any(dimension):
     assert report.best_value > (-1e-9 if dimension == 2 else -4.0)
 
 
+HILLS = np.array([[0.3, 0.4, 0.6], [0.9, 1.0, 1.0]])  # a low one within the square, a high one in its corner
+HEIGHTS, WIDTHS = np.array([1.0, 2.0]), np.array([0.6, 0.15])
+
+
+def highest(points, count):
+    """The best of ``count`` points of the cube in three coordinates, which alone decides; and which it is."""
+    blocks = points.reshape(-1, count, 3)
+    away = ((blocks[:, :, np.newaxis] - HILLS) ** 2).sum(axis=3)
+    heights = (HEIGHTS * np.exp(-away / WIDTHS**2)).max(axis=2)
+    return heights.max(axis=1), heights.argmax(axis=1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_blocks_that_do_not_act_find_the_hill_to_which_no_slope_leads(seed):
+    count, last = 40, np.zeros(40, dtype=bool)
+
+    def value(points):
+        values, owner = highest(points, count)
+        last[:] = np.arange(count) == owner[-1]
+        return values
+
+    def slope(point):
+        away = point.reshape(count, 3)[last][0] - HILLS
+        heights = HEIGHTS * np.exp(-(away**2).sum(axis=1) / WIDTHS**2)
+        hill, gradient = heights.argmax(), np.zeros((count, 3))
+        gradient[last] = -2.0 * heights[hill] * away[hill] / WIDTHS[hill] ** 2
+        return gradient.ravel()
+
+    box = sr.Box(np.zeros(3 * count), np.ones(3 * count))
+    start = np.tile(HILLS[0] + 0.05, count) + np.random.default_rng(seed).uniform(-0.01, 0.01, 3 * count)
+    reached = {}
+    for acting in (None, last.copy):
+        objective = CountedObjective(Target(value, box, slope, 3, acting=acting), 60)
+        with suppress(sr.SearchEnded):
+            polish(objective, start[np.newaxis], value(start[np.newaxis]))
+        reached[acting is None] = objective.best_value
+        assert objective.evaluations <= 60
+    assert reached[True] == pytest.approx(HEIGHTS[0]) and reached[False] == pytest.approx(HEIGHTS[1])
+
+
 def test_a_gradient_that_is_zero_where_nothing_is_defined_does_no_harm():
     def half(x):
         return np.where(x[:, 0] > 0.4, -np.inf, cone(x))

@@ -335,8 +335,23 @@ def test_points_known_from_before_are_not_evaluated_and_the_search_goes_on_from_
         ({"known": ([[0.5, 0.5]], [1.0, 2.0])}, "known: expected a value for each point"),
         ({"known": ([[0.5, 2.0]], [1.0])}, "known: expected points of the box"),
         ({"known": 3}, "known: expected points and their values"),
+        ({"callback": 3}, "callback: expected a function of points and values, got 3"),
+        ({"integer": [0]}, "integer: expected an argument of maximise, got one of ask_tell, which takes it"),
     ],
 )
 def test_ends_and_known_points_that_make_no_sense_are_refused(options, words):
     with pytest.raises(sr.InputError, match=words):
         sr.maximise(lambda x: x.sum(axis=1), SLOPE, "sobol", budget=10, **options)
+
+
+def test_no_points_known_from_before_are_none():
+    nothing = np.empty((0, 2)), []
+    reports = [
+        sr.maximise(lambda x: x.sum(axis=1), SLOPE, "sequool", budget=30, known=known) for known in (None, nothing)
+    ]
+    assert np.array_equal(reports[0].trace.points, reports[1].trace.points)
+
+
+def test_sides_whose_length_is_no_finite_number_are_refused():
+    with pytest.raises(sr.InputError, match=r"sides whose length is a finite number, got -1e\+308 to 1e\+308"):
+        sr.maximise(lambda x: x[:, 0], sr.Box([0.0, -1e308], [1.0, 1e308]), "direct", budget=10)

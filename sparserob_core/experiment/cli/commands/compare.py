@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.cli.shell.options import json_option
+from sparserob_core.experiment.cli.shell.options import json_option, watching_options
 from sparserob_core.experiment.terminal.printing import print_json, printable, say
 
 
@@ -33,15 +33,27 @@ from sparserob_core.experiment.terminal.printing import print_json, printable, s
     type=click.Choice(["evaluations", "seconds"]),
     help="For studies: what a run spends; evaluations unless given, or seconds where some runs do not search.",
 )
+@watching_options("the runs")
 @json_option("the comparison as JSON", "the tables")
-def compare(runs: tuple[Path, ...], out: Path, accuracy: float | None, measure: Any, as_json: bool) -> int:
+def compare(
+    runs: tuple[Path, ...],
+    out: Path,
+    accuracy: float | None,
+    measure: Any,
+    watch: bool,
+    save: Path | None,
+    serve: bool,
+    connect: str | None,
+    as_json: bool,
+) -> int:
     """Compare runs of one problem: the lower bounds that they prove, against evaluations and against seconds. Or
     compare the maximisers, solvers or methods of studies over all of their problems.
 
     For runs it prints a table, one row per RUN in the order given, named by what differs between the configs, and draws
     the bounds. An evaluation is a value of g, or for a method that does not search a relaxed program. When a run is
     certified, its value is the exact optimum: the table says after how many evaluations each bound was within 10 %, 1 %
-    and 0.1 % of it.
+    and 0.1 % of it. With --watch, or --save, --serve or --connect, the runs are side by side in the viewer of Rerun
+    too, an optional extra (pip install rerun-sdk).
 
     For studies (each RUN is then a directory that sparserob sweep has left) it prints and draws performance profiles,
     which share of the problems each contender solves within a factor of what the best one needs, and data profiles,
@@ -52,11 +64,17 @@ def compare(runs: tuple[Path, ...], out: Path, accuracy: float | None, measure: 
     from sparserob_core.experiment.comparison.profiles import LISTED, Profiles
     from sparserob_core.experiment.comparison.studies import ACCURACY
     from sparserob_core.experiment.directory.artefacts import finite
+    from sparserob_core.experiment.run.viewer import recorded, recorder
     from sparserob_core.experiment.terminal.table import print_table
 
-    found = side_by_side(runs, out, accuracy=ACCURACY if accuracy is None else accuracy, measure=measure)
+    watched = watch or serve or save is not None or connect is not None
+    watching = [recorder(save, serve, connect)] if watched else []
+    asked: dict[str, Any] = {"accuracy": ACCURACY if accuracy is None else accuracy, "measure": measure}
+    found = side_by_side(runs, out, **asked, observers=watching)
+    recordings = [line for one in watching for line in recorded(one, save)]
     if as_json:
-        print_json(finite(found.summary() if isinstance(found, Profiles) else comparison_summary(found)))
+        summary = found.summary() if isinstance(found, Profiles) else comparison_summary(found)
+        print_json(finite({**summary, **({"remarks": [*summary["remarks"], *recordings]} if recordings else {})}))
         return 0
     tables = [found.table(), found.times_table()] if isinstance(found, Profiles) else [comparison_table(found)]
     for number, (columns, rows) in enumerate(tables):
@@ -66,6 +84,8 @@ def compare(runs: tuple[Path, ...], out: Path, accuracy: float | None, measure: 
         say(printable(line))
     if not found.undrawn:
         say(f"written to {out}")
+    for line in recordings:
+        say(printable(line))
     return 0
 
 

@@ -43,6 +43,10 @@ def parse_value(text: str, parse: Callable[[str], object]) -> object:
         value = parse(given)
     except ConfigError as error:
         raise ConfigError(f"{error}; as text it is written {quoted(text)}") from error
+    if value == "" and given.strip() not in ('""', "''"):  # a block of no lines
+        raise ConfigError(
+            f"override {shown(text)}: {shown(given)} reads as an empty text; as text it is written {quoted(text)}"
+        )
     for mark in re.finditer(r"(?:^|(?<=\s))#", given):
         try:
             comment = parse(given[: mark.start()]) == value
