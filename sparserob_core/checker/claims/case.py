@@ -255,12 +255,16 @@ class Case:
             )
         return [0.0, *(float(self.disturbance.breakpoints[j]) for j in jumps)]
 
+    @property
+    def until(self) -> float:
+        """The last time that anything is said of."""
+        return max(float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1]), self.problem.horizon)
+
     @cached_property
     def grid(self) -> list[float]:
         """Every breakpoint of either dictionary, those of the control as late as it acts."""
         self.clock.check()
-        ends = float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1])
-        last = max(*ends, self.problem.horizon)
+        ends, last = (self.control.breakpoints[-1], self.disturbance.breakpoints[-1]), self.until
         measured = self.control.breakpoints.tolist() if self.answering else []
         every = np.unique(
             [*self.acting, *measured, *self.disturbance.breakpoints.tolist(), *self.problem.system.switches]
@@ -274,7 +278,7 @@ class Case:
     @cached_property
     def flows(self) -> Flows:
         """The flows of the system, over boxes of its parameters and at single ones."""
-        return Flows.of(self.problem.system, self.grid[-1])
+        return Flows.of(self.problem.system, self.until)
 
     @cached_property
     def marks(self) -> list[float]:
