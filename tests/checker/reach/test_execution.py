@@ -134,7 +134,7 @@ def test_integrals_of_fast_modes_are_enclosed_closely(rate: float) -> None:
 
 
 def test_rows_and_their_opposites_are_made_once(execution: Execution) -> None:
-    assert execution.ages(C) is execution.ages(-C)
+    assert execution.absolute(C) is execution.absolute(-C)
 
 
 def test_many_intervals_are_bounded_as_each_alone(execution: Execution) -> None:
