@@ -123,6 +123,7 @@ class Motion:
         every = [one.matrix for one in terms]
         if columns is not None:
             every, off = [one * columns for one in every], off @ Series.known(columns).size
+        every += [every[0] * 0] * (order + 1 - len(every))  # of a system whose series ends
         found = Enclosed.all(every, (order + 1, *off.shape))
         found.rad[0] += off * OUTWARD
         return found

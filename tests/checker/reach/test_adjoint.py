@@ -151,6 +151,16 @@ def test_terms_that_are_left_out_are_in_what_rows_and_inputs_are_off_by(
     assert known.driven.rad.sum(axis=1).max() <= 20.0 * missed.max() * max(heights)
 
 
+def test_rows_of_a_system_whose_series_ends_are_exact() -> None:
+    """``l = (1, s)``, and what an input of 1 adds grows as ``s^2 / 2``."""
+    known = Adjoint.of(Motion.of(arb_mat([[0.0, 1.0], [0.0, 0.0]]), arb_mat([[0.0], [1.0]]), HORIZON, Clock()), C[:2])
+    rows, (sums, rounded) = known.at(TIMES), known.integrals(TIMES)
+    truth = np.stack([np.full(6, 1.0), TIMES + 0.3], axis=1)
+    assert (np.abs(rows.mid - truth) <= rows.rad + 1e-16 * truth).all() and rows.rad.max() < 1e-13
+    added = (TIMES**2 / 2.0 + 0.3 * TIMES)[:, None]
+    assert (np.abs(sums.mid - added) <= sums.rad + rounded + 1e-15 * added).all() and sums.rad.max() < 1e-13
+
+
 def test_what_the_flow_is_off_by_on_a_step_is_in_the_terms_of_rows_and_in_those_after_it() -> None:
     motion, off = Motion.of(arb_mat(A), arb_mat(F), HORIZON, Clock()), np.array([[1.0, 2.0, 3.0]] * 3) * 1e-3
     wide = replace(motion, segment=Segment(motion.segment.terms, motion.segment.off + off))
