@@ -2,8 +2,8 @@
 trajectory, and how large it is at most along all of them.
 
 The rows at the ends of equal steps are vectors of balls, each a product of few matrices; from there on they are floats
-with a radius. Within a step a row, and what an input adds, is a polynomial of the time with a rest. Nothing is as large
-as a transition at every time.
+with a radius. Within a step a row, and what an input adds, is a polynomial of the time: its terms, and what they are
+off by, are those of a segment of the verified flow. Nothing is as large as a transition at every time.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class Motion:
 
     @cached_property
     def bending(self) -> Enclosed:
-        """Fewer of ``l'[A^2, A F, A^2 F]``, ``(J, d, d + 2 q)``."""
+        """The first of ``l'[A^2, A F, A^2 F]``, ``(J, d, d + 2 q)``."""
         once, twice = (Series.known(self.A * one) for one in (self.F, self.A))
         return self._expanded(BENDING, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix)
 

@@ -62,9 +62,9 @@ class Execution:
         """``F_j`` at the ages ``times (k,)`` minus ``points (q,)``, exactly, between ``(k, q, m)`` and ``(k, q, m)``; 0
         before a point."""
         ages, rounded = (part.ravel() for part in subtract_times(times[:, None], points))
-        low, high = self.absolute(c).at(np.maximum(ages, 0.0), rounded)
-        begun, shape = (ages > 0.0)[:, None], (times.size, points.size, self.shares.size)
-        low, high = np.where(begun, np.maximum(low, 0.0), 0.0), np.where(begun, high, 0.0)
+        both = self.absolute(c).at(np.maximum(ages, 0.0), rounded)
+        low, high = (np.where(ages[:, None] > 0.0, one, 0.0) for one in both)
+        shape = times.size, points.size, self.shares.size
         return low.reshape(shape), high.reshape(shape)
 
     def least(self, c: Array, time: float) -> Array:

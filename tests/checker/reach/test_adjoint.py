@@ -384,15 +384,12 @@ def test_integrals_of_support_functions_hold_the_least_and_the_most_and_hardly_m
 
 def test_a_time_that_is_rounded_counts_as_much_as_the_support_function_is_high_near_it() -> None:
     """Also where the step beside is the higher one."""
-    known, times, off = (
-        swept([[1.0], [4.0], [1.0], [1.0], [0.5]], 0.0, [[1.0, -1.0], [2.0]]),
-        np.arange(5) / 2 + 0.1,
-        1e-3,
-    )
+    times, off = np.arange(5) / 2 + 0.1, 1e-3
+    known = swept([[1.0], [4.0], [1.0], [1.0], [0.5]], 0.25, [[1.0, -1.0], [2.0]])
     plain, rough = known.at(times), known.at(times, np.full(5, off))
-    heights = np.array([4.0, 4.0, 4.0, 1.0, 1.0])[:, None] * [1.0, 2.0]
-    np.testing.assert_allclose(rough[1] - plain[1], off * heights, rtol=1e-9)
-    np.testing.assert_allclose(plain[0] - rough[0], off * heights, rtol=1e-9)
+    heights = np.array([4.25, 4.25, 4.25, 1.25, 1.25])[:, None] * [1.0, 2.0]
+    np.testing.assert_allclose(rough[1] - plain[1], off * heights, rtol=1e-8)
+    np.testing.assert_allclose(plain[0] - rough[0], off * heights, rtol=1e-8)
 
 
 def test_sums_of_many_numbers_are_rounded_once() -> None:
@@ -402,3 +399,64 @@ def test_sums_of_many_numbers_are_rounded_once() -> None:
         assert abs(arb(found[4, 1]) - (3 * arb(0.1) - arb(0.3))) < 1e-30
     assert found[:, 0].tolist() == [0.0, 1e16, 1e16 + 1.0, 1.0, 2.0]
     assert module.accumulate_exactly(np.zeros((3, 0))).shape == (4, 0)
+
+
+def test_every_term_of_a_polynomial_counts_in_what_it_is_off_by_and_what_rounding_makes_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def polynomials(unit: float, outward: float) -> tuple[np.ndarray, np.ndarray]:
+        known = swept(TERMS, 0.0, [[1.0]])
+        known.row.driven.rad[:, 1:4, 1] = 1e-3
+        with monkeypatch.context() as patched:
+            told(patched, unit, 0.0, outward)
+            _, off, size = known._polynomials
+        return off[:, 0], size[:, 0]
+
+    sizes = np.abs(TERMS).sum(axis=1)
+    off, size = polynomials(0.0, 1.0)
+    np.testing.assert_allclose(off, 3e-3)
+    np.testing.assert_allclose(size, sizes)
+    np.testing.assert_allclose(polynomials(COARSE, 1.0)[0], 3e-3 + COARSE * (4 * module.ORDER + 1) * sizes)
+    np.testing.assert_allclose(polynomials(0.0, 2.0)[0], 2.0 * off)
+
+
+def test_integrals_are_off_by_what_all_steps_are_and_by_what_their_sum_is_rounded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The side tells what it will of every step: a value, how much more and less, and how large it is."""
+    each, outward, half = np.array([1e17, 1.0, -1e17, 1.0]), 1.5, 1e-7
+
+    def found(P: np.ndarray, *_: np.ndarray) -> tuple[np.ndarray, ...]:
+        count = len(P)
+        values = each if count == each.size else np.ones(count)
+        return values, np.full(count, 0.1), np.full(count, 0.2), np.full(count, 3.0)
+
+    known = swept([[1.0]] * 4, 0.0, [[1.0]])
+    known = replace(known, sides=[cast(Side, SimpleNamespace(swept=found, far=np.ones(1)))])
+    with monkeypatch.context() as patched, ctx.workprec(128):
+        told(patched, COARSE, half, outward)
+        value, more, less = (part[:, 0] for part in known._ends)
+        low, high = (part[:, 0] for part in known.at(np.array([1.75])))
+        _, over, less_here = (part[:, 0] for part in known._parts(np.array([3]), np.array([0.5])))
+    assert value[-1] == 0.5 and value[-2] == 0.25
+    rounded, steps = 4 * module.ORDER * COARSE * 6.0, np.arange(5)
+    np.testing.assert_allclose([over[0], less_here[0]], (np.array([0.1, 0.2]) + rounded) * outward * 0.25)
+    np.testing.assert_allclose(more, steps * over[0] * outward * (1.0 + 4 * COARSE))
+    np.testing.assert_allclose(less, steps * less_here[0] * outward * (1.0 + 4 * COARSE))
+    lost = 4.0 * half * (0.25 + 0.5)
+    assert high[0] == pytest.approx(0.5 + (more[3] + over[0] + lost) * outward, rel=1e-12)
+    assert low[0] == pytest.approx(0.5 - (less[3] + less_here[0] + lost) * outward, rel=1e-12)
+
+
+def test_a_measurable_worst_is_off_by_what_its_integrals_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    linear = Enclosed(np.array([[9.0, 2.0]]), np.array([[9.0, 0.3]]))
+    stub = SimpleNamespace(integrals=lambda times: (linear, np.array([[9.0, 0.05]])))
+    row = replace(worst("measurable"), adjoint=cast(Adjoint, stub))
+    integrals = (np.array([[1.0, 2.0]]), np.array([[1.5, 2.25]]))
+    row.__dict__["_swept"] = SimpleNamespace(at=lambda times: integrals, sides=[None, None])
+    about = 0.15  # the middle of the set
+    with monkeypatch.context() as patched:
+        told(patched, COARSE, 0.0, 1.0)
+        (top,), (rad,) = row._measurable(np.array([1.0]))
+    assert top == pytest.approx(3.375 + 2.0 * about)
+    assert rad == pytest.approx(0.375 + 0.35 * about + 5 * COARSE * (2.0 * about + 3.0 + 3.75), rel=1e-12)
