@@ -36,8 +36,8 @@ def above(ball: arb) -> float:
 def below(ball: arb) -> float:
     """A float that is certainly not above a ball; the ball itself where it is one."""
     return (
-        float(ball.mid())
-        if ball.is_exact() and float(ball.mid()) == ball
+        float(ball)
+        if ball.is_exact() and float(ball) == ball
         else float(np.nextafter(float(ball.lower()), -np.inf))
     )
 

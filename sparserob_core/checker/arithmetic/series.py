@@ -68,7 +68,9 @@ class Series:
     @cached_property
     def size(self) -> Array:
         """How large the entries are at most, ``(rows, columns)``."""
-        return np.asarray(sizes_of([self])[0])
+        entries = np.array([float(x.abs_upper()) for part in self.parts for x in part.entries()])
+        found = np.where(entries > 0.0, entries + TINY, 0.0)
+        return np.asarray(found.reshape(len(self.parts), *self.shape).sum(axis=0) * OUTWARD)
 
     @property
     def middle(self) -> Series:
@@ -142,9 +144,7 @@ class Series:
 
 def sizes_of(series: Sequence[Series]) -> Array:
     """How large the entries of series of one shape are at most, ``(n, rows, columns)``."""
-    entries = np.array([float(x.abs_upper()) for one in series for part in one.parts for x in part.entries()])
-    found = np.where(entries > 0.0, entries + TINY, 0.0)
-    return np.asarray(found.reshape(len(series), len(series[0].parts), *series[0].shape).sum(axis=1) * OUTWARD)
+    return np.array([one.size for one in series])
 
 
 def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
@@ -194,7 +194,7 @@ def around(off: Array) -> arb_mat:
 
 def middles(matrix: arb_mat) -> Array:
     """The middles of balls."""
-    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
+    return np.array([[float(x) for x in row] for row in matrix.tolist()])
 
 
 def norm(matrix: arb_mat) -> arb:

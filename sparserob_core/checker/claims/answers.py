@@ -302,7 +302,7 @@ class Answers:
             rows = [(d * (k + 1), most) for k in range(len(members))]
             ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
             columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
-            reach = np.array([float(length.mid()) for block in blocks for _, length in self._segments[block]])
+            reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
             self._inverses[members] = Seen(stacked(table), pattern, rows, columns, reach).inverse(), blocks
         return self._inverses[members]
 

@@ -512,7 +512,7 @@ class Case:
             answers = import_module("sparserob_core.checker.claims.answers")  # which is about a case
             return np.asarray(answers.answers_of(self).sizes(rows))
         d = self.problem.system.states
-        z = np.array([[(float(x.mid()), float(x.rad())) for x in one.entries()] for one in self.nominal_states])
+        z = np.array([[(float(x), float(x.rad())) for x in one.entries()] for one in self.nominal_states])
         seen = np.delete(z, d, axis=1)  # without the 1
         both = np.zeros((len(rows), seen.shape[1]))
         both[:, :d], both[:, d : d + gains.shape[1]] = rows, gains

@@ -277,7 +277,7 @@ def _cost(case: Case) -> str:
         return _counted(case)
     derived = answers_of(case).cost()
     _agrees("cost", number(case.certificate, "cost"), derived, CANCELLED * compared(case))
-    return f"J = {float(derived.mid()):.12g}{_effort(case)}"
+    return f"J = {float(derived):.12g}{_effort(case)}"
 
 
 def _effort(case: Case) -> str:
@@ -301,7 +301,7 @@ def _counted(case: Case) -> str:
     if case.letters is not None and not np.isin(case.control.control(case.theta), case.letters).all():
         raise Broken(f"the control takes other values than {list(case.letters)}")
     unit = f" {case.problem.names.time}" if case.problem.names.time else ""
-    return f"it acts for {acted * total:.9g}{unit} of {total:.9g}{unit}, J = {float(derived.mid()):.12g}{_effort(case)}"
+    return f"it acts for {acted * total:.9g}{unit} of {total:.9g}{unit}, J = {float(derived):.12g}{_effort(case)}"
 
 
 def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
@@ -309,7 +309,7 @@ def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
 
     off = abs(arb(written) - derived)
     if not off <= arb(FIGURES) * arb(scale).max(abs(derived)):
-        raise Broken(f"{name}: {written!r} is written, {float(derived.mid())!r} is derived")
+        raise Broken(f"{name}: {written!r} is written, {float(derived)!r} is derived")
 
 
 def _fewest(case: Case, status: str) -> str:
@@ -508,10 +508,10 @@ def _exceeded(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> s
     """A constraint is exceeded by ``over``, as the witness says in a figure that is known up to ``slack``."""
     none = excused(case, data, slack)
     if not over > none:
-        raise Broken(f"it leads to a violation of {float(over.mid()):.3g}, up to {none:.3g} is none")
+        raise Broken(f"it leads to a violation of {float(over):.3g}, up to {none:.3g} is none")
     # a figure in doubles is rounded by every step of the state's transition, d + 2 times each; slack is 17 roundings
     rounded = slack * max(1.0, len(case.grid) * (case.problem.system.states + 2) / 17.0)
-    if abs(float(over.mid()) - number(data, "violation")) > 1e-6 * abs(float(over.mid())) + rounded:
-        raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over.mid())!r} is derived")
+    if abs(float(over) - number(data, "violation")) > 1e-6 * abs(float(over)) + rounded:
+        raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over)!r} is derived")
     name, unit = data.get("constraint"), case.measured(str(data.get("constraint")), numbers(data.get("direction"), ""))
     return f"{name} is exceeded by {float(over.lower()):.6g}{unit} at {case.at(number(data, 'time'))}"

@@ -196,7 +196,7 @@ class Duality:
         In a corner of slanted sides the one that bounds most is between these two: the multipliers of the sides take a
         part of what the slope asks for, and a tangent at a control that is off by a little tilts the corner.
         """
-        asked = _shrunk([_exact(-float(s.mid())) for s in slope], sizes)
+        asked = _shrunk([_exact(-float(s)) for s in slope], sizes)
         given = [] if offered is None else [(_within, _shrunk(offered, sizes))]
         offers = []
         for chosen, wanted in ((_within, asked), (_lengthened, at), *given):
@@ -306,7 +306,7 @@ def _most(values: Sequence[arb]) -> arb:
 
 def _shrunk(vector: Sequence[arb], sizes: Sequence[arb]) -> list[arb]:
     """Exact numbers, each nearer to 0 by a size, or 0."""
-    about = [(float(v.mid()), float(size.mid())) for v, size in zip(vector, sizes, strict=True)]
+    about = [(float(v), float(size)) for v, size in zip(vector, sizes, strict=True)]
     return [_exact(np.sign(v) * max(abs(v) - size, 0.0)) for v, size in about]
 
 
@@ -317,7 +317,7 @@ def _within(vector: Sequence[arb], length: arb) -> Sequence[arb]:
 
 def _lengthened(vector: Sequence[arb], length: arb) -> list[arb]:
     """The vector in a direction, of its middle, that is as long as that; 0 where the direction is 0."""
-    vector = [_exact(float(v.mid())) for v in vector]
+    vector = [_exact(float(v)) for v in vector]
     size = _squares(vector)
     return [length * v / size.sqrt() for v in vector] if size > 0 else [_exact(0.0) for _ in vector]
 

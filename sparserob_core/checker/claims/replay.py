@@ -152,7 +152,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         return [float((height - b).mid()) for height, (_, b) in zip(heights, flat, strict=True)], slack
     if name == EQUALS and case.equalities:
         every = missed(case)
-        return [float(off.mid()) for off, _ in every], TOLERANCE * max(added for _, added in every)
+        return [float(off) for off, _ in every], TOLERANCE * max(added for _, added in every)
     window, parameter = case.window(name), numbers(said.get("parameter", []), "parameter")
     asked(case, window, time, parameter)  # of one at the edge of its set, rounded, the worst is compared
     flat, found = window.seen.facets, window.seen.basis
@@ -169,7 +169,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     for piece, k in pieces:
         cells = tube.cells(piece, time, time, z)
         polynomials += cells if beside is None else beside.added(cells, time, time, z, k)
-    limits = [float(b.mid()) for _, b in flat] * (len(polynomials) // max(1, len(flat)))
+    limits = [float(b) for _, b in flat] * (len(polynomials) // max(1, len(flat)))
     over = [float(poly.coefficients[0, 0]) - b for poly, b in zip(polynomials, limits, strict=True)]
     slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(
         case.units(window).resolved.max(initial=0.0)
@@ -195,7 +195,7 @@ def _along_rows(
             low, high = beside(case, window, c, time, (breaks[k] + breaks[k + 1]) / 2)
             (least,), (most,) = erring_at(case, window.split(c)[0], np.array([time]))
             low, high = low + least, high + most
-            over.append(float(top - wide / 3.0 + (low + high) / 2.0) - float(b.mid()))
+            over.append(float(top - wide / 3.0 + (low + high) / 2.0) - float(b))
             slack = max(slack, float(wide + high - low))
     return over, slack
 

@@ -68,7 +68,7 @@ class RowUnits:
         resolved, flat = self.resolved, known(self.shape).facets
         assert flat is not None
         across = np.array(widths(flat))
-        sizes = np.array([abs(float(b.mid())) for _, b in flat])
+        sizes = np.array([abs(float(b)) for _, b in flat])
         sizes = np.maximum(sizes, np.where(np.isfinite(across), across, 0.0))
         if (resolved > sizes).any() and self.nominal is not None:
             sizes = np.maximum(sizes, self.nominal(*self._rows_of(states=False)))
@@ -99,7 +99,7 @@ class RowUnits:
         that figures are compared, nothing is excused."""
         flat = known(self.shape).facets
         assert flat is not None
-        heights = np.array([abs(float(b.mid())) for _, b in flat])
+        heights = np.array([abs(float(b)) for _, b in flat])
         reach, sums = self._measured(self._middle, states=False)
         across, thin = np.array(widths(flat)), THIN * sums[: heights.size]
         both = np.where(across > thin, np.stack([heights, across]), 0.0)
@@ -138,7 +138,7 @@ class RowUnits:
         no less than the ``least`` for that width."""
         shape = known(self.shape)
         if shape.facets is None:
-            width = float(limit.mid()) - float(direction @ shape.centre)
+            width = float(limit) - float(direction @ shape.centre)
             return TOLERANCE * max(width, least(width))
         return TOLERANCE * float(shape.shares(direction) @ facets())
 

@@ -152,7 +152,7 @@ class Beside:
         key = z.tobytes()
         if key not in self._directions:
             exact = (exactly(z) * exactly(self.basis)).entries()
-            floats = [float(x.mid()) for x in exact]
+            floats = [float(x) for x in exact]
             left = [x - _exact(c) for x, c in zip(exact, floats, strict=True)]
             off = [0.0 if x.is_zero() else above(abs(x)) for x in left]
             if len(self._directions) >= DIRECTIONS_KEPT:

@@ -36,11 +36,11 @@ def at_most(
 
     high = [x + support(row) for x, row in zip(a, A, strict=True)]
     low = [x - support([-y for y in row]) for x, row in zip(a, A, strict=True)]
-    slopes = np.array([_slope(float(u.mid()), float(v.mid())) for u, v in zip(high, low, strict=True)])
+    slopes = np.array([_slope(float(u), float(v)) for u, v in zip(high, low, strict=True)])
     heights = [(u * (1 - arb(s))).max(-v * (1 + arb(s))).max(arb(0)) for u, v, s in zip(high, low, slopes, strict=True)]
-    about, table = np.array([float(x.mid()) for x in a]), stacked([[x, *row] for x, row in zip(a, A, strict=True)])
-    rough = np.array([[float(x.mid()) for x in row] for row in A]).reshape(len(a), -1)
-    tall = np.array([float(h.mid()) for h in heights])
+    about, table = np.array([float(x) for x in a]), stacked([[x, *row] for x, row in zip(a, A, strict=True)])
+    rough = np.array([[float(x) for x in row] for row in A]).reshape(len(a), -1)
+    tall = np.array([float(h) for h in heights])
     todo: list[tuple[Array, np.ndarray]] = [(slopes, np.array([bool(h > 0) or not h.is_zero() for h in heights]))]
     count = 0
     while todo:
@@ -56,9 +56,9 @@ def at_most(
                 continue
             if not open_.any():
                 if bound > limit:
-                    raise Broken(f"a disturbance causes the effort {float(bound.mid())!r}")
+                    raise Broken(f"a disturbance causes the effort {float(bound)!r}")
                 raise Unchecked("the largest effort is known too roughly")
-            worst = np.sign(np.array([float(x.mid()) for x in along])) * reach
+            worst = np.sign(np.array([float(x) for x in along])) * reach
             values = about + rough @ worst
             k = int(np.where(open_, tall + signs * values - np.abs(values), -np.inf).argmax())
             rest = open_.copy()

@@ -69,7 +69,7 @@ def walked(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> 
             value = value + (pieces[k].transpose() * push)[0, 0]
             terms += _terms(pieces[k], matrix) * float(end - begin)
             slope[k] = [g + 2 * entry for g, entry in zip(slope[k], push.entries(), strict=True)]
-    sizes = [abs(float(value.mid())), *(abs(float(g.mid())) for entry in slope for g in entry)]
+    sizes = [abs(float(value)), *(abs(float(g)) for entry in slope for g in entry)]
     radii = [float(value.rad()), *(float(g.rad()) for entry in slope for g in entry)]
     exact = max(radii) == 0.0
     blurred = 0.0 if exact else float("inf") if not np.isfinite(sum(radii)) else max(radii) / (max(sizes) or 1.0)
@@ -93,8 +93,8 @@ def nominal_states(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_m
 
 def _terms(z: arb_mat, M: arb_mat) -> float:
     """``|z|' |M| |z|``."""
-    size = np.array([abs(float(entry.mid())) for entry in z.entries()])
-    weight = np.abs([float(entry.mid()) for entry in M.entries()]).reshape(size.size, size.size)
+    size = np.array([abs(float(entry)) for entry in z.entries()])
+    weight = np.abs([float(entry) for entry in M.entries()]).reshape(size.size, size.size)
     return float(size @ weight @ size)
 
 

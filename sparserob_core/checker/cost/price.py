@@ -147,7 +147,7 @@ class Price:
         if norms is None:
             norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), rational(Fraction(0)))
         if not self.is_quadratic:
-            return float(norms.mid())
+            return float(norms)
         found = self._quadratic(pieces)
         constant, linear = self._quadratic(self._still).value, -found.value
         for piece, slope in zip(pieces, found.slope, strict=True):

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from math import comb
+from operator import add
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -89,6 +90,15 @@ class Segment:
     def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
         """`Powers.within` of the flow."""
         return self.powers.within(start, width, order)
+
+    def first(self, count: int) -> tuple[list[Series], Array]:
+        """The first terms, and by how much their sum is off from the flow at most."""
+        return self.terms[:count], (sum((one.size for one in self.terms[count:]), self.off)) * OUTWARD
+
+    @property
+    def end(self) -> Series:
+        """The flow over all of the time; the smallest terms are added up first, which rounds less."""
+        return reduce(add, reversed(self.terms)).within(self.off)
 
     @cached_property
     def powers(self) -> Powers:

@@ -3,17 +3,15 @@ would be right."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.series import middles, norm, stacked
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
+    from flint import arb_mat
 
 SWEEPS = 12  # of balancing
 FAINT = 1e-6  # with 1 a state's own source would be overlooked beside others, with 0 its unit may be that of a speck
@@ -64,30 +62,3 @@ def scaled(matrix: arb_mat, rows: Array, columns: Array) -> arb_mat:
             for line, row in zip(matrix.tolist(), map(float, rows), strict=True)
         ]
     )
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class OwnUnits:
-    """Units ``(d,)`` of the states, powers of two, in which a system's ``matrix`` is small."""
-
-    matrix: arb_mat
-    units: Array
-
-    @staticmethod
-    def of(A: arb_mat, horizon: float, speed: Array) -> OwnUnits:
-        """Those of ``x' = A x`` with sources of about this ``speed (d,)``."""
-        return OwnUnits(A, balanced(middles(A), horizon, speed))
-
-    @cached_property
-    def growth(self) -> arb:
-        """The norm of the matrix in these units."""
-        return norm(self.rows(self.states(self.matrix)))
-
-    def states(self, columns: arb_mat) -> arb_mat:
-        """Columns of states ``(d, n)`` in these units."""
-        return scaled(columns, 1.0 / self.units, np.ones(columns.ncols()))
-
-    def rows(self, rows: arb_mat) -> arb_mat:
-        """Rows on states ``(r, d)``, on such in these units."""
-        return scaled(rows, np.ones(rows.nrows()), self.units)

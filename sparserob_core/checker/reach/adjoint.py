@@ -2,8 +2,8 @@
 trajectory, and how large it is at most along all of them.
 
 The rows at the ends of equal steps are vectors of balls, each a product of few matrices; from there on they are floats
-with a radius. Within a step a row, and what an input adds, is a polynomial of the time with a rest. Nothing is as large
-as a transition at every time.
+with a radius. Within a step a row, and what an input adds, is a polynomial of the time: its terms, and what they are
+off by, are those of a segment of the verified flow. Nothing is as large as a transition at every time.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import ceil, exp, factorial, floor, log2
+from itertools import accumulate
+from math import ceil, comb, factorial, floor, log2
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.series import middles, stacked
-from sparserob_core.checker.flow.units import OwnUnits
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.series import Series, middles, stacked, zeros
+from sparserob_core.checker.flow.segment import Segment, solve
+from sparserob_core.checker.flow.units import balanced
 from sparserob_core.checker.outcome import Clock, Unchecked
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.measurable import Side
@@ -30,10 +33,9 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 ORDER = 13  # of the polynomials
-REST = 2e-15  # of a row's largest term is left of them over a step, at most: more is felt, less takes shorter steps
-SERIES = 128  # terms of what is left that are added up one by one: steps are so short that the last of them is nothing
+REST = 2e-15  # of a row's largest term is left of them over a step, about: more is felt, less takes shorter steps
 LONGEST = 16.0  # size of a system over a step, at most: the terms of its series are then below 1e6, and cancel little
-BENDING = 7  # terms of the bounds of second derivatives
+BENDING = 7  # of the polynomials that bound second derivatives
 MOST_STEPS = 2**17
 BLOCK = 64  # rows in one ball matrix, a power of two: fewer take more calls, more make more that are not needed
 # Steps between rows that are products of ball matrices, a power of two, where all of them would be dear; those between
@@ -53,54 +55,13 @@ SUMMED = 32
 
 @final
 @dataclass(frozen=True, eq=False)
-class Powers:
-    """How large the powers of a matrix are, which is often far less than the power of its ``size``: ``norms (p,)`` of
-    the first of them, after division by that power. The norm is the largest sum of absolute values in a row."""
-
-    size: float
-    norms: Array
-
-    @staticmethod
-    def of(matrix: arb_mat, clock: Clock) -> Powers:
-        """Those of a matrix of balls."""
-        from flint import arb
-
-        size = max((float(sum((abs(x) for x in row), arb(0)).upper()) for row in matrix.tolist()), default=0.0)
-        if not size < 2.0**1000:
-            raise Unchecked("the system is too fast for its horizon to be followed")
-        size = 2.0 ** ceil(log2(max(size * OUTWARD, 2.0**-1000)))  # a power of two divides exactly
-        small, found = matrix * (1 / arb(size)), list[float]()
-        power = small
-        for order in range(ORDER):
-            clock.check()
-            power = power * small if order else small
-            entries = Enclosed.of(power)
-            found.append(min(1.0, float((np.abs(entries.mid) + entries.rad).sum(axis=1).max()) * OUTWARD))
-        return Powers(size, np.array(found))
-
-    def left(self, step: float, order: int) -> float:
-        """A bound of what the exponential series of the matrix times a ``step`` adds after the terms up to an
-        ``order``, which is one of the norms."""
-        short, norms = self.size * step, [1.0, *self.norms.tolist()]
-        while len(norms) <= SERIES:  # of a product the norm is at most the product of the norms
-            norms.append(min(a * b for a, b in zip(norms[1 : ORDER + 1], norms[: -ORDER - 1 : -1], strict=True)))
-        sizes = [1.0]
-        for j in range(1, SERIES + 2):
-            sizes.append(sizes[-1] * short / j)
-        total = sum(a * b for a, b in zip(norms[order + 1 :], sizes[order + 1 : -1], strict=True))
-        return float((total + sizes[-1] * exp(short)) * OUTWARD + TINY)
-
-
-@final
-@dataclass(frozen=True, eq=False)
 class Motion:
-    """What all rows of a system ``x' = A x + F u`` share: steps of a length, in which a row moves little in the states'
-    own ``units``; ``powers`` bound how fast. The length is a power of two, so that places within a step are exact."""
+    """What all rows of a system ``x' = A x + F u`` share: the flow on a ``segment`` of time, a ``step``, of which there
+    are ``count`` one after another. Its length is a power of two, so that places within a step are exact."""
 
     A: arb_mat
     F: arb_mat
-    units: Array
-    powers: Powers
+    segment: Segment
     step: float
     count: int
     clock: Clock
@@ -108,27 +69,32 @@ class Motion:
     @staticmethod
     def of(A: arb_mat, F: arb_mat, horizon: float, clock: Clock) -> Motion:
         """That of rows with inputs through ``F (d, q)`` up to the ``horizon``."""
-        own = OwnUnits.of(A, horizon, np.abs(middles(F)).sum(axis=1))
-        powers = Powers.of(own.rows(own.states(own.matrix)), clock)
-        step = 2.0 ** floor(log2(min(horizon / 64.0, LONGEST / max(powers.size, 1e-300))))
-        while powers.left(step, ORDER) > REST:
-            step /= 2.0
+        from flint import arb
+
+        plain, speed = middles(A), np.abs(middles(F)).sum(axis=1)
+        units = balanced(plain, horizon, speed)
+        step = choose_step(plain * units / units[:, None], horizon)
         count = ceil(horizon / step)
         if not (count <= MOST_STEPS and count * A.nrows() <= MOST):
             raise Unchecked("the system is too fast for its horizon to be followed")
-        return Motion(A, F, own.units, powers, step, count, clock)
+        clock.check()
+        segment = solve([Series.known(A * arb(step))], [Series.known(zeros(A.nrows(), 0))], units)
+        return Motion(A, F, segment, step, count, clock)
 
-    @cached_property
-    def _powers(self) -> list[arb_mat]:
-        """The transition over a step, and what was squared of it."""
-        from flint import arb
-
-        return [(self.A * arb(self.step)).exp()]
+    @property
+    def states(self) -> int:
+        """How many states there are."""
+        return int(self.A.nrows())
 
     @property
     def apart(self) -> int:
         """How many steps are between rows that are products of ball matrices."""
-        return APART if self.count * self.A.nrows() ** 2 > DEAR else 1
+        return APART if self.count * self.states**2 > DEAR else 1
+
+    @cached_property
+    def _powers(self) -> list[arb_mat]:
+        """The transition over a step, and what was squared of it."""
+        return [self.segment.end.matrix]
 
     def over(self, place: int) -> arb_mat:
         """The transition over ``2^place`` steps."""
@@ -141,7 +107,7 @@ class Motion:
     def between(self) -> list[Enclosed]:
         """The transitions over 1, 2, ... steps, fewer than `apart`, ``(1, d, d)`` each."""
         found: list[arb_mat] = []
-        shape = (1, self.A.nrows(), self.A.nrows())
+        shape = (1, self.states, self.states)
         for j in range(1, self.apart):
             self.clock.check()
             place = floor(log2(j))
@@ -149,44 +115,48 @@ class Motion:
             found.append(power if j == 2**place else found[j - 2**place - 1] * power)
         return [Enclosed.all([one], shape) for one in found]
 
-    def _expanded(self, first: arb_mat) -> Enclosed:
-        """The terms ``(p + 1, d, n)`` of ``e^{A r}`` times a matrix ``(d, n)``, in the share of a step that ``r``
-        is."""
-        from flint import arb
-
-        terms = [first]
-        for order in range(1, ORDER + 1):
-            self.clock.check()
-            terms.append(self.A * terms[-1] * (arb(self.step) / order))
-        return Enclosed.all(terms, (ORDER + 1, first.nrows(), first.ncols()))
+    def _expanded(self, order: int, columns: arb_mat | None = None) -> Enclosed:
+        """What makes of a row the terms of ``l`` on the step after it, or of ``l`` times ``columns (d, n)``, up to an
+        ``order``, ``(order + 1, d, n)``; what the others add counts as what the first is off by."""
+        self.clock.check()
+        terms, off = self.segment.first(order + 1)
+        every = [one.matrix for one in terms]
+        if columns is not None:
+            every, off = [one * columns for one in every], off @ Series.known(columns).size
+        every += [every[0] * 0] * (order + 1 - len(every))  # of a system whose series ends
+        found = Enclosed.all(every, (order + 1, *off.shape))
+        found.rad[0] += off * OUTWARD
+        return found
 
     @cached_property
     def rows(self) -> Enclosed:
-        """What makes of a node the terms of the polynomials of ``l`` on the step after it, ``(p + 1, d, d)``."""
-        from flint import arb_mat
-
-        d = self.A.nrows()
-        return self._expanded(arb_mat(d, d, [int(i == j) for i in range(d) for j in range(d)]))
+        """The terms of ``l``, ``(p + 1, d, d)``."""
+        return self._expanded(ORDER)
 
     @cached_property
     def inputs(self) -> Enclosed:
-        """And those of ``l'F``, ``(p + 1, d, q)``."""
-        return self._expanded(self.F)
+        """Those of ``l'F``, ``(p + 1, d, q)``."""
+        return self._expanded(ORDER, self.F)
 
     @cached_property
-    def bending(self) -> list[Enclosed]:
-        """Terms of ``e^{A r} [A^2, A F, A^2 F]``, ``(1, d, d + 2 q)`` each."""
-        from flint import arb, arb_mat
+    def bending(self) -> Enclosed:
+        """The first of ``l'[A^2, A F, A^2 F]``, ``(J, d, d + 2 q)``."""
+        once, twice = (Series.known(self.A * one) for one in (self.F, self.A))
+        return self._expanded(BENDING, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix)
 
-        once = self.A * self.F
-        every = zip((self.A * self.A).tolist(), once.tolist(), (self.A * once).tolist(), strict=True)
-        term, found = arb_mat([[*a, *b, *c] for a, b, c in every]), []
-        for order in range(BENDING + 1):
-            self.clock.check()
-            if order:
-                term = self.A * term * (arb(self.step) / order)
-            found.append(Enclosed.all([term], (1, term.nrows(), term.ncols())))
-        return found
+
+def choose_step(A: Array, horizon: float) -> float:
+    """The length of a step, a power of two, after which about `REST` of a row is beyond the terms of its polynomial;
+    ``A`` is in units in which it is small. By floats, since what is beyond is bounded wherever the step ends: powers of
+    a matrix are often far less than the power of its norm."""
+    size = float(np.abs(A).sum(axis=1).max(initial=0.0))
+    if not size < 2.0**1000:
+        raise Unchecked("the system is too fast for its horizon to be followed")
+    if not size:
+        return 2.0 ** floor(log2(horizon / 64.0))
+    last = float(np.abs(np.linalg.matrix_power(A / size, ORDER + 1)).sum(axis=1).max())
+    share = (REST * factorial(ORDER + 1) / max(last, TINY)) ** (1.0 / (ORDER + 1))
+    return 2.0 ** floor(log2(min(horizon / 64.0, min(share, LONGEST) / size)))
 
 
 @final
@@ -242,27 +212,9 @@ class Adjoint:
         return int(self.nodes.mid.shape[0]) - 1
 
     @cached_property
-    def sizes(self) -> Array:
-        """The sums of the absolute values of ``l`` in own units at the ends of steps, ``(N + 1,)``."""
-        return np.asarray(((np.abs(self.nodes.mid) + self.nodes.rad) * self.motion.units).sum(axis=1) * OUTWARD)
-
-    @cached_property
-    def left(self) -> Array:
-        """What is left of the expansion of ``l``, in the same sums, ``(N,)``."""
-        return np.asarray(self.sizes[:-1] * self.motion.powers.left(self.step, ORDER) * OUTWARD)
-
-    @cached_property
-    def pushes(self) -> Array:
-        """How large a row of ``F`` is in own units, ``(q,)``."""
-        F = Enclosed.of(self.motion.F)
-        return np.asarray(((np.abs(F.mid) + F.rad) / self.motion.units[:, None]).max(axis=0, initial=0.0) * OUTWARD)
-
-    @cached_property
     def driven(self) -> Enclosed:
         """The terms ``(N, p + 1, q)`` of ``l'F`` on every step, the rest among their radii, at the first."""
-        mid, rad = _product(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.motion.inputs)
-        rad[:, 0] += self.left[:, None] * self.pushes
-        return Enclosed(mid, rad * OUTWARD)
+        return Enclosed(*_product(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.motion.inputs))
 
     @cached_property
     def _weights(self) -> Array:
@@ -272,18 +224,12 @@ class Adjoint:
     def sums(self) -> Enclosed:
         """``int l'F`` up to the end of every step, ``(N + 1, q)``; the radius grows from step to step by what the terms
         of the step are off, so that what the difference of two is off is the difference of their radii."""
-        from flint import arb
-
         moved, size = (
             self.step * np.einsum("kjq,j->kq", part, self._weights)
             for part in (self.driven.mid, np.abs(self.driven.mid))
         )
         rad = self.step * np.einsum("kjq,j->kq", self.driven.rad, self._weights) + rounding(ORDER + 2) * size
-        totals = [[arb(0)] * moved.shape[1]]
-        for row in moved.tolist():
-            totals.append([a + b for a, b in zip(totals[-1], row, strict=True)])
-        mid = np.array([[float(x.mid()) for x in row] for row in totals])
-        return Enclosed(mid, np.vstack([np.zeros((1, mid.shape[1])), np.cumsum(rad, axis=0)]) * OUTWARD)
+        return Enclosed(accumulate_exactly(moved), _accumulated(rad) * OUTWARD)
 
     def placed(self, times: Array) -> tuple[np.ndarray, Array]:
         """The step of every time, and the share of it that has passed, exactly."""
@@ -293,7 +239,7 @@ class Adjoint:
     def at(self, times: Array) -> Enclosed:
         """``l`` at exact times ``(k,)``, ``(k, d)``."""
         steps, shares = self.placed(times)
-        mid, rad = np.empty((times.size, self.motion.units.size)), np.empty((times.size, self.motion.units.size))
+        mid, rad = np.empty((2, times.size, self.motion.states))
         whole = shares == 0.0
         mid[whole], rad[whole] = self.nodes.mid[steps[whole]], self.nodes.rad[steps[whole]]
         others = np.flatnonzero(~whole)
@@ -307,7 +253,7 @@ class Adjoint:
             chosen = terms[which]
             mid[here] = np.einsum("kjd,kj->kd", chosen, powers)
             lost = np.einsum("kjd,kj->kd", off[which] + rounding(3 * ORDER) * np.abs(chosen), powers)
-            rad[here] = (lost + self.left[steps[here]][:, None] / self.motion.units) * OUTWARD
+            rad[here] = lost * OUTWARD
         return Enclosed(mid, rad)
 
     def integrals(self, times: Array) -> tuple[Enclosed, Array]:
@@ -342,19 +288,72 @@ class Adjoint:
         """On every step bounds of ``|l''|``, ``(N, d)``, of ``|l'AF|`` and of ``|l'A^2 F|``, ``(N, q)``."""
         if self.opposite is not None:
             return self.opposite.bends
-        motion = self.motion
-        d, q, first = motion.A.nrows(), motion.F.ncols(), motion.bending[0]
-        rest = motion.powers.left(self.step, BENDING)
-        heights = ((np.abs(first.mid[0]) + first.rad[0]) / motion.units[:, None]).max(axis=0)
-        found = self.sizes[:-1, None] * rest * heights
+        d, q, terms = self.motion.states, self.motion.F.ncols(), self.motion.bending
+        found = np.zeros((self.count, d + 2 * q))
         several = max(1, AT_ONCE // (d + 2 * q))
         for start in range(0, self.count, several):
             steps = slice(start, min(start + several, self.count))
-            for term in motion.bending:
-                mid, rad = _product(Enclosed(self.nodes.mid[steps], self.nodes.rad[steps]), term)
+            for one in zip(terms.mid[:, None], terms.rad[:, None], strict=True):
+                mid, rad = _product(Enclosed(self.nodes.mid[steps], self.nodes.rad[steps]), Enclosed(*one))
                 found[steps] += np.abs(mid[:, 0]) + rad[:, 0]
         found *= OUTWARD
         return found[:, :d], found[:, d : d + q], found[:, d + q :]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SupportIntegrals:
+    """The integrals from 0 on of the support functions of some ``sides`` at the ``columns`` of ``l'F`` of one ``row``:
+    one for every side."""
+
+    row: Adjoint
+    columns: slice
+    sides: Sequence[Side | Curve]
+
+    @cached_property
+    def _polynomials(self) -> tuple[Array, Array, Array]:
+        """Those of every step in powers of ``u`` from -1 to 1 across it, ``(N, p + 1, w)``, by how much they and sums
+        of two of their values are off, and how large they are, ``(N, w)`` each."""
+        mid, rad = (part[:, :, self.columns] for part in (self.row.driven.mid, self.row.driven.rad))
+        size = np.abs(mid).sum(axis=1) * OUTWARD  # in other powers not more, since ``|v| <= (1 + |u|) / 2``
+        off = rad.sum(axis=1) + (rounding(2 * ORDER) + rounding(size.shape[1] + 2 * ORDER)) * size
+        return np.einsum("ij,kjw->kiw", CENTRED, mid), off * OUTWARD, size
+
+    @cached_property
+    def _heights(self) -> Array:
+        """How large the support functions are at most, on every step and its neighbours, ``(N, S)``."""
+        _, off, size = self._polynomials
+        found = (size + off) @ np.array([side.far for side in self.sides]).T * OUTWARD
+        around = np.pad(found, ((1, 1), (0, 0)), mode="edge")
+        return np.asarray(np.maximum(found, np.maximum(around[:-2], around[2:])))
+
+    def _parts(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array, Array]:
+        """The integrals over the first ``shares (k,)`` of steps ``(k,)``, and by how much more and less they may be,
+        ``(k, S)`` each."""
+        P, off, size = (part[steps] for part in self._polynomials)
+        found = []
+        for side in self.sides:
+            value, more, less, tops = side.swept(P, off, size, 2.0 * shares - 1.0)
+            rounded = rounding(4 * ORDER) * 2.0 * tops
+            found.append((value, (more + rounded) * OUTWARD, (less + rounded) * OUTWARD))
+        value, more, less = (np.stack(part, axis=1) * (self.row.step / 2.0) for part in zip(*found, strict=True))
+        return value, more, less
+
+    @cached_property
+    def _ends(self) -> tuple[Array, Array, Array]:
+        """The same over all steps before each, ``(N + 1, S)``."""
+        value, more, less = self._parts(np.arange(self.row.count), np.ones(self.row.count))
+        outward = OUTWARD * (1.0 + rounding(self.row.count))
+        return accumulate_exactly(value), _accumulated(more) * outward, _accumulated(less) * outward
+
+    def at(self, times: Array, rounded: Array | float = 0.0) -> tuple[Array, Array]:
+        """The integrals up to ``times (k,)``, which are off by what is ``rounded``: between ``(k, S)`` and
+        ``(k, S)``."""
+        steps, shares = self.row.placed(times)
+        (value, more, less), inside = (part[steps] for part in self._ends), self._parts(steps, shares)
+        found = value + inside[0]
+        lost = np.asarray(rounded)[..., None] * self._heights[steps] + 4.0 * HALF_ULP * (np.abs(value) + np.abs(found))
+        return found - (less + inside[2] + lost) * OUTWARD, found + (more + inside[1] + lost) * OUTWARD
 
 
 @final
@@ -402,6 +401,16 @@ def _sum(parts: Sequence[Enclosed]) -> Enclosed:
         mid = mid + part.mid
         rad = rad + part.rad + HALF_ULP * np.abs(mid)
     return Enclosed(mid, rad * OUTWARD)
+
+
+def accumulate_exactly(values: Array) -> Array:
+    """The sums of the first ``0, 1, ..., N`` of ``values (N, q)``, each rounded once."""
+    sums = [accumulate(balls(column), initial=balls([0.0])[0]) for column in values.T]
+    return np.array([[float(x) for x in column] for column in sums]).reshape(-1, len(values) + 1).T
+
+
+def _accumulated(values: Array) -> Array:
+    return np.vstack([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
 
 
 def subtract_times(times: Array, others: Array | float) -> tuple[Array, Array]:
@@ -538,44 +547,27 @@ class Worst:
         return top, rad
 
     @cached_property
-    def _sides(self) -> tuple[Array, list[Side | Curve]]:
+    def _about(self) -> Array:
+        """The middle of the set of a measurable disturbance, ``(mw,)``."""
         assert self.pushed is not None
-        return middle(self.pushed), Side.of(self.pushed)
+        return middle(self.pushed)
 
     @cached_property
-    def _swept(self) -> tuple[Array, Array]:
-        """What a measurable disturbance adds up to the end of every step, but for the middle of its set, and by how
-        much it may be more, ``(N + 1,)`` each."""
-        steps = np.arange(self._row.count)
-        value, more = self._part(steps, np.ones(steps.size))
-        more = more + rounding(self._row.count) * np.abs(value)
-        return np.append(0.0, np.cumsum(value)), np.append(0.0, np.cumsum(more)) * OUTWARD
-
-    def _part(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array]:
-        """The integrals over the first ``shares (k,)`` of steps ``(k,)``, and by how much they may be more."""
-        polynomials, off = (part[steps][:, :, self._mine] for part in (self._row.driven.mid, self._row.driven.rad))
-        moved = np.einsum("ij,kjw->kiw", CENTRED, polynomials)
-        size = np.einsum("ij,kjw->kiw", np.abs(CENTRED), np.abs(polynomials)).sum(axis=1)
-        lost = off.sum(axis=1) + rounding(2 * ORDER) * size
-        value, more = np.zeros(steps.size), np.zeros(steps.size)
-        for side in self._sides[1]:
-            off = lost + rounding(size.shape[1] + 2 * ORDER) * size
-            high, over, less, tops = side.swept(moved, off, size, 2.0 * shares - 1.0)
-            value, more = value + high, more + np.maximum(over, less) + rounding(4 * ORDER) * 2.0 * tops
-        half = self._row.step / 2.0
-        return value * half, more * half * OUTWARD
+    def _swept(self) -> SupportIntegrals:
+        """What it adds, but for the middle of its set."""
+        assert self.pushed is not None
+        return SupportIntegrals(self._row, self._mine, Side.of(self.pushed))
 
     def _measurable(self, times: Array) -> tuple[Array, Array]:
         if isinstance(self.adjoint, Stopped):
             return self._over_ways(self.adjoint, times)
-        about, _ = self._sides
-        steps, shares = self._row.placed(times)
-        inside, more = self._part(steps, shares)
+        low, high = (part.sum(axis=1) for part in self._swept.at(times))
         linear, rounded = self._row.integrals(times)
         mid, off = linear.mid[:, self._mine], (linear.rad + rounded)[:, self._mine]
-        top = self._swept[0][steps] + inside + mid @ about
-        rad = self._swept[1][steps] + more + off @ np.abs(about)
-        return top, rad + rounding(about.size + 2) * (np.abs(mid) @ np.abs(about) + np.abs(top))
+        top = (low + high) / 2.0 + mid @ self._about
+        size = np.abs(mid) @ np.abs(self._about) + np.abs(low) + np.abs(high)
+        lost = rounding(len(self._swept.sides) + self._about.size + 2) * size
+        return top, (high - low) / 2.0 + off @ np.abs(self._about) + lost
 
     def _over_ways(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:
         """`_measurable` of what is integrated, once for all ``times (k,)``."""
@@ -583,7 +575,7 @@ class Worst:
         if not stopped.ways or (times < stopped.parts[0][1]).any():
             raise Unchecked("of measurable disturbances one integral at a time is followed")
         top, rad = np.zeros(times.size), np.zeros(times.size)
-        far: Array = np.abs(self._sides[0]) + np.array(known(self.pushed).radius)
+        far: Array = np.abs(self._about) + np.array(known(self.pushed).radius)
         for row, length, rounded in stopped.ways:
             value, more = replace(self, adjoint=row)._measurable(np.full(times.size, length))
             top = top + value
@@ -614,7 +606,7 @@ class Worst:
         """Upper bounds ``(k,)`` on ``[start, stop]``, each between two `cuts`; ``beside (2, k)``: what is added at both
         ends, linear in between."""
         ends, which = np.unique(np.concatenate([start, stop]), return_inverse=True)
-        several = max(1, AT_ONCE // self.adjoint.motion.units.size)  # numbers of every state at every end are many
+        several = max(1, AT_ONCE // self.adjoint.motion.states)  # numbers of every state at every end are many
         parts = [self.most(ends[k : k + several])[0] for k in range(0, ends.size, several)]
         tops = np.concatenate(parts)[which]
         width, bent = (stop - start) * OUTWARD, np.zeros(start.size)
@@ -643,13 +635,5 @@ def _supported(bound: ConvexSet, rows: Enclosed) -> tuple[Array, Array]:
     return (w * rows.mid).sum(axis=1), (more + np.abs(excess)) * OUTWARD
 
 
-def _centred() -> Array:
-    """From powers of a share ``v`` of a step to those of ``u = 2 v - 1``: ``v^j = (1 + u)^j / 2^j``."""
-    found = np.zeros((ORDER + 1, ORDER + 1))
-    for j in range(ORDER + 1):
-        for i in range(j + 1):
-            found[i, j] = factorial(j) / (factorial(i) * factorial(j - i)) / 2.0**j
-    return found
-
-
-CENTRED = _centred()
+# from powers of a share ``v`` of a step to those of ``u = 2 v - 1``: ``v^j = (1 + u)^j / 2^j``
+CENTRED = np.array([[comb(j, i) / 2.0**j for j in range(ORDER + 1)] for i in range(ORDER + 1)])

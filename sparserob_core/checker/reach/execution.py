@@ -10,39 +10,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import accumulate
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Clock
-from sparserob_core.checker.reach.adjoint import CENTRED, ORDER, Adjoint, Motion, subtract_times
+from sparserob_core.checker.reach.adjoint import Adjoint, Motion, SupportIntegrals, subtract_times
 from sparserob_core.checker.reach.kernels import Missed
-from sparserob_core.checker.reach.measurable import signed, swept
-from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
+from sparserob_core.checker.reach.measurable import Side
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Ages:
-    """``|c'e^{A s} B_j|`` for one ``c`` on equal steps: polynomials ``P (N, p + 1, m)`` of ``u`` from -1 to 1 across
-    each, off by at most ``off (N, m)``; integrals up to the end of every step between ``low`` and ``high (N + 1, m)``;
-    and how large it is, ``heights (N, m)``, and how fast it changes, ``steepest (N, m)``, at most."""
-
-    P: Array
-    off: Array
-    low: Array
-    high: Array
-    heights: Array
-    steepest: Array
+    from flint import arb_mat
 
 
 @final
@@ -56,7 +39,7 @@ class Execution(Missed):
     breakpoints: Array
     pieces: Sequence[arb_mat]
     clock: Clock = field(default_factory=Clock)
-    _known: dict[bytes, Ages] = field(default_factory=dict, repr=False)
+    _known: dict[bytes, SupportIntegrals] = field(default_factory=dict, repr=False)
 
     @cached_property
     def motion(self) -> Motion:
@@ -66,47 +49,23 @@ class Execution(Missed):
         B = stacked([[x * (i not in self.problem.commanded) for x in row[:m]] for i, row in enumerate(B.tolist())])
         return Motion.of(A, B, float(self.breakpoints[-1]), self.clock)
 
-    def ages(self, c: Array) -> Ages:
-        """Those of a direction ``c (d,)``, which is exact; its opposite has the same."""
+    def absolute(self, c: Array) -> SupportIntegrals:
+        """The integrals of ``|c'e^{A s} B_j|`` of a direction ``c (d,)``, which is exact; its opposite has the same."""
         exact = c + 0.0
         key = min(exact.tobytes(), (0.0 - exact).tobytes())
         if key not in self._known:
-            row, m = Adjoint.of(self.motion, exact), self.shares.size
-            P, sizes = (np.einsum("ij,kjw->kiw", *pair) for pair in (
-                (CENTRED, row.driven.mid), (np.abs(CENTRED), np.abs(row.driven.mid))
-            ))  # fmt: skip
-            # in other powers, and as they are summed
-            off = (row.driven.rad.sum(axis=1) + rounding(6 * ORDER + 32) * sizes.sum(axis=1)) * OUTWARD
-            value, more, less = (part.reshape(-1, m) for part in swept(*signed(P, off), np.ones(len(P) * m)))
-            half = row.step / 2.0  # a power of two
-            sums = zip(*map(_accumulated, value.T), strict=True)
-            totals = np.array([[float(x.mid()) for x in line] for line in sums])
-            outward = OUTWARD * (1.0 + rounding(len(P)))
-            lost = [np.vstack([np.zeros((1, m)), np.cumsum(part, axis=0)]) * outward for part in (less, more)]
-            ends = 4.0 * HALF_ULP * totals
-            low, high = (totals - lost[0] - ends) * half, (totals + lost[1] + ends) * half
-            heights = np.abs(P).sum(axis=1) + off
-            self._known[key] = Ages(P, off, low, high, heights * OUTWARD, row.bends[1])
+            ends = np.eye(self.shares.size)
+            sides = [Side(np.stack([one, -one]), 0.0 * ends[:2]) for one in ends]
+            self._known[key] = SupportIntegrals(Adjoint.of(self.motion, exact), slice(None), sides)
         return self._known[key]
 
     def integrals(self, c: Array, times: Array, points: Array) -> tuple[Array, Array]:
         """``F_j`` at the ages ``times (k,)`` minus ``points (q,)``, exactly, between ``(k, q, m)`` and ``(k, q, m)``; 0
         before a point."""
-        known, m, step = self.ages(c), self.shares.size, self.motion.step
         ages, rounded = (part.ravel() for part in subtract_times(times[:, None], points))
-        place = np.clip(np.floor(np.maximum(ages, 0.0) / step).astype(int), 0, len(known.P) - 1)
-        ends = np.clip(2.0 * (np.maximum(ages, 0.0) - place * step) / step - 1.0, -1.0, 1.0)
-        P, off = known.P[place], known.off[place]
-        value, more, less = (one.reshape(-1, m) for one in swept(*signed(P, off), np.repeat(ends, m)))
-        # the exact age is within what is rounded, which is far less than a step
-        near = np.maximum(known.heights[place], known.heights[np.maximum(place - 1, 0)])
-        near = np.maximum(near, known.heights[np.minimum(place + 1, len(known.P) - 1)])
-        late = (rounded[:, None] + HALF_ULP * step) * near + rounding(4) * np.abs(value) * step / 2.0
-        low = known.low[place] + (value - less) * (step / 2.0) - late
-        high = known.high[place] + (value + more) * (step / 2.0) + late
-        size = rounding(4) * (np.abs(low) + np.abs(high))
-        begun, shape = (ages > 0.0)[:, None], (times.size, points.size, m)
-        low, high = np.where(begun, np.maximum(low - size, 0.0), 0.0), np.where(begun, high + size, 0.0)
+        both = self.absolute(c).at(np.maximum(ages, 0.0), rounded)
+        low, high = (np.where(ages[:, None] > 0.0, one, 0.0) for one in both)
+        shape = times.size, points.size, self.shares.size
         return low.reshape(shape), high.reshape(shape)
 
     def least(self, c: Array, time: float) -> Array:
@@ -146,17 +105,12 @@ class Execution(Missed):
     def bent_over(self, c: Array, start: Array, stop: Array) -> Array:
         """`bent` on intervals from ``start (k,)`` to ``stop (k,)``."""
         which, change, off = self.jumps
-        steepest, step = self.ages(c).steepest, self.motion.step
+        steepest, step = self.absolute(c).row.bends[1], self.motion.step
         ages = np.stack([start, stop])[:, :, None] - self.breakpoints[which]
         places = np.clip(np.floor(ages / step).astype(int) + np.array([-1, 1])[:, None, None], 0, len(steepest) - 1)
         tops = _tallest(steepest, places[0], places[1] + 1)
         total = ((np.abs(change) + off) * tops * (ages[1] > 0.0)[..., None]).sum(axis=(1, 2))
         return np.asarray((stop - start) ** 2 / 8.0 * total * (1.0 + rounding(change.size + 16)))
-
-
-def _accumulated(values: Array) -> list[arb]:
-    """The sums of the first ``0, 1, ..., n`` of ``values (n,)``, without rounding that one would notice."""
-    return list(accumulate(balls(values), initial=balls([0.0])[0]))
 
 
 def _tallest(values: Array, first: np.ndarray, last: np.ndarray) -> Array:

@@ -82,7 +82,7 @@ class Pushed:
 def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
     from flint import fmpq, fmpq_mat
 
-    return fmpq_mat([[fmpq(*float(x.mid()).as_integer_ratio()) for x in row] for row in rows])
+    return fmpq_mat([[fmpq(*float(x).as_integer_ratio()) for x in row] for row in rows])
 
 
 @final

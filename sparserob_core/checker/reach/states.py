@@ -147,7 +147,7 @@ class States:
         rows = stacked([balls(row) for row in basis])
         state = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in terms])
         state.rad[0, 0] += np.abs(basis) @ off * OUTWARD
-        lines = self._lines(segment, basis).shifted(float(first.mid()), float(width.mid()), order)
+        lines = self._lines(segment, basis).shifted(float(first), float(width), order)
         carried, found = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
         if scene.disturbance is not None and stop > 0.0:
             past = ring(flow.monomials, carried, self.effect(place)[1])

@@ -110,7 +110,7 @@ def rule() -> tuple[Array, Array]:
 
     with ctx.workprec(128):
         found = [arb.legendre_p_root(NODES, k, weight=True) for k in range(NODES)]
-        nodes, weights = ([float(x.mid()) for x in one] for one in zip(*found, strict=True))
+        nodes, weights = ([float(x) for x in one] for one in zip(*found, strict=True))
     return np.array(nodes), np.array(weights)
 
 

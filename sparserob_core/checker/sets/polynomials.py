@@ -46,7 +46,7 @@ class Enclosed:
     def all(matrices: Sequence[arb_mat], shape: tuple[int, ...]) -> Enclosed:
         """The entries of ball matrices, one matrix after another, row by row, in an array of that shape."""
         entries = [x for matrix in matrices for x in matrix.entries()]
-        mid = np.array([float(x.mid()) for x in entries]).reshape(shape)
+        mid = np.array([*map(float, entries)]).reshape(shape)
         rad = np.array([float(x.rad()) for x in entries]).reshape(shape)
         if not (np.isfinite(mid).all() and np.isfinite(rad).all()):
             raise Unchecked("the response grows beyond what numbers can hold")

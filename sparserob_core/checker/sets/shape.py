@@ -190,7 +190,7 @@ class Shape(ABC):
         """At most ``min sum_i ups_i max(u_i, 0) + downs_i max(-u_i, 0) + slope_i u_i`` over the set; ``ups`` and
         ``downs`` are not negative, and any slope between ``-down`` and ``up`` is below their part."""
         tilt = [
-            s + balls([float(np.clip(-float(s.mid()), -float(down.lower()), float(up.lower())))])[0]
+            s + balls([float(np.clip(-float(s), -float(down.lower()), float(up.lower())))])[0]
             for up, down, s in zip(ups, downs, slope, strict=True)
         ]
         return -self.support([-t for t in tilt])
@@ -241,7 +241,7 @@ def widths(flat: Sequence[Facet]) -> list[float]:
     """For every facet how far it is from the opposite one, in its own measure; infinite where there is none."""
     normals = np.array([c for c, _ in flat]).reshape(len(flat), -1)
     sizes = np.linalg.norm(normals, axis=1)
-    heights = np.array([float(b.mid()) for _, b in flat])
+    heights = np.array([float(b) for _, b in flat])
     turned = normals / sizes[:, None]
     answer = []
     for i in range(len(flat)):
@@ -260,7 +260,7 @@ def facet(flat: Sequence[Facet], direction: Array) -> tuple[int, Fraction]:
             continue
         factor = Fraction(float(direction[place])) / Fraction(float(c[place]))
         if all(Fraction(float(a)) == factor * Fraction(float(b)) for a, b in zip(direction, c, strict=True)):
-            height = float(b.mid()) * float(factor)
+            height = float(b) * float(factor)
             best = min((height, number, factor), best or (np.inf, number, factor))
     if best is None:
         raise Broken(f"{np.asarray(direction).tolist()} is not the normal of a facet")

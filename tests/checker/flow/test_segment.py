@@ -12,7 +12,7 @@ from flint import arb, arb_mat, ctx
 import sparserob_core.checker.flow.segment as segments
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.arithmetic.series import Series, middles
-from sparserob_core.checker.flow.segment import Equation, guess, shifted, solve, verify
+from sparserob_core.checker.flow.segment import Equation, Segment, guess, shifted, solve, verify
 from sparserob_core.checker.outcome import Unchecked
 
 BITS = 192
@@ -220,6 +220,30 @@ def test_parts_of_a_segment_hold_the_flow_with_as_few_terms_as_one_wants(count, 
             assert (off <= found.off + 1e-6).all() and (away <= 4.0 * found.off.max() + 1e-6).all()
         if order == 99:
             assert (off <= found.off * (1 + 1e-9)).all()
+
+
+@pytest.mark.parametrize(("count", "degree"), [(0, 0), (1, 2)])
+def test_the_end_and_the_first_terms_hold_the_flow_with_what_they_are_off_by(count, degree):
+    equation = system(count, degree, size=1.0)
+    one = solve(equation.A, equation.F, np.ones(2))
+    for point in corners(count):
+        inside = at(one.end, point)
+        assert all(a.overlaps(b) for a, b in zip(inside.entries(), flow_at(
+            equation.A, equation.F, point, 1.0).entries(), strict=True))  # fmt: skip
+    for kept in (1, 4, len(one.terms) - 1):
+        terms, off = one.first(kept)
+        assert len(terms) == kept
+        rest = sum(term.size for term in one.terms[kept:])
+        assert (off >= rest + one.off).all() and (off <= (rest + one.off) * (1.0 + 1e-9)).all()
+        for point in corners(count):
+            for share in (0.3, 1.0):
+                assert (missed(terms, equation, point, share) <= off).all()
+    wide = Segment(one.terms, one.off + 1e-3)
+    assert (radii_of(wide.end.parts[0]) >= radii_of(one.end.parts[0]) + 1e-3 * (1.0 - 1e-4)).all()
+
+
+def radii_of(one):
+    return np.array([[float(x.rad()) for x in row] for row in one.tolist()])
 
 
 def test_powers_of_what_is_shifted_are_those_of_binomials_from_above():

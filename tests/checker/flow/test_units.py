@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from sparserob_core.checker.arithmetic.series import middles
 from sparserob_core.checker.flow.still import column, held_about, modes_at
-from sparserob_core.checker.flow.units import OwnUnits, balanced, scaled
+from sparserob_core.checker.flow.units import balanced, scaled
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
@@ -52,10 +52,6 @@ def test_units_that_balance_a_matrix_make_rows_as_large_as_columns():
         # in states that are so many times as large, units are
         again = balanced(A * 1.0, 1.0, speed * 1024.0)
         assert again == pytest.approx(found * 1024.0, rel=1.0)
-        own = OwnUnits.of(matrix(A), 1.0, speed)
-        assert float(own.growth.mid()) == pytest.approx(np.linalg.norm(A / own.units[:, None] * own.units))
-        assert middles(own.states(matrix(A))) == pytest.approx(A / own.units[:, None])
-        assert middles(own.rows(matrix(A))) == pytest.approx(A * own.units)
 
 
 def test_a_drive_of_nothing_but_rounding_does_not_choose_the_units():

@@ -5,17 +5,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from math import factorial
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx
+from scipy.integrate import quad
 
+from sparserob_core.checker.flow.segment import Segment
 from sparserob_core.checker.outcome import Clock, Unchecked
 from sparserob_core.checker.reach import adjoint as module
-from sparserob_core.checker.reach.adjoint import DEAR, Adjoint, Motion, Powers, Worst
+from sparserob_core.checker.reach.adjoint import DEAR, Adjoint, Motion, SupportIntegrals, Worst
+from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Box, Polytope
 
@@ -130,34 +132,62 @@ def test_a_system_that_is_too_fast_is_not_followed() -> None:
         Motion.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), 1.0, Clock())
 
 
-def test_what_is_left_of_an_exponential_series_is_bounded_closely_however_large_the_matrix_is() -> None:
+@pytest.mark.parametrize("order", [3, 5])
+def test_terms_that_are_left_out_are_in_what_rows_and_inputs_are_off_by(
+    order: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With so few terms that what is left out shows: it is added to no more than a few times what it is."""
+    motion = Motion.of(arb_mat(A), arb_mat(F), HORIZON, Clock())
+    monkeypatch.setattr(module, "ORDER", order)
+    known, times = Adjoint.of(motion, C), np.arange(1, 64) * motion.step - motion.step / 1024
+    rows, (sums, rounded) = known.at(times), known.integrals(times)
+    truth = [exact(t) for t in times.tolist()]
+    missed = np.array([np.abs(rows.mid[i] - row) for i, (row, _) in enumerate(truth)])
+    assert (missed <= rows.rad).all() and missed.max() > 1e-12
+    assert rows.rad.max() <= 20.0 * missed.max()
+    added = np.array([np.abs(sums.mid[i] - moved) for i, (_, moved) in enumerate(truth)])
+    assert (added <= sums.rad + rounded).all()
+    heights = [float(np.abs(np.array(truth[i][0]) @ np.array(F)).max()) for i in range(len(truth))]
+    assert known.driven.rad.sum(axis=1).max() <= 20.0 * missed.max() * max(heights)
+
+
+def test_rows_of_a_system_whose_series_ends_are_exact() -> None:
+    """``l = (1, s)``, and what an input of 1 adds grows as ``s^2 / 2``."""
+    known = Adjoint.of(Motion.of(arb_mat([[0.0, 1.0], [0.0, 0.0]]), arb_mat([[0.0], [1.0]]), HORIZON, Clock()), C[:2])
+    rows, (sums, rounded) = known.at(TIMES), known.integrals(TIMES)
+    truth = np.stack([np.full(6, 1.0), TIMES + 0.3], axis=1)
+    assert (np.abs(rows.mid - truth) <= rows.rad + 1e-16 * truth).all() and rows.rad.max() < 1e-13
+    added = (TIMES**2 / 2.0 + 0.3 * TIMES)[:, None]
+    assert (np.abs(sums.mid - added) <= sums.rad + rounded + 1e-15 * added).all() and sums.rad.max() < 1e-13
+
+
+def test_what_the_flow_is_off_by_on_a_step_is_in_the_terms_of_rows_and_in_those_after_it() -> None:
+    motion, off = Motion.of(arb_mat(A), arb_mat(F), HORIZON, Clock()), np.array([[1.0, 2.0, 3.0]] * 3) * 1e-3
+    wide = replace(motion, segment=Segment(motion.segment.terms, motion.segment.off + off))
+    for terms, of_wide, columns in (
+        (motion.rows, wide.rows, np.eye(3)),
+        (motion.inputs, wide.inputs, np.array(F)),
+        (motion.bending, wide.bending, np.hstack([np.array(A) @ A, np.array(A) @ F, np.array(A) @ A @ F])),
+    ):
+        more = of_wide.rad - terms.rad
+        np.testing.assert_allclose(more[0], off @ np.abs(columns), rtol=1e-6)
+        assert not more[1:].any()
+    onward = Enclosed.of(wide.over(0)).rad - Enclosed.of(motion.over(0)).rad
+    assert (onward >= off * (1.0 - 1e-6)).all()
+
+
+def test_steps_are_as_long_as_powers_of_the_system_allow_and_not_its_norm() -> None:
     """``[[-1, 40], [0, -2]]`` has powers that are far smaller than those of its norm."""
-    matrix = [[-1.0, 40.0], [0.0, -2.0]]
-    powers = Powers.of(arb_mat(matrix), Clock())
-    for step, order in ((0.01, 13), (0.1, 13), (0.25, 7), (0.01, 7)):
-        with ctx.workprec(400):
-            term, whole = arb_mat([[1, 0], [0, 1]]), (arb_mat(matrix) * arb(step)).exp()
-            for j in range(order + 1):
-                whole, term = whole - term, term * arb_mat(matrix) * (arb(step) / (j + 1))
-            exact = max(float(sum((abs(x) for x in row), arb(0)).mid()) for row in whole.tolist())
-        found = powers.left(step, order)
-        assert exact <= found <= 40.0 * exact
-        short = 41.0 * step
-        assert found < 0.1 * short ** (order + 1) / factorial(order + 1)
-    none = Powers.of(arb_mat([[0.0]]), Clock())
-    assert none.left(1.0, 13) < 1e-200
-
-
-def test_what_is_left_of_an_expansion_is_in_what_inputs_add() -> None:
-    """In own units: the largest entry of every column, times what is left of the row."""
-    known = adjoint()
-    sizes = (np.abs(np.array(F)) / known.motion.units[:, None]).max(axis=0)
-    assert (sizes <= known.pushes).all() and (known.pushes <= sizes * (1 + 1e-9)).all()
-    wide = replace(known)
-    wide.__dict__["left"] = known.left + 1.0
-    grown = wide.driven.rad - known.driven.rad
-    assert (np.abs(grown[:, 0] - known.pushes) <= 1e-9 * known.pushes).all()
-    assert not grown[:, 1:].any()
+    slow, fast = (module.choose_step(np.array(one), 1e3) for one in ([[-1.0, 40.0], [0.0, -2.0]], [[-41.0]]))
+    assert slow >= 4.0 * fast
+    assert module.choose_step(np.zeros((2, 2)), 64.0) == 1.0
+    assert module.choose_step(np.array([[0.0, 1e6], [0.0, 0.0]]), 64.0) * 1e6 <= module.LONGEST
+    for matrix, speed in (([[-1.0, 40.0], [0.0, -2.0]], 1.0), ([[0.0, 1.0], [-9.0, 0.0]], 3.0)):
+        step = module.choose_step(np.array(matrix), 1e3)
+        motion = Motion.of(arb_mat(matrix), arb_mat([[0.0], [speed]]), 1e3, Clock())
+        left = motion.segment.first(module.ORDER + 1)[1]
+        assert motion.step == step or motion.step >= step / 4.0
+        assert left.max() <= 40.0 * 8.0 * module.REST
 
 
 def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
@@ -229,7 +259,10 @@ def radii(kind: str) -> dict[str, np.ndarray]:
         "supported": module._supported(Box([-0.2], [0.5]), Enclosed(np.array([[0.7]]), np.array([[1e-9]])))[1],
     }
     if kind == "measurable":
-        found |= {"swept": row._swept[1][1:], "part": row._part(np.array([3, 9]), np.array([0.25, 0.75]))[1]}
+        steps, shares = np.array([3, 9]), np.array([0.25, 0.75])
+        for name, (_, over, less) in (("ends", row._swept._ends), ("parts", row._swept._parts(steps, shares))):
+            found |= {f"{name} above": over[1:], f"{name} below": less[1:]}
+        found["swept"] = np.subtract(*row._swept.at(times)[::-1])
         found["measurable"] = row._measurable(times)[1]
     return found
 
@@ -308,3 +341,122 @@ def test_what_is_left_of_the_expansion_of_a_bend_is_in_its_bound(rate: float, mo
     for bound, power in ((rows, 2), (once, 1), (twice, 2)):
         assert (rate**power * ends <= bound).all()
         assert (bound <= rate**power * ends * (1.0 + 1e-9)).all()
+
+
+def swept(mid: list[list[float]], rad: float, sides: list[list[float]], step: float = 0.5) -> SupportIntegrals:
+    """Of a row of which ``l'F`` on every step has these first terms in each of two columns, of which the second is the
+    one that counts."""
+    table = np.zeros((len(mid), module.ORDER + 1, 2))
+    table[:, : len(mid[0]), 1] = mid
+    off = np.zeros_like(table)
+    off[:, 0, 1] = rad
+    row = SimpleNamespace(driven=Enclosed(table, off), count=len(mid), step=step)
+    row.placed = lambda times: Adjoint.placed(cast(Adjoint, row), times)
+    every = [Side(np.array(side)[:, None], np.zeros((len(side), 1))) for side in sides]
+    return SupportIntegrals(cast(Adjoint, row), slice(1, None), every)
+
+
+TERMS = [[-1.0, 3.0, 0.5], [2.0, -0.5, -4.0], [0.3, 1.0, 0.0]]
+
+
+def height(time: float, corners: list[float], moved: float) -> float:
+    step = min(int(time / 0.5), 2)
+    value = np.polynomial.polynomial.polyval(time / 0.5 - step, TERMS[step])
+    return float(max(corner * (value + moved * np.sign(corner)) for corner in corners))
+
+
+@pytest.mark.parametrize("rad", [0.0, 1e-3])
+def test_integrals_of_support_functions_hold_the_least_and_the_most_and_hardly_more(rad: float) -> None:
+    sides = [[1.0, -1.0], [0.5, -2.0]]
+    known, times = swept(TERMS, rad, sides), np.array([0.0, 0.2, 0.5, 0.8, 1.3, 1.5])
+    low, high = known.at(times)
+    for j, corners in enumerate(sides):
+        for i, time in enumerate(times.tolist()):
+            ends = [0.0, *(t for t in (0.5, 1.0) if t < time), time]
+            most, least = (
+                sum(quad(height, a, b, (corners, moved), epsabs=1e-13, limit=200)[0] for a, b in pairwise(ends))
+                for moved in (rad, -rad)
+            )
+            assert low[i, j] <= least + 1e-9 and most <= high[i, j] + 1e-9
+            assert high[i, j] <= most + 6.0 * rad * time + 1e-9 and low[i, j] >= least - 6.0 * rad * time - 1e-9
+            assert rad or high[i, j] - low[i, j] <= 1e-12
+
+
+def test_a_time_that_is_rounded_counts_as_much_as_the_support_function_is_high_near_it() -> None:
+    """Also where the step beside is the higher one."""
+    times, off = np.arange(5) / 2 + 0.1, 1e-3
+    known = swept([[1.0], [4.0], [1.0], [1.0], [0.5]], 0.25, [[1.0, -1.0], [2.0]])
+    plain, rough = known.at(times), known.at(times, np.full(5, off))
+    heights = np.array([4.25, 4.25, 4.25, 1.25, 1.25])[:, None] * [1.0, 2.0]
+    np.testing.assert_allclose(rough[1] - plain[1], off * heights, rtol=1e-8)
+    np.testing.assert_allclose(plain[0] - rough[0], off * heights, rtol=1e-8)
+
+
+def test_sums_of_many_numbers_are_rounded_once() -> None:
+    values = np.array([[1e16, 0.1], [1.0, 0.1], [-1e16, 0.1], [1.0, -0.3]])
+    with ctx.workprec(128):
+        found = module.accumulate_exactly(values)
+        assert abs(arb(found[4, 1]) - (3 * arb(0.1) - arb(0.3))) < 1e-30
+    assert found[:, 0].tolist() == [0.0, 1e16, 1e16 + 1.0, 1.0, 2.0]
+    assert module.accumulate_exactly(np.zeros((3, 0))).shape == (4, 0)
+
+
+def test_every_term_of_a_polynomial_counts_in_what_it_is_off_by_and_what_rounding_makes_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def polynomials(unit: float, outward: float) -> tuple[np.ndarray, np.ndarray]:
+        known = swept(TERMS, 0.0, [[1.0]])
+        known.row.driven.rad[:, 1:4, 1] = 1e-3
+        with monkeypatch.context() as patched:
+            told(patched, unit, 0.0, outward)
+            _, off, size = known._polynomials
+        return off[:, 0], size[:, 0]
+
+    sizes = np.abs(TERMS).sum(axis=1)
+    off, size = polynomials(0.0, 1.0)
+    np.testing.assert_allclose(off, 3e-3)
+    np.testing.assert_allclose(size, sizes)
+    np.testing.assert_allclose(polynomials(COARSE, 1.0)[0], 3e-3 + COARSE * (4 * module.ORDER + 1) * sizes)
+    np.testing.assert_allclose(polynomials(0.0, 2.0)[0], 2.0 * off)
+
+
+def test_integrals_are_off_by_what_all_steps_are_and_by_what_their_sum_is_rounded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The side tells what it will of every step: a value, how much more and less, and how large it is."""
+    each, outward, half = np.array([1e17, 1.0, -1e17, 1.0]), 1.5, 1e-7
+
+    def found(P: np.ndarray, *_: np.ndarray) -> tuple[np.ndarray, ...]:
+        count = len(P)
+        values = each if count == each.size else np.ones(count)
+        return values, np.full(count, 0.1), np.full(count, 0.2), np.full(count, 3.0)
+
+    known = swept([[1.0]] * 4, 0.0, [[1.0]])
+    known = replace(known, sides=[cast(Side, SimpleNamespace(swept=found, far=np.ones(1)))])
+    with monkeypatch.context() as patched, ctx.workprec(128):
+        told(patched, COARSE, half, outward)
+        value, more, less = (part[:, 0] for part in known._ends)
+        low, high = (part[:, 0] for part in known.at(np.array([1.75])))
+        _, over, less_here = (part[:, 0] for part in known._parts(np.array([3]), np.array([0.5])))
+    assert value[-1] == 0.5 and value[-2] == 0.25
+    rounded, steps = 4 * module.ORDER * COARSE * 6.0, np.arange(5)
+    np.testing.assert_allclose([over[0], less_here[0]], (np.array([0.1, 0.2]) + rounded) * outward * 0.25)
+    np.testing.assert_allclose(more, steps * over[0] * outward * (1.0 + 4 * COARSE))
+    np.testing.assert_allclose(less, steps * less_here[0] * outward * (1.0 + 4 * COARSE))
+    lost = 4.0 * half * (0.25 + 0.5)
+    assert high[0] == pytest.approx(0.5 + (more[3] + over[0] + lost) * outward, rel=1e-12)
+    assert low[0] == pytest.approx(0.5 - (less[3] + less_here[0] + lost) * outward, rel=1e-12)
+
+
+def test_a_measurable_worst_is_off_by_what_its_integrals_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    linear = Enclosed(np.array([[9.0, 2.0]]), np.array([[9.0, 0.3]]))
+    stub = SimpleNamespace(integrals=lambda times: (linear, np.array([[9.0, 0.05]])))
+    row = replace(worst("measurable"), adjoint=cast(Adjoint, stub))
+    integrals = (np.array([[1.0, 2.0]]), np.array([[1.5, 2.25]]))
+    row.__dict__["_swept"] = SimpleNamespace(at=lambda times: integrals, sides=[None, None])
+    about = 0.15  # the middle of the set
+    with monkeypatch.context() as patched:
+        told(patched, COARSE, 0.0, 1.0)
+        (top,), (rad,) = row._measurable(np.array([1.0]))
+    assert top == pytest.approx(3.375 + 2.0 * about)
+    assert rad == pytest.approx(0.375 + 0.35 * about + 5 * COARSE * (2.0 * about + 3.0 + 3.75), rel=1e-12)

@@ -134,7 +134,7 @@ def test_integrals_of_fast_modes_are_enclosed_closely(rate: float) -> None:
 
 
 def test_rows_and_their_opposites_are_made_once(execution: Execution) -> None:
-    assert execution.ages(C) is execution.ages(-C)
+    assert execution.absolute(C) is execution.absolute(-C)
 
 
 def test_many_intervals_are_bounded_as_each_alone(execution: Execution) -> None:
@@ -162,3 +162,12 @@ def test_sums_and_jumps_are_off_by_what_is_rounded(execution: Execution) -> None
         off[np.abs(CONTROL.T[which]) > 0.0]
         >= 2e-16 * (SHARES * np.abs(CONTROL.T[which]))[np.abs(CONTROL.T[which]) > 0.0]
     ).all()
+
+
+def test_an_age_that_is_rounded_is_so_in_its_integral(execution: Execution, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = execution.integrals(C, np.array([2.0]), np.zeros(1))
+    coarse = lambda times, points: (times - points, np.full((times - points).shape, 1e-3))  # noqa: E731
+    monkeypatch.setattr("sparserob_core.checker.reach.execution.subtract_times", coarse)
+    low, high = execution.integrals(C, np.array([2.0]), np.zeros(1))
+    speeds = np.array([abs(_height(2.0, j)) for j in range(2)])
+    assert (high[0, 0] - plain[1][0, 0] >= 1e-3 * speeds).all() and (plain[0][0, 0] - low[0, 0] >= 1e-3 * speeds).all()
