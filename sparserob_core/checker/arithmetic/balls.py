@@ -35,11 +35,7 @@ def above(ball: arb) -> float:
 
 def below(ball: arb) -> float:
     """A float that is certainly not above a ball; the ball itself where it is one."""
-    return (
-        float(ball)
-        if ball.is_exact() and float(ball) == ball
-        else float(np.nextafter(float(ball.lower()), -np.inf))
-    )
+    return float(ball) if ball.is_exact() and float(ball) == ball else float(np.nextafter(float(ball.lower()), -np.inf))
 
 
 def difference(a: float, b: float) -> tuple[float, float]:

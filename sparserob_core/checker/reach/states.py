@@ -41,6 +41,8 @@ class States:
     _places: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
     _nodes: dict[int, Series] = field(default_factory=dict, repr=False)
     _driven: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
+    _made: dict[tuple[int, ...], Series] = field(default_factory=dict, repr=False)
+    _inputs: dict[int, Series] = field(default_factory=dict, repr=False)
     _paths: dict[int, Powers] = field(default_factory=dict, repr=False)
     _rows: dict[tuple[int, bytes], tuple[Lines, Segment]] = field(default_factory=dict, repr=False)
     _effects: dict[int, tuple[Enclosed, Enclosed]] = field(default_factory=dict, repr=False)
@@ -81,13 +83,20 @@ class States:
     def _controlled(self, level: int, number: int) -> Series:
         """What the control does on ``2^level`` intervals in a row, ``(d, 1)``."""
         if (level, number) not in self._driven:
-            if not level:
-                d, u = self.flow.states, self.scene.control[self.pieces[number]]
-                found = self._steps[number].columns(d, d + self.flow.driven).applied(u)
+            block, last = self._block(level, number), 2 * number + 1
+            if level:
+                parts = [self._controlled(level - 1, number) for number in (last - 1, last)]
+                key: tuple[int, ...] = (block, *map(id, parts))
             else:
-                before, after = (self._controlled(level - 1, 2 * number + i) for i in range(2))
-                found = self._tables[self._block(level - 1, 2 * number + 1)][0] * before + after
-            self._driven[level, number] = found
+                u = self.scene.control[self.pieces[number]]
+                key = block, id(u)
+            if key not in self._made:  # most of a sparse control is one and the same
+                self._made[key] = (
+                    self._tables[self._block(level - 1, last)][0] * parts[0] + parts[1]
+                    if level
+                    else self._inputs[block].applied(u)
+                )
+            self._driven[level, number] = self._made[key]
         return self._driven[level, number]
 
     def effect(self, mark: int) -> tuple[Enclosed, Enclosed]:
@@ -121,6 +130,7 @@ class States:
                 d, step = self.flow.states, self._steps[number]
                 pushed = step.columns(d + self.flow.driven, None) if self._is_pushed else step.columns(0, 0)
                 self._tables[mine] = step.columns(0, d), pushed
+                self._inputs[mine] = step.columns(d, d + self.flow.driven)
             else:
                 (Phi, early), (onward, late) = (self._tables[self._block(level - 1, 2 * number + i)] for i in range(2))
                 self._tables[mine] = onward * Phi, (onward * early).beside(late)
