@@ -385,8 +385,8 @@ class Case:
 
     @cached_property
     def held(self) -> ConvexSet | None:
-        """The set of the disturbances of which every one stays the same between `changes`: of a system that changes
-        with time, measurable ones are in the middle of their set, and `strayed` says how far they may be from that."""
+        """The set of the disturbances of which every one stays the same between `changes`: where nothing answers
+        them, measurable ones are in the middle of their set, and `strayed` says how far they may be from that."""
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
         if self.answering or not self.measurable or bound is None:
             return bound
@@ -405,7 +405,7 @@ class Case:
 
     @cached_property
     def strayed(self) -> Missed | None:
-        """What measurable disturbances of a system that changes with time do beside the middle of their box: a command
+        """What measurable disturbances do beside the middle of their box, where nothing answers them: a command
         of 1 through the columns of ``E`` that is missed by half the widths; of a polytope all of it at once, counted
         from its middle. ``None`` where there are none."""
         bound = self.problem.measurable
@@ -425,7 +425,7 @@ class Case:
         return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off)
 
     def _missing(self, *errors: Any, **more: Any) -> Missed:
-        """Errors in a system that changes with time, over all of its parameters."""
+        """What is missed at every parameter of the system."""
         if self.flows.box.middle:
             return MissedOver(self.flows, *errors, **more)
         return MissedAt(self.flows.at(()), *errors, **more)

@@ -225,7 +225,7 @@ def _added(case: Case, window: Window, direction: Array, start: Array, stop: Arr
 def _delivered(case: Case) -> Execution | None:
     """How exactly the control is delivered, of a system whose rows are followed."""
     found = case.execution
-    assert found is None or isinstance(found, Execution)  # of one that changes with time none are
+    assert found is None or isinstance(found, Execution)  # they are followed by age there
     return found
 
 

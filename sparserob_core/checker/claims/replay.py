@@ -118,8 +118,8 @@ def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
 def _farthest(
     case: Case, direction: tuple[Array, Array], time: float, parameter: Sequence[float], piece: int | None
 ) -> arb:
-    """The largest ``c'x(t) + gain'u``, ``u`` the control on a ``piece``, under measurable disturbances of a system that
-    changes with time, at a parameter."""
+    """The largest ``c'x(t) + gain'u``, ``u`` the control on a ``piece``, under measurable disturbances, at a
+    parameter."""
     (c, gain), none, strayed = direction, balls([0.0])[0], case.strayed_at(parameter)
     assert strayed is not None
     row = case.duality.row(c, time, parameter, none)

@@ -1,4 +1,4 @@
-"""Errors of execution of a known system that changes with time: what `Execution` is to the others.
+"""What enters at any time, errors of execution and measurable disturbances, through the flow of any system.
 
 The worst of them is the sum of ``share_j |u_jk| int |c'Phi(t, s) B_j(s)| ds`` over the pieces of the command, each cut
 where a segment of the system ends. What the time after a piece makes of its end is a row; ``Phi(end, s) B(s)`` on the
