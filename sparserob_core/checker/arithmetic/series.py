@@ -133,10 +133,6 @@ class Series:
         first, *others = (part.tolist() for part in self.parts)
         return Series(self.monomials, [stacked(first + below.tolist()), *(stacked(part + none) for part in others)])
 
-    def rows(self, count: int) -> Series:
-        """The first rows."""
-        return Series(self.monomials, [stacked(part.tolist()[:count]) for part in self.parts])
-
     def transpose(self) -> Series:
         """The transposed one."""
         return Series(self.monomials, [part.transpose() for part in self.parts])
@@ -200,11 +196,6 @@ def middles(matrix: arb_mat) -> Array:
 def norm(matrix: arb_mat) -> arb:
     """The Frobenius norm, which bounds the 2-norm."""
     return (matrix.transpose() * matrix).trace().nonnegative_part().sqrt()
-
-
-def upper(ball: arb) -> arb:
-    """The upper end of a ball, as an exact number."""
-    return ball.upper()
 
 
 def products(steps: Sequence[Series]) -> list[Series]:

@@ -30,7 +30,7 @@ from sparserob_core.checker.problem.turns import in_turns
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion
 from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.kernels import Missed
+from sparserob_core.checker.reach.kernels import Missed, MissedHere
 from sparserob_core.checker.reach.measurable import Side, Together
 from sparserob_core.checker.reach.missed import MissedAt, MissedOver
 from sparserob_core.checker.reach.scene import Scene
@@ -384,6 +384,12 @@ class Case:
         return Beside(window, basis, gains, self.scene, ends, self.pieces, delivered)
 
     @cached_property
+    def middle(self) -> Array:
+        """The middle of the set of the disturbances, ``(mw,)``; 0 where there are none."""
+        bound = self.problem.disturbance
+        return np.zeros(self.problem.system.disturbances) if bound is None else _middle(bound)
+
+    @cached_property
     def held(self) -> ConvexSet | None:
         """The set of the disturbances of which every one stays the same between `changes`: where nothing answers
         them, measurable ones are in the middle of their set, and `strayed` says how far they may be from that."""
@@ -430,7 +436,7 @@ class Case:
             return MissedOver(self.flows, *errors, **more)
         return MissedAt(self.flows.at(()), *errors, **more)
 
-    def strayed_at(self, parameter: Sequence[float]) -> Missed | None:
+    def strayed_at(self, parameter: Sequence[float]) -> MissedHere | None:
         """`strayed` at one parameter."""
         return None if self.strayed is None else self.strayed.at(parameter)
 
@@ -454,7 +460,7 @@ class Case:
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][: acts.size - 1 if pieces else 0]
         return self._missing(shares, acts, pieces, numb=self.problem.commanded)
 
-    def delivered_at(self, parameter: Sequence[float]) -> Missed | None:
+    def delivered_at(self, parameter: Sequence[float]) -> MissedHere | None:
         """`execution` at one parameter."""
         return None if self.execution is None else self.execution.at(parameter)
 

@@ -38,8 +38,8 @@ MOST_PRECISION = 1024
 VARYING = 96  # more bits for a tree of products, in each level of which balls grow; half of it shows after ten orbits
 SMALL_COST = 1e-6  # of what is added up to a cost: a gap is relative to at least so much
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
-# Of a cost, by which a lower bound that is derived may be above it: what is excused of constraints lets it be, by their
-# multipliers. More is a contradiction between two proofs, of which one is wrong.
+# Of a cost, or of 1, by which a lower bound that is derived may be above it: what is excused of constraints lets it be,
+# by their multipliers. More is a contradiction between two proofs, of which one is wrong.
 CONTRADICTION = 1e-4
 ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
 
@@ -453,7 +453,8 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
     if any(claim.verdict == "not checked" for claim in needed):
         raise Unchecked(f"{status} rests on claims that were not checked")
     cost, lower = number(case.certificate, "cost"), number(case.certificate, "lower_bound")
-    if not case.counts and case.certificate.get("multipliers") is not None:
+    proven = any(claim.name == "lower bound" and claim.verdict == "holds" for claim in claims)
+    if proven and not case.counts and case.certificate.get("multipliers") is not None:
         derived = float(multiplied(case, priced=True).lower())
         if derived > cost + CONTRADICTION * max(1.0, added_up(case)):
             raise Broken(f"no control costs less than {derived!r}, yet one that keeps every constraint costs {cost!r}")

@@ -34,7 +34,7 @@ from sparserob_core.checker.sets.polynomials import HALF_ULP, Enclosed
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.control.problem.names import joined, measured_in, unit_of_row
 from sparserob_core.control.sets.sets import Box
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -429,8 +429,10 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     answers, found = answers_of(case), []
     last = answers.loop.nodes[-1].tolist() if case.answering else _unreached(case, scene)
     for state, value in case.equalities:
-        rests = not case.answering and _rests(case, state)
-        off, responses = (last[state][0] * 0 if rests else last[state][0]) - balls([value])[0], last[state][1:]
+        (reached, *responses), (goal,) = last[state], balls([value])
+        if not case.answering:
+            reached = reached * 0 if _rests(case, state) else reached + pushed_by_middle(case, state)
+        off = reached - goal
         high, low = off + answers.support(responses), answers.support([-x for x in responses]) - off
         found.append((high.max(low), float(sums[state]) + (answers.added(state) if case.answering else 0.0)))
     return found
@@ -442,6 +444,17 @@ def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
     return list(States(case.flows.at(case.nominal_parameter), scene).last.matrix.tolist())
+
+
+def pushed_by_middle(case: Case, state: int) -> arb:
+    """What the disturbance in the middle of its set adds to a state at the end."""
+    (total,), about = balls([0.0]), case.middle
+    if about.any():
+        end, column = case.problem.horizon, stacked([[w] for w in balls(about)])
+        ends = [t for t in case.grid if t < end]
+        for part in case.flows.at(case.nominal_parameter).weights([*ends, end]).disturbance:
+            total = total + (part * column)[state, 0]
+    return total
 
 
 def of_fixed(case: Case) -> str:
@@ -459,22 +472,29 @@ def _reached(case: Case, state: int) -> bool:
     d, m = case.problem.system.states, case.flows.plant.driven
     uncertain = bool(changed[rows, : d + m].any())
     bound = case.problem.disturbance
-    free = [] if bound is None else [w for w, size in enumerate(known(bound).radius) if size > math.ulp(0.0)]
+    free = [] if bound is None else [w for w, axis in enumerate(np.eye(bound.dimension)) if _is_wide(bound, axis)]
     pushed = bool(there[np.ix_(rows, [d + m + w for w in free])].any())
     begun = case.problem.initial_set
     moved = begun is not None and any(known(begun).radius[j] > math.ulp(0.0) for j in reaching)
     return uncertain or pushed or moved
 
 
+def _is_wide(bound: ConvexSet, axis: Array) -> bool:
+    """Whether a set is more than one point along an axis."""
+    width = known(bound).support(balls(axis)) + known(bound).support(balls(-axis))
+    return not width <= math.ulp(0.0)
+
+
 def _rests(case: Case, state: int) -> bool:
     """Whether a state begins at 0 and nothing ever moves it: neither another state that is linked to it, nor a control
-    of the decision, nor a drift."""
+    of the decision, nor a drift, nor the middle of a disturbance."""
     reaching, (there, _) = _linked(case, state), case.flows.links
     m, early = case.problem.system.controls, case.problem.initial_control
     commands = [*case.pieces, *([] if early is None else [stacked([[u] for u in balls(np.asarray(early))])])]
     idle = [all(command[channel, 0].is_zero() for command in commands) for channel in range(m)]
     d, columns = case.problem.system.states, case.flows.plant.driven
     acting = [d + channel for channel in range(columns) if channel >= m or not idle[channel]]
+    acting += [d + columns + int(w) for w in np.flatnonzero(case.middle)]
     driven = bool(there[np.ix_(sorted(reaching), acting)].any())
     return not driven and not any(np.asarray(case.problem.initial_state)[[*reaching]])
 

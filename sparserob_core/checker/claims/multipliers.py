@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.answers import PEAK, WORST, Named, answers_of
 from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
-from sparserob_core.checker.claims.constraints import followed, follows
+from sparserob_core.checker.claims.constraints import followed, follows, pushed_by_middle
 from sparserob_core.checker.claims.duality import EFFORT, Row, before
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -58,7 +58,8 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
             row = _along_adjoint(case, direction, case.problem.horizon, arb(value), disturbed=False)
         else:
             row = case.duality.row(direction, case.problem.horizon, middle, arb(value), disturbed=False)
-        rows.append((multiplier, row))
+        # what is known of a disturbance that does not vary counts; where none may reach the state it is any member
+        rows.append((multiplier, replace(row, constant=row.constant + pushed_by_middle(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
         return rows, None
     pieces, expected = numbers(data.get("pieces"), "pieces"), (case.problem.system.controls, case.control.pieces)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 COARSE = 16
 MOST_MARKS = 2**17  # of the horizon
 KEPT = 4096  # parts of the horizon whose flows are remembered
+WEIGHTS_KEPT = 64  # times whose states are known as sums: of a thousand pieces each takes megabytes
 POINTS_KEPT = 256  # flows at single parameters
 ENOUGH = 2.0**-64  # of a kernel, which goes on as numbers of 53 bits, what its last terms may be: 2^-54 would show
 
@@ -199,7 +200,7 @@ class Flow:
     def about(self, start: float, stop: float) -> tuple[Array, Array, Array]:
         """`over` in floats, off by their rounding, of which units of rows are made, and no claim."""
         phases, d = self.plant.phases, self.states
-        if d < COARSE or any(phase.timed for phase in phases):
+        if d < COARSE or self.plant.is_timed:
             of_states, of_controls, of_disturbances = (middles(one.matrix) for one in self.over(start, stop))
             return of_states, of_controls, of_disturbances
         found = np.hstack([np.eye(d), np.zeros((d, self.plant.inputs))])
@@ -301,6 +302,8 @@ class Flow:
         """What the state at the end of a grid, which begins at 0, is made of, where the parameters are known."""
         key = tuple(grid)
         if key not in self._weights:
+            if len(self._weights) >= WEIGHTS_KEPT:
+                self._weights.clear()
             parts = [self.over(*ends) for ends in pairwise(grid)]
             after = products([part[0] for part in parts])
             control, disturbance = (

@@ -59,6 +59,11 @@ class Plant:
         driven = int(system.controls + (system.c is not None))
         return Plant(tuple(phases), int(system.states), driven, driven + int(system.disturbances))
 
+    @property
+    def is_timed(self) -> bool:
+        """Whether entries may depend on the time."""
+        return any(phase.timed for phase in self.phases)
+
     def looked_at(self, parameter: Sequence[float]) -> Iterator[Array]:
         """``[A B c E]`` at some times, and a parameter."""
         for phase in self.phases:

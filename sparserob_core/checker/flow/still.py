@@ -53,8 +53,3 @@ def held_about(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
     for _ in range(halvings):
         flow, driven = flow @ flow, driven + flow @ driven
     return flow, driven
-
-
-def column(matrix: arb_mat, number: int) -> arb_mat:
-    """One column of a ball matrix."""
-    return stacked([[matrix[i, number]] for i in range(matrix.nrows())])

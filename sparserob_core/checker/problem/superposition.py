@@ -383,7 +383,7 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return problem
     parts = Parts(system, tuple(system.parameters.interior_point().tolist()))
-    if not parts.is_affine:  # then it is expanded, box by box (`SpreadFlow`)
+    if not parts.is_affine:  # then it is expanded, box by box by the flow
         return problem
     d, more = system.states, parts.size - system.states
     corners = [parts.seen(shares) for shares in parts.corners()]

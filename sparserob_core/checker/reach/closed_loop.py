@@ -167,9 +167,9 @@ class ClosedLoop:
         return Phi.matrix, Delta.matrix
 
     def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
-        """Who can see a block of the disturbance along these vectors; of what changes with time from which numbers are
-        other than 0 at any time alone."""
-        if self.flow.law.is_still:
+        """Who can see a block of the disturbance along these vectors; of what may change with time from which numbers
+        are other than 0 at any time alone."""
+        if not self.flow.plant.is_timed:
             return Pushed.of([(one["A"], one["E"]) for one in modes_at(self.system, ())], vectors)
         d, m = self.flow.states, self.flow.driven
         there = self.flow.law.there

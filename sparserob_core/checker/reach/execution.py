@@ -18,7 +18,7 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Clock
 from sparserob_core.checker.reach.adjoint import Adjoint, Motion, SupportIntegrals, subtract_times
-from sparserob_core.checker.reach.kernels import Missed
+from sparserob_core.checker.reach.kernels import MissedHere
 from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Execution(Missed):
+class Execution(MissedHere):
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for."""
 

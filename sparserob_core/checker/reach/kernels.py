@@ -33,8 +33,21 @@ class Added(NamedTuple):
 
 
 class Missed(ABC):
-    """What enters at any time and is known by its size alone, in a known system: errors of execution, and measurable
-    disturbances about the middle of their set."""
+    """What enters at any time and is known by its size alone: errors of execution, and measurable disturbances about
+    the middle of their set."""
+
+    @abstractmethod
+    def at(self, parameter: Sequence[float]) -> MissedHere:
+        """That at one parameter, of which there may be none."""
+
+    @abstractmethod
+    def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
+        """What the worst adds to ``c'x`` at one or two ``times``, between which there is no mark, ``within`` a box of
+        parameters with the monomials on it."""
+
+
+class MissedHere(Missed):
+    """`Missed` of a known system."""
 
     @abstractmethod
     def added(self, c: Array, time: float) -> tuple[float, float]:
@@ -48,13 +61,12 @@ class Missed(ABC):
     def bent(self, c: Array, start: float, stop: float) -> float:
         """How far `added` may be above its chord on ``[start, stop]``, which lies within one piece and one segment."""
 
-    def at(self, parameter: Sequence[float]) -> Missed:
-        """That at one parameter."""
+    def at(self, parameter: Sequence[float]) -> MissedHere:
+        """`Missed.at`."""
         return self
 
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
-        """What the worst adds to ``c'x`` at one or two ``times``, between which there is no mark, ``within`` a box of
-        parameters with the monomials on it."""
+        """`Missed.over`."""
         ends = np.array([self.added(c, time) for time in times])
         off = float((ends[:, 1] - ends[:, 0]).max())
         bent = self.bent(c, times[0], times[-1]) if times[-1] > times[0] else 0.0

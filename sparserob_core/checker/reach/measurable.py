@@ -316,14 +316,14 @@ class MeasurableLoop(ClosedLoop):
         d = self.system.states
         axes = np.vstack([np.eye(d), -np.eye(d)])
         exact = Enclosed(axes, np.zeros_like(axes))
-        alike: dict[int, Array] = {}
+        alike: dict[int, tuple[Kernel, Array]] = {}  # kernels are kept with their numbers
         found = []
         for piece in range(self.blocks):
             kernel = self.kernel(piece)
             if id(kernel) not in alike:
                 ends = kernel.most(exact, self.sides)
-                alike[id(kernel)] = (ends.mid + ends.rad).reshape(2, d).max(axis=0)
-            found.append(alike[id(kernel)])
+                alike[id(kernel)] = kernel, (ends.mid + ends.rad).reshape(2, d).max(axis=0)
+            found.append(alike[id(kernel)][1])
         found += [np.array(known(shape).radius) + np.abs(about) for shape, about in self.sets]
         return np.nextafter(np.concatenate(found) * OUTWARD, np.inf)
 

@@ -21,7 +21,7 @@ from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.flows import Flows
 from sparserob_core.checker.flow.law import Box
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.kernels import Added, Missed, above_chord, pushes
+from sparserob_core.checker.reach.kernels import Added, Missed, MissedHere, above_chord, pushes
 from sparserob_core.checker.reach.measurable import Side, Together, signed, swept
 from sparserob_core.checker.reach.states import enclosed, ring
 from sparserob_core.checker.reach.tube import Around
@@ -41,12 +41,12 @@ MEANS = 1.0 / np.arange(1.0, 257.0)  # of |u|^p from -1 to 1
 
 @final
 @dataclass(eq=False)
-class MissedAt(Missed):
+class MissedAt(MissedHere):
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for. It enters through the columns of ``[B E]`` from the ``first`` one on; the
     errors are known but for ``off (m,)``, and do not reach the ``numb`` states, which add up what is commanded.
     ``side``: what enters by all columns at once, in the place of channels of their own; there is one share of 1 then,
-    and integrals are those of its support function, which is not negative."""
+    and integrals are those of its support function."""
 
     law: Flow
     shares: Array
@@ -91,19 +91,19 @@ class MissedAt(Missed):
         return self.side.far
 
     def least(self, c: Array, time: float) -> Array:
-        """`Missed.least`."""
+        """`MissedHere.least`."""
         found = np.zeros((self.breakpoints.size - 1, self.shares.size))
         low, _, which = self._integrals(c[None], time, np.arange(len(self.marks) - 1))
         np.add.at(found, self.owner[which], np.maximum(low[:, 0], 0.0))
         return found * self.shares * (1.0 - rounding(which.size))
 
     def added(self, c: Array, time: float) -> tuple[float, float]:
-        """`Missed.added`."""
+        """`MissedHere.added`."""
         low, high = self._summed(c[None], time)
         return float(low[0]), float(high[0])
 
     def bent(self, c: Array, start: float, stop: float) -> float:
-        """`Missed.bent`."""
+        """`MissedHere.bent`."""
         d = c.size
         begun = self._summed(np.eye(d), start)[1]
         if self.side is not None:
@@ -120,7 +120,9 @@ class MissedAt(Missed):
             low, high, which = self._integrals(rows, time, np.flatnonzero(np.isin(self.owner, used)))
             owner = self.owner[which]
             mid, rad = self.sizes.mid[owner, None], self.sizes.rad[owner, None]
-            at_least = (np.maximum(low, 0.0) * np.maximum(mid - rad, 0.0)).sum(axis=(0, 2))
+            if self.side is None:  # an absolute value is not negative; the middle of a thin set may be beside it
+                low = np.maximum(low, 0.0)
+            at_least = np.where(low > 0.0, low * np.maximum(mid - rad, 0.0), low * (mid + rad)).sum(axis=(0, 2))
             at_most = (high * (mid + rad)).sum(axis=(0, 2))
             lost = rounding(2 * which.size * self.shares.size + 8) * at_most
             if len(self._added) >= TIMES_KEPT:
@@ -238,18 +240,6 @@ class MissedOver(Missed):
             law, enters = self.flows.at(point), (self.first, self.off, self.numb, self.side)
             self._at[point] = MissedAt(law, self.shares, self.breakpoints, self.pieces, *enters)
         return self._at[point]
-
-    def added(self, c: Array, time: float) -> tuple[float, float]:
-        """`Missed.added` in the middle of the parameters."""
-        return self.at(self.flows.box.middle).added(c, time)
-
-    def least(self, c: Array, time: float) -> Array:
-        """`Missed.least` in the middle of the parameters."""
-        return self.at(self.flows.box.middle).least(c, time)
-
-    def bent(self, c: Array, start: float, stop: float) -> float:
-        """`Missed.bent` in the middle of the parameters."""
-        return self.at(self.flows.box.middle).bent(c, start, stop)
 
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
         """`Missed.over`."""

@@ -45,7 +45,7 @@ class Flat(Shape):
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
         """Where the coordinate planes cut the set (or one that holds it, larger by rounding), what is asked for is
         linear on every part: its least value is attained at a corner of one of them."""
-        rows = tuple((*map(float, c), float(b) if b.is_exact() else above(b)) for c, b in self.holding)
+        rows = tuple((*map(float, c), float(b) if b == float(b) else above(b)) for c, b in self.holding)
         return _least(
             [
                 total(map(_height, ups, downs, slope, map(rational, point)))

@@ -42,6 +42,15 @@ class Compared:
 
 def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Compared:
     """``result.json`` and ``solution.npz`` against the certificate and the config; other files are not looked at."""
+    from flint import ctx
+
+    from sparserob_core.checker.claims.claims import precision_of
+
+    with ctx.workprec(precision_of(case)):
+        return _compared(stored, loaded, case, summary)
+
+
+def _compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Compared:
     found = Compared()
     for name, (different, agrees, left) in (
         ("result.json", _result(loaded, case, summary)),

@@ -11,7 +11,7 @@ import pytest
 from flint import ctx
 
 from sparserob_core.checker.claims.window import Beside, Window
-from sparserob_core.checker.reach.kernels import Missed
+from sparserob_core.checker.reach.kernels import MissedHere
 from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.measurable import as_enclosed
 from sparserob_core.checker.reach.tube import Polynomial
@@ -23,7 +23,7 @@ from tests.support.undriven import undriven
 FAR = np.array([2.0, 0.5, 3.0])
 
 
-class Erring(Missed):
+class Erring(MissedHere):
     """What is added is ``FAR'|c|`` and as much again by a time of 1, and a little more for ``c`` below 0."""
 
     def added(self, c: np.ndarray, time: float) -> tuple[float, float]:

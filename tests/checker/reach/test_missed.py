@@ -1,8 +1,9 @@
-"""Guards checker/reach/missed: errors of execution of systems that change with time: integrals of absolute
+"""Guards checker/reach/missed: what enters at any time: integrals of absolute
 values between closed forms, and their bends."""
 
 from __future__ import annotations
 
+from fractions import Fraction
 from itertools import pairwise
 from types import ModuleType
 
@@ -20,8 +21,9 @@ import sparserob_core.checker.flow.segment as segments
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.measurable import Side
+from sparserob_core.checker.reach.measurable import Side, Together
 from sparserob_core.checker.reach.missed import MissedAt
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
@@ -222,3 +224,18 @@ def test_sizes_are_those_of_absolute_values_and_what_shares_are_off_by_counts_fo
     assert (exact <= found.rad).all() and found.rad == pytest.approx(exact, rel=1e-8)
     plain = MissedAt(law, shares, np.array([0.0, 1.0, 2.0]), pieces).sizes
     assert plain.rad == pytest.approx(np.broadcast_to(shares * 1e-3, (2, 2)), rel=1e-8)
+
+
+def test_a_thin_set_whose_middle_is_rounded_adds_no_less_than_nothing() -> None:
+    """Of the segment from (0, 0) to (1, 1/3) across its own direction: the middle is a rounding away from it."""
+    thin = sr.Polytope(np.array([[-1.0, 3.0], [1.0, -3.0], [1.0, 0.0], [-1.0, 0.0]]), np.array([0.0, 0.0, 1.0, 0.0]))
+    still = sr.LinearSystem(np.zeros((2, 2)), np.array([[0.0], [1.0]]), np.eye(2))
+    with ctx.workprec(192):
+        one, ends = [stacked([[arb(1)]])], np.array([0.0, 1.0])
+        found = MissedAt(Flow(Plant.of(still, 1.0), 1.0), np.ones(1), ends, one, 1, side=Together(Side.of(thin)))
+        about = middle(thin)
+        for c in (np.array([-1.0, 3.0]), np.array([1.0, -3.0])):
+            exact = sum(Fraction(float(a)) * Fraction(float(m)) for a, m in zip(c, about, strict=True))
+            low, high = found.added(c, 1.0)
+            assert Fraction(low) + exact <= 0 <= Fraction(high) + exact
+            assert high - low < 1e-12

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
+from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box
 
 PLANTS = {
@@ -183,3 +187,14 @@ def test_of_deviations_that_are_seen_alike_those_are_taken_that_reach_farthest()
             best = np.array([1.0, 1.0, 1e3]) * reach
             assert floats(X)[:, 0] @ [1.0, 1.0, 1e3] == pytest.approx(1.0, abs=1e-12)
             assert share.max() < 8.0 / best.max()  # powers of two near the reach
+
+
+def test_what_may_change_with_time_is_not_taken_for_exact_where_it_seems_still() -> None:
+    """Columns that differ by 1e-17 are two: floats of one time would call them one."""
+    system = VaryingSystem.of([["0", "0"], ["0", "0"]], [["1"], ["0"]], 1.0, [["1", "1"], ["1", "exp(1e-17 + 0*t)"]])
+    with ctx.workprec(192):
+        law, ends = Flow(Plant.of(system, 1.0), 1.0), [0.0, 0.5, 1.0]
+        still, none = [arb_mat(1, 1)] * 2, np.zeros((2, 2, 1, 2))
+        loop = ClosedLoop(system, [0.0, 0.0], still, none, ends, ends, ends[:2], Box([-1, -1], [1, 1]), law=law)
+        found = loop.pushed([[Fraction(1), Fraction(0)], [Fraction(0), Fraction(1)]])
+    assert law.law.is_still and (found.states, found.entries) == (2, 2)

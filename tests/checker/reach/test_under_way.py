@@ -10,6 +10,7 @@ from flint import arb_mat, ctx
 
 from sparserob_core.checker.flow.flow import Flow
 from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.reach import measurable
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Box
@@ -52,3 +53,20 @@ def test_what_enters_less_and_less_is_above_its_chord_by_how_fast_that_falls() -
     owed = 0.125**2 / 8.0 * 0.1
     assert heights[1] - (heights[0] + heights[2]) / 2.0 == pytest.approx(owed, rel=1e-9)
     assert owed <= bent <= owed * (1.0 + 1e-9)
+
+
+def test_a_kernel_that_is_forgotten_leaves_no_radius_to_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``x' = (t + 1/1000) w``: of every piece another, whether kernels of three pieces are kept or of all."""
+    system, grid, found = VaryingSystem.of([["0*t"]], [[1.0]], 1.0, [["t + 0.001"]]), np.linspace(0, 1, 13), []
+    with ctx.workprec(192):
+        law = Flow(Plant.of(system, 1.0), 1.0)
+        still, none = [arb_mat(1, 1)], np.zeros((1, 1, 1, 1))
+        for kept in (4096, 3):
+            monkeypatch.setattr(measurable, "KEPT", kept)
+            loop = MeasurableLoop(
+                system, [0.0], still, none, grid.tolist(), [0.0, 1.0], [], Box([-0.1], [0.1]), law=law
+            )
+            found.append(loop.radii)
+    exact = 0.1 * (np.diff(grid**2) / 2.0 + 0.001 * np.diff(grid))
+    for radii in found:
+        assert radii == pytest.approx(exact, rel=1e-9)

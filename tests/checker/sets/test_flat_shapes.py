@@ -191,3 +191,11 @@ def test_of_a_plane_that_floats_name_the_normal_is_that():
     assert np.abs(H @ normal).max() == pytest.approx(1.0)
     exact = np.array([c for c, _ in known(FLAT["parallelogram"]).facets])
     assert np.abs(exact @ normal).max() == pytest.approx(1.0)
+
+
+def test_an_exact_side_of_more_bits_than_a_float_is_rounded_outwards() -> None:
+    """A zonotope about 2^-55: where the least value of ``-x`` is attained, doubles have no number."""
+    with ctx.workprec(96):
+        shape = known(sr.Zonotope(np.array([2.0**-55, 0.0]), np.array([[1.0, 0.0], [0.0, 1.0], [0.25, 0.25]])))
+        least = shape.least([arb(0)] * 2, [arb(0)] * 2, [arb(-1), arb(0)])
+        assert not least > -shape.support([arb(1), arb(0)])

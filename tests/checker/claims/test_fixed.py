@@ -1,0 +1,58 @@
+"""Guards checker/claims: fixed final states beside disturbances that are known numbers there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import ctx
+
+import sparserob_core as sr
+from sparserob_core.checker.claims import constraints
+from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.claims import check
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.sets.sets import Box, Equality
+
+PIECES = Dictionary.indicators(np.linspace(0.0, 1.0, 5))
+KNOWN: dict[str, Any] = {
+    "one that pushes": ([[0.0]], [[1.0]], [[1.0]], Box([1.0], [1.0]), [1.5]),
+    "beside one that varies": (
+        [[0.0, 0.0], [0.0, -1.0]], [[1.0], [0.0]], np.eye(2), Box([1.0, -0.1], [1.0, 0.1]), [1.5, np.nan],
+    ),
+}  # fmt: skip
+
+
+def case_of(which: str, goal: float | None = None, **said: Any) -> Case:
+    A, B, E, bound, goals = KNOWN[which]
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(A, B, E), horizon=1.0, initial_state=np.zeros(len(A)), control=Box([-1.0], [1.0]),
+        disturbance=bound, terminal=[Equality(np.array(goals if goal is None else [goal, *goals[1:]]))],
+    )  # fmt: skip
+    return Case(problem, PIECES, PIECES, {"format": 1, **said})
+
+
+def verdicts(case: Case) -> dict[str, str]:
+    return {claim.name: claim.verdict for claim in check(case, 1e-3)}
+
+
+@pytest.mark.parametrize("which", KNOWN)
+def test_a_push_that_is_known_counts_in_a_fixed_state(which: str) -> None:
+    """``x' = u + 1`` from 0 ends at 1.5 with ``u = 0.5``, and at 2.5 never."""
+    held = {"multipliers": {"constraints": [], "equalities": [-1.0]}}
+    assert verdicts(case_of(which, status="infeasible", **held)) == {"infeasibility": "fails"}
+    assert verdicts(case_of(which, 2.5, status="infeasible", **held)) == {"infeasibility": "holds"}
+    figures = {"cost": 0.5, "lower_bound": 0.5, "gap_tolerance": 1e-3}
+    told = {"status": "certified", "decision": [[0.5] * 4], **figures, **held}
+    assert set(verdicts(case_of(which, **told)).values()) == {"holds"}
+    assert verdicts(case_of(which, **{**told, "lower_bound": 0.6}))["lower bound"] == "fails"
+    assert verdicts(case_of(which, **{**told, "decision": [[0.4] * 4]}))["equalities"] == "fails"
+
+
+def test_a_state_that_a_known_push_moves_does_not_rest() -> None:
+    case = case_of("one that pushes", 1.0, status="certified", decision=[[0.0] * 4])
+    with ctx.workprec(96):
+        ((off, _),) = constraints.missed(case)
+        assert off.contains(0) and not constraints._rests(case, 0)
+        assert constraints._rests(case_of("beside one that varies", decision=[[0.0] * 4]), 1)
