@@ -236,7 +236,7 @@ def test_the_checker_bounds_errors_over_boxes_and_cells_of_time_from_above_and_b
     assert isinstance(delivered, MissedOver)
     tube = tube_of(case, box)
     start, stop = 1.52, 1.53
-    found = delivered.over(c, [start, stop], box, tube.flow)
+    found = delivered.over(c, [start, stop], (box, tube.flow))
     powers = np.array(tube.flow.monomials.exponents)
     for share in np.random.default_rng(1).uniform(-1.0, 1.0, size=(4, 2)):
         point = np.array(tube.flow.centre) + share * np.array(tube.flow.radius)
@@ -248,7 +248,7 @@ def test_the_checker_bounds_errors_over_boxes_and_cells_of_time_from_above_and_b
             assert over - low < found.off + found.over + 1e-5
     assert found.off < 2e-3
     half = ((-0.0175, 0.0025), (-0.0125, 0.0075))
-    smaller = delivered.over(c, [start, start + 0.005], half, tube_of(case, half).flow)
+    smaller = delivered.over(c, [start, start + 0.005], (half, tube_of(case, half).flow))
     assert smaller.off < 0.26 * found.off  # of second order in the widths and in the time
     middle = delivered.at(tube.flow.centre).added(c, start)[0]
     assert found.ends[0, 0] - found.off - found.over <= middle

@@ -302,7 +302,7 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
     assert isinstance(strayed, MissedOver)
     tube = tube_of(case, box)
     start, stop = 1.52, 1.53
-    found = strayed.over(c, [start, stop], box, tube.flow)
+    found = strayed.over(c, [start, stop], (box, tube.flow))
     powers = np.array(tube.flow.monomials.exponents)
     for share in np.random.default_rng(1).uniform(-1.0, 1.0, size=(4, 2)):
         point = np.array(tube.flow.centre) + share * np.array(tube.flow.radius)
@@ -315,7 +315,7 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
     assert found.off < 2e-3
     whole = ((-0.05, -0.03), (0.1, 0.05))
     flow = tube_of(case, whole).flow
-    wide, truth = strayed.over(c, [1.5], whole, flow), strayed.at(flow.centre).added(c, 1.5)[0]
+    wide, truth = strayed.over(c, [1.5], (whole, flow)), strayed.at(flow.centre).added(c, 1.5)[0]
     assert wide.ends[0, 0] + 1e-6 < truth < wide.ends[0, 0] + wide.off  # there it is concave
     step, n = 1.5 / 900, 900
     M = np.array([[0.0, 1.0], [-4.0 + flow.centre[0], -0.3 - flow.centre[1]]])
@@ -324,5 +324,5 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
     heights = PLANTS["two" if bound is BOX else "triangle"][2](np.array(rows)) - np.array(rows) @ about
     assert truth == pytest.approx(float(heights.sum()) * step, rel=1e-5)
     half = ((-0.0175, 0.0025), (-0.0125, 0.0075))
-    smaller = strayed.over(c, [start, start + 0.005], half, tube_of(case, half).flow)
+    smaller = strayed.over(c, [start, start + 0.005], (half, tube_of(case, half).flow))
     assert smaller.off < 0.26 * found.off  # of second order in the widths and in the time
