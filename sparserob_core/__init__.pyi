@@ -11,6 +11,7 @@ from sparserob_core.control.problem.dictionary import DictionaryFactory as Dicti
 from sparserob_core.control.problem.names import Names as Names
 from sparserob_core.control.problem.system import LinearSystem as LinearSystem
 from sparserob_core.control.problem.system import SwitchedSystem as SwitchedSystem
+from sparserob_core.control.problem.system import System as System
 from sparserob_core.control.problem.system import VaryingSystem as VaryingSystem
 from sparserob_core.control.problem.problem import OptimalControlProblem as OptimalControlProblem
 from sparserob_core.control.problem.disturbances import Disturbance as Disturbance

@@ -46,7 +46,11 @@ def _shown(record: Any) -> list[tuple[str, object]]:
 
 
 def _given(record: Any) -> list[tuple[str, object]]:
-    return [(name, value) for name, value in _shown(record) if not (value is None or _is_empty(value))]
+    return _known(_shown(record))
+
+
+def _known(shown: Sequence[tuple[str, object]]) -> list[tuple[str, object]]:
+    return [(name, value) for name, value in shown if not (value is None or _is_empty(value))]
 
 
 def _is_empty(value: object) -> bool:
@@ -56,8 +60,14 @@ def _is_empty(value: object) -> bool:
 def noun(record: Any) -> str:
     """A dataclass of what a problem is made of, for its ``__repr__``: one line where it fits into `WIDTH`, else as
     `brief` says it. What was left out, ``None`` or nothing, is not said."""
-    line = f"{type(record).__name__}({', '.join(f'{name}={_value(value)}' for name, value in _given(record))})"
-    return line if len(line) <= WIDTH else _lines(type(record).__name__, _given(record))
+    return phrase(type(record).__name__, _shown(record))
+
+
+def phrase(heading: str, shown: Sequence[tuple[str, object]]) -> str:
+    """A record with this heading as `noun` says it, of which these fields are shown."""
+    given = _known(shown)
+    line = f"{heading}({', '.join(f'{name}={_value(value)}' for name, value in given)})"
+    return line if len(line) <= WIDTH else _lines(heading, given)
 
 
 def _value(value: object) -> str:

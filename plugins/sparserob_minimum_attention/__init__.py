@@ -82,7 +82,7 @@ class MinimumAttention(sr.LinearKeys):
             last = {"Q": Q, "reference": np.append(final.reference, np.zeros(m))}
         return sr.Cost(l1=plain.l1, group=plain.group, state=both, final=last)
 
-    def _augmented(self, d: int, m: int) -> sr.LinearSystem | sr.SwitchedSystem | sr.VaryingSystem:
+    def _augmented(self, d: int, m: int) -> sr.System:
         """``A = [[A, B], [0, 0]]``, ``B = [0; I]``, ``E = [E; 0]``, ``c = [c; 0]``, still in expressions of the
         parameters, piece by piece."""
         system = self.system

@@ -72,7 +72,7 @@ class Rendezvous(sr.ControlKeys):
         """The problem; raises `InputError` that begins with the key at fault."""
         return self.problem(self._system(), self._names())
 
-    def _system(self) -> sr.LinearSystem | sr.VaryingSystem:
+    def _system(self) -> sr.System:
         m = len(AXES[self.motion])
         B = np.eye(2 * m, m, -m).tolist()
         if self.orbit.eccentricity == 0.0:

@@ -159,7 +159,7 @@ def test_windows_cut_the_pieces_of_a_system_and_share_their_ends():
     system = sr.SwitchedSystem([(1.0, first), (2.0, second)], delay=0.25)
     every = [sr.Disturbance(SMALL, start=0.5, stop=1.5), sr.Disturbance(SMALL, [[2.0]], start=1.0 + 1e-13)]
     problem = integrator(*every, system=system, initial_control=[0.0])
-    assert [until for until, _ in problem.system.pieces] == [0.5, 1.0, 1.5, 2.0]
+    assert [phase.until for phase in problem.system.phases] == [0.5, 1.0, 1.5, 2.0]
     assert [np.asarray(mode.E).tolist() for mode in problem.system.modes] == [
         [[0.0, 0.0]], [[1.0, 0.0]], [[3.0, 2.0]], [[0.0, 2.0]],
     ]  # fmt: skip

@@ -197,7 +197,7 @@ def test_functionals_of_switched_systems_are_what_trajectories_do() -> None:
             length, middle = min(stop, time) - start, (start + stop) / 2
             if length <= 0:
                 break
-            mode = next(one for until, one in problem.system.pieces if middle < until)
+            mode = next(one for one in problem.system.phases if middle < one.until)
             A, B, E = (part[0] for part in mode.matrices(p[None]))
             acting = before if middle < 0.15 else u[:, int((middle - 0.15) / (2 / 7))]
             force = B @ acting + E @ w + np.asarray(mode.c)[:, 0]
@@ -314,7 +314,7 @@ def test_wrong_pieces_are_named_with_their_key(system: dict[str, Any], said: str
 def test_a_known_piece_may_follow_an_uncertain_one() -> None:
     uncertain = sr.LinearSystem(lambda p: np.array([[p[0]]]), [[1.0]], parameters=sr.Box([-1.0], [1.0]))
     system = sr.SwitchedSystem([(1.0, sr.LinearSystem([[0.0]], [[1.0]], c=[0.5])), (2.0, uncertain)])
-    assert [mode.parameter_count for mode in system.modes] == [1, 1]
+    assert [mode.count for mode in system.modes] == [1, 1]
     assert [mode.c is not None for mode in system.modes] == [True, True]
     with pytest.raises(sr.InputError, match=r"system\.pieces\.1: expected the parameters of the other pieces"):
         other = sr.LinearSystem(lambda p: np.array([[p[0]]]), [[1.0]], parameters=sr.Box([-2.0], [1.0]))

@@ -212,8 +212,8 @@ def test_a_drift_may_be_any_function_of_the_parameters() -> None:
     parameters = sr.Box([-0.1], [0.1])
     system = sr.LinearSystem(np.zeros((2, 2)), [[0.0], [1.0]], parameters=parameters, c=of)
     matrix = sr.LinearSystem(np.zeros((2, 2)), [[0.0], [1.0]], parameters=parameters, c=lambda p: np.array([0.0, p[0]]))
-    assert system.forced.matrices(np.array([[0.05]]))[1][0].tolist() == [[0.0, 0.0], [1.0, 1.1]]
-    assert matrix.forced.matrices(np.array([[0.05]]))[1][0].tolist() == [[0.0, 0.0], [1.0, 0.05]]
+    assert system.forced.phases[0].matrices(np.array([[0.05]]))[1][0].tolist() == [[0.0, 0.0], [1.0, 1.1]]
+    assert matrix.forced.phases[0].matrices(np.array([[0.05]]))[1][0].tolist() == [[0.0, 0.0], [1.0, 0.05]]
     for wrong in ([1.0, 2.0, 3.0], 3.0):
         with pytest.raises(sr.InputError, match=r"system\.c: expected 2 numbers, one per state"):
             sr.LinearSystem(np.zeros((2, 2)), [[0.0], [1.0]], c=wrong)

@@ -22,7 +22,7 @@ def build(**changes) -> sr.OptimalControlProblem:
 
 
 def test_the_augmented_system_integrates_the_rate_into_the_control() -> None:
-    A, B, E = build().system.matrices(np.array([[0.1]]))
+    A, B, E = build().system.phases[0].matrices(np.array([[0.1]]))
     np.testing.assert_allclose(A[0], [[0, 1, 0, 1], [-1.9, -0.5, 1.1, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
     np.testing.assert_array_equal(B[0], [[0, 0], [0, 0], [1, 0], [0, 1]])
     np.testing.assert_array_equal(E[0], [[1, 0], [0, 1], [0, 0], [0, 0]])

@@ -29,10 +29,8 @@ def build(**changes: Any) -> sr.OptimalControlProblem:
 
 
 def laws(problem: sr.OptimalControlProblem, time: float) -> np.ndarray:
-    system = problem.system
-    if isinstance(system, sr.VaryingSystem):
-        return system.law.matrices(np.array([[time]]))[0][0]
-    return system.matrices(np.empty((1, 0)))[0][0]
+    (phase,) = problem.system.phases
+    return phase.matrices(np.array([[time]]) if phase.timed else np.empty((1, 0)))[0][0]
 
 
 def anomaly(time: float) -> float:
@@ -84,7 +82,7 @@ def hill(n: float, t: float) -> np.ndarray:
 
 def test_a_circle_gives_hills_equations_with_constant_coefficients() -> None:
     problem = build(orbit={**ELLIPSE, "eccentricity": 0.0})
-    assert isinstance(problem.system, sr.LinearSystem)
+    assert not problem.system.varies
     n = np.sqrt(3.0 / 8.0)
     for t in (0.4, 3.0):
         np.testing.assert_allclose(expm(laws(problem, t) * t), hill(n, t), atol=1e-12)
@@ -118,7 +116,7 @@ def test_names_and_units_come_with_it_and_may_be_others() -> None:
 
 def test_a_disturbance_is_an_acceleration() -> None:
     problem = build(orbit={**ELLIPSE, "eccentricity": 0.0}, disturbance={"box": 1e-6}, terminal=[{"box": 1.0}])
-    np.testing.assert_array_equal(problem.system.matrices(np.empty((1, 0)))[2][0], np.eye(4, 2, -2))
+    np.testing.assert_array_equal(problem.system.phases[0].matrices(np.empty((1, 0)))[2][0], np.eye(4, 2, -2))
 
 
 @pytest.mark.parametrize(

@@ -202,7 +202,7 @@ class Plan:
         problem, T = self.problem, self.problem.horizon
         delay, own = problem.system.delay, problem.disturbance_breakpoints or ()
         ends = [0.0, T, *self.breakpoints, *(self.breakpoints + delay), *self.of_disturbance]
-        ends += [begin for begin, _, _ in problem.system.turns(T)]
+        ends += [phase.begin for phase in problem.system.phases]
         for one in (*problem.windows, *problem.integral):
             ends += [one.start, float(one.stop or 0.0)]
             ends += [] if one.relative_to is None else np.asarray(one.relative_to)[:, 0].tolist()
@@ -320,8 +320,8 @@ class Flow:
         that ``time`` is an end of."""
         plan, T = self.plan, self.plan.problem.horizon
         inner = time if within is None else within
-        law = next(law for begin, until, law in plan.problem.system.turns(T) if begin <= inner <= until)
-        point = parameter if law.parameter_count == parameter.size else np.append(time, parameter)
+        law = next(phase for phase in plan.problem.system.until(T) if phase.begin <= inner <= phase.until)
+        point = np.append(time, parameter) if law.timed else parameter
         A, B, E = (part[0] for part in law.matrices(point[None]))
         drift = law.forced.matrices(point[None])[1][0][:, B.shape[1] :]
         d, m, mw = len(A), B.shape[1], E.shape[1]

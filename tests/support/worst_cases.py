@@ -4,7 +4,7 @@ the support functions of its sets; and problems with their cases for the checker
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any
@@ -167,7 +167,7 @@ def kind(name: str) -> Kind:
         system = SwitchedSystem(pieces)
     if name == "late":
         delay = 0.375
-        system = replace(system, delay=delay)
+        system = system.with_delay(delay)
     if name == "varying":
         delay = 0.375
         parts = [

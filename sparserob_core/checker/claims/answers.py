@@ -24,7 +24,6 @@ from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import NEAR, along
-from sparserob_core.control.problem.system import SwitchedSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -92,7 +91,7 @@ class Answers:
         system = case.problem.system
         if system.parameter_count:
             raise Unchecked("the checker knows feedback of known systems only")
-        if case.measurable and (isinstance(system, SwitchedSystem) or system.delay):
+        if case.measurable and (system.switches or system.delay):
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
         if not case.alike:
             raise Unchecked("the checker knows feedback under disturbances of one class, on one dictionary")

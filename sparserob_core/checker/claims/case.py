@@ -41,7 +41,7 @@ from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import Accumulated
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.sets.sets import Box, ConvexSet, Product, product
@@ -82,7 +82,7 @@ class Case:
             object.__setattr__(self, "problem", self._returning(self.problem))
         plain = in_turns(spelt(self.problem))
         known = parted(plain)
-        uncertain = isinstance(known.system, VaryingSystem) and known.system.parameters is not None
+        uncertain = known.system.varies and known.system.parameters is not None
         if (known is not plain or uncertain) and self.policy is not None:
             raise Unchecked("the checker knows no feedback beside parameters and the time")
         object.__setattr__(self, "problem", in_turns(integrating(known)))
@@ -354,7 +354,7 @@ class Case:
         """The control and the disturbance on the common grid."""
         middles = [(a + b) / 2 for a, b in zip(self.grid[:-1], self.grid[1:], strict=True)]
         which = np.clip(np.searchsorted(self.acting, middles, side="right") - 1, 0, len(self.acting) - 1)
-        changes, constants = self.changes, 0 if self.problem.system.c is None else 1
+        changes, constants = self.changes, int(self.problem.system.drifts)
         known = [stacked([[v] for v in balls([*before(self.problem)])])] if self.problem.system.delay > 0.0 else []
         inputs = [*known, *self.pieces]
         if constants:
@@ -418,7 +418,7 @@ class Case:
         if bound is None or self.answering:
             return None
         ends, system = np.array([0.0, self.grid[-1]]), self.problem.system
-        first = system.controls + (system.c is not None)
+        first = system.controls + system.drifts
         if not bound.is_box:
             side = Together(Side.of(bound))
             return self._missing(np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
@@ -549,17 +549,18 @@ class Case:
     def running(self) -> Running | None:
         """What is integrated, where nothing else changes with time."""
         system = self.problem.system
-        if not isinstance(system, SwitchedSystem):
+        if not system.switches:
             return None
         found, d = Running.of(spelt(self.stated)), self.stated.system.states
-        return found if found is not None and all(found.is_beside(mode, d) for mode in system.modes) else None
+        return found if found is not None and all(found.is_beside(phase, d) for phase in system.phases) else None
 
     @property
-    def still(self) -> LinearSystem | None:
+    def still(self) -> System | None:
         """The one system that acts all along, beside what is integrated of it; ``None`` where others do."""
         if self.running is not None:
             return self.running.system
-        return self.problem.system if isinstance(self.problem.system, LinearSystem) else None
+        system = self.problem.system
+        return None if system.varies or system.switches else system
 
     @cached_property
     def motion(self) -> Motion:

@@ -26,7 +26,6 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.checker.sets.sides import Curved, Sides
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import ConvexSet
 
@@ -112,7 +111,7 @@ def precision_of(case: Case) -> int:
         entries = np.concatenate([np.ravel(part) for part in parts]) * problem.horizon
     sizes = np.abs(entries[np.isfinite(entries) & (entries != 0.0)])
     apart = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
-    spare = VARYING if isinstance(problem.system, VaryingSystem) else 0
+    spare = VARYING if problem.system.varies else 0
     return int(min(PRECISION + spare + np.ceil(apart), MOST_PRECISION))
 
 

@@ -130,7 +130,7 @@ def followed(case: Case, c: Array, driven: bool = True) -> Worst:
     ``driven``: without the control that the certificate decides on, of which there is none where nothing is
     feasible."""
     problem = case.problem
-    inputs = problem.system.controls + (problem.system.c is not None)
+    inputs = problem.system.controls + problem.system.drifts
     table = Enclosed(*np.zeros((2, inputs, len(case.grid) - 1)))
     if driven:
         on_grid = [u.entries() for u in case.scene.control]

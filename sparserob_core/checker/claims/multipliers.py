@@ -177,7 +177,7 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
     state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
     begun = balls(np.asarray(problem.initial_state, dtype=float))
     constant = sum((w * x for w, x in zip(state, begun, strict=True)), arb(0)) - limit
-    if problem.system.c is not None:  # a drift is an input that is 1
+    if problem.system.drifts:  # a drift is an input that is 1
         constant = constant + worst.weights(time, np.zeros(1), np.full(1, np.inf))[0][m]
     if delay > 0.0:
         (early,) = worst.weights(time, np.zeros(1), begins[:1])

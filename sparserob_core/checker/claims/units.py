@@ -191,7 +191,7 @@ class RowUnits:
         self, parameter: tuple[float, ...], states: bool, nodes: list[float], places: npt.NDArray[np.intp]
     ) -> tuple[Array, Array]:
         system, bound = self.problem.system, self.problem.disturbance
-        d, m, columns = system.states, system.controls, system.controls + (system.c is not None)
+        d, m, columns = system.states, system.controls, system.controls + system.drifts
         rows, gains = self._rows_of(states)
         flow = self.flows.at(parameter)
         v = np.tile(rows, (len(places), 1, 1))

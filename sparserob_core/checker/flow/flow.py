@@ -17,7 +17,7 @@ from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, middles, products, zeros
 from sparserob_core.checker.flow.law import Box, Law, Stretch
-from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.flow.plant import Plant, called
 from sparserob_core.checker.flow.segment import LONGER, ROUGH, SHARP, Segment, solve
 from sparserob_core.checker.flow.still import held_about
 from sparserob_core.checker.outcome import Unchecked
@@ -209,7 +209,7 @@ class Flow:
             if length > 0.0:
                 key = number, length
                 if key not in self._about:
-                    table = phase.called(np.array([phase.begin, *self.box.middle])).astype(float)
+                    table = called(phase, np.array([phase.begin, *self.box.middle])).astype(float)
                     self._about[key] = held_about(table[:, :d], table[:, d:], length)
                 onward, pushed = self._about[key]
                 found = onward @ found

@@ -16,10 +16,11 @@ import numpy as np
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked
-from sparserob_core.checker.flow.plant import Phase, Plant
+from sparserob_core.checker.flow.plant import Plant, called
 from sparserob_core.checker.flow.segment import SHARP
 from sparserob_core.checker.flow.units import balanced, pace
 from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -282,7 +283,7 @@ class Law:
             p[1 + j] = (
                 Model.number(frame, arb(middle)) if wide.is_zero() else Model.parameter(frame, j, arb(middle), wide)
             )
-        values = phase.called(p)
+        values = called(phase, p)
         found = [[[arb_poly([])] * values.shape[1] for _ in range(values.shape[0])] for _ in range(monomials.size)]
         for (i, j), value in np.ndenumerate(values):
             parts = value.parts if isinstance(value, Model) else [arb_poly([float(value)])]

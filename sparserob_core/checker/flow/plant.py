@@ -9,30 +9,13 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.control.problem.system import LinearSystem, System, VaryingSystem
+from sparserob_core.control.problem.phase import Phase
+from sparserob_core.control.problem.system import System
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 GOLDEN = 0.6180339887
 LOOKS = 17  # times of a phase at which its numbers are looked at, by which nothing is proven
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Phase:
-    """``A``, ``B`` with the drift beside it, and ``E`` of a ``law`` from ``begin`` to ``until``: functions of the
-    parameters, which may come after the time (``timed``)."""
-
-    begin: float
-    until: float
-    law: LinearSystem
-    timed: bool
-
-    def called(self, p: np.ndarray) -> np.ndarray:
-        """``[A B c E]`` at the time and the parameters ``(1 + nu,)``, numbers of any kind."""
-        law, given = self.law, p if self.timed else p[1:]
-        parts = [law.entry(name) for name in ("A", "B", "c", "E")]
-        return np.hstack([_called(part, given) for part in parts if part is not None])
 
 
 @final
@@ -49,15 +32,8 @@ class Plant:
     @staticmethod
     def of(system: System, horizon: float) -> Plant:
         """That of any system of a problem."""
-        if isinstance(system, VaryingSystem):
-            laws = [(begin, law) for begin, _, law in system.laws]
-        else:
-            laws = list(zip((0.0, *system.switches), system.modes, strict=True))
-        ends = [*(begin for begin, _ in laws[1:]), horizon]
-        timed = isinstance(system, VaryingSystem)
-        phases = [Phase(begin, until, law, timed) for (begin, law), until in zip(laws, ends, strict=True)]
-        driven = int(system.controls + (system.c is not None))
-        return Plant(tuple(phases), int(system.states), driven, driven + int(system.disturbances))
+        driven = int(system.controls + system.drifts)
+        return Plant(system.until(horizon), int(system.states), driven, driven + int(system.disturbances))
 
     @property
     def is_timed(self) -> bool:
@@ -70,9 +46,15 @@ class Plant:
             for share in np.sort(np.arange(LOOKS) * GOLDEN % 1.0).tolist():  # none is a period of anything
                 time = phase.begin + share * (phase.until - phase.begin)
                 try:
-                    yield phase.called(np.array([time, *parameter])).astype(float)
+                    yield called(phase, np.array([time, *parameter])).astype(float)
                 except (InputError, Unchecked):  # not finite there
                     continue
+
+
+def called(phase: Phase, p: np.ndarray) -> np.ndarray:
+    """``[A B c E]`` of a phase at the time and the parameters ``(1 + nu,)``, numbers of any kind."""
+    given, parts = p if phase.timed else p[1:], [phase.entry(name) for name in ("A", "B", "c", "E")]
+    return np.hstack([_called(part, given) for part in parts if part is not None])
 
 
 def _called(entry: Any, p: np.ndarray) -> np.ndarray:

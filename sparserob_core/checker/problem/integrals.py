@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, TypeAlias, final
 
 import numpy as np
@@ -16,8 +17,9 @@ import numpy as np
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.names import Names
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
@@ -151,7 +153,7 @@ class Running:
     coordinates are integrated all along. What is integrated from ``begins (k,)`` to ``ends (k,)`` is what has been
     until the end, less what had been at the beginning."""
 
-    system: LinearSystem
+    system: System
     begins: Array
     ends: Array
 
@@ -159,17 +161,17 @@ class Running:
     def of(problem: OptimalControlProblem) -> Running | None:
         """That of a problem as it is stated, of which one known system acts; ``None`` for others."""
         system = problem.system
-        if not problem.integral or not isinstance(system, LinearSystem) or system.parameters is not None:
+        if not problem.integral or system.varies or system.switches or system.parameters is not None:
             return None
         coordinates, _ = _coordinates(problem)
-        whole = _with(system, [(one.h, one.g) for one in coordinates])
+        whole = _with(system.phases[0], [(one.h, one.g) for one in coordinates])
         ends = np.array([[one.begin, one.end] for one in coordinates])
-        return Running(replace(whole, delay=system.delay), *ends.T)
+        return Running(System((whole,), None, system.delay), *ends.T)
 
-    def is_beside(self, mode: LinearSystem, d: int) -> bool:
-        """Whether a mode is the same of the first ``d`` states, whatever is integrated beside them."""
-        pairs = [(getattr(mode, name), getattr(self.system, name)) for name in ("A", "B", "E", "c")]
-        if mode.parameters is not None or any((one is None) != (other is None) for one, other in pairs):
+    def is_beside(self, phase: Phase, d: int) -> bool:
+        """Whether a phase is the same of the first ``d`` states, whatever is integrated beside them."""
+        pairs = [(phase.entry(name), self.system.phases[0].entry(name)) for name in ("A", "B", "E", "c")]
+        if phase.domain is not None or any((one is None) != (other is None) for one, other in pairs):
             return False
         return all(one is None or np.array_equal(np.asarray(one)[:d], np.asarray(other)[:d]) for one, other in pairs)
 
@@ -186,23 +188,16 @@ class Running:
 
 def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> System:
     """The system with its coordinates, cut where one of them begins or ends."""
-    switches, modes = system.switches, system.modes
-    if isinstance(system, VaryingSystem):
-        switches, modes = tuple(begin for begin, _ in system.later), tuple(law for _, _, law in system.laws)
+    switches = [phase.begin for phase in system.phases[1:]]
     turns = [*switches, horizon]
     for time in sorted({t for one in coordinates for t in (one.begin, one.end)}):
         if all(abs(time - turn) > APART * horizon for turn in (0.0, *turns)):
             turns.append(time)
-    pieces, begins, begin = [], [0.0], 0.0
-    for until in sorted(turns):
+    phases = []
+    for begin, until in pairwise([0.0, *sorted(turns)]):
         which = sum(switch <= begin for switch in switches)
-        pieces.append((until, _with(modes[which], list(_acting(coordinates, begin, until)))))
-        begins.append(until)
-        begin = until
-    if isinstance(system, VaryingSystem):
-        laws = [(start, law) for start, (_, law) in zip(begins, pieces, strict=False)]
-        return VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:]), system.parameters)
-    return SwitchedSystem(pieces, system.delay) if len(pieces) > 1 else replace(pieces[0][1], delay=system.delay)
+        phases.append(_with(system.phases[which], list(_acting(coordinates, begin, until))).between(begin, until))
+    return system.in_phases(phases)
 
 
 def _acting(coordinates: list[Coordinate], begin: float, until: float) -> Iterator[tuple[Array, Array]]:
@@ -213,20 +208,19 @@ def _acting(coordinates: list[Coordinate], begin: float, until: float) -> Iterat
         yield share * one.h, share * one.g
 
 
-def _with(mode: LinearSystem, rates: list[tuple[Array, Array]]) -> LinearSystem:
-    d, k, m = mode.states, len(rates), mode.controls
+def _with(phase: Phase, rates: list[tuple[Array, Array]]) -> Phase:
+    k, m = len(rates), phase.controls
     below = {
         "A": np.array([[*h, *np.zeros(k)] for h, _ in rates]),
         "B": np.array([g for _, g in rates]).reshape(k, m),
-        "E": np.zeros((k, mode.disturbances)),
+        "E": np.zeros((k, phase.disturbances)),
         "c": np.zeros((k, 1)),
     }
-    given = {name: Above(getattr(mode, name), part) for name, part in below.items() if getattr(mode, name) is not None}
-    if mode.parameters is None:
-        made = {name: np.asarray(entry(()), dtype=float) for name, entry in given.items()}
-        return LinearSystem(made["A"], made["B"], made["E"], c=made.get("c"))
-    assert d > 0
-    return LinearSystem(given["A"], given["B"], given["E"], mode.parameters, mode.names, given.get("c"))
+    given = {name: (phase.entry(name), part) for name, part in below.items() if phase.entry(name) is not None}
+    made: dict[str, Any] = {name: Above(entry, part) for name, (entry, part) in given.items()}
+    if phase.domain is None:
+        made = {name: np.asarray(entry(()), dtype=float) for name, entry in made.items()}
+    return replace(phase, A=made["A"], B=made["B"], E=made["E"], c=made.get("c"))
 
 
 def _freed(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint | MixedConstraint:

@@ -23,8 +23,9 @@ import numpy as np
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Quadratic
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint
@@ -254,7 +255,7 @@ def _mixed(
 class Parts:
     """The system of a problem about the ``middle (nu,)`` of its parameters."""
 
-    system: VaryingSystem
+    system: System
     middle: tuple[float, ...]
 
     @cached_property
@@ -311,9 +312,9 @@ class Parts:
         """The coordinates of every ``y_j``; raises `Unchecked` where the state is not affine in the parameters."""
         d, nu = self.system.states, len(self.middle)
         steady, own, driven = np.zeros((d, d), dtype=bool), np.zeros((nu, d, d), dtype=bool), np.zeros((nu, d), bool)
-        for _, _, law in self.system.laws:
+        for phase in self.system.phases:
             for name in NAMES:
-                entry = law.entry(name)
+                entry = phase.entry(name)
                 if entry is None:
                     continue
                 first, *others = (
@@ -380,7 +381,7 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The problem with coordinates for its parameters beside the time; it itself where there are none that the state is
     an affine function of."""
     system = problem.system
-    if not isinstance(system, VaryingSystem) or system.parameters is None:
+    if not system.varies or system.parameters is None:
         return problem
     parts = Parts(system, tuple(system.parameters.interior_point().tolist()))
     if not parts.is_affine:  # then it is expanded, box by box by the flow
@@ -398,12 +399,11 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     for name, scale, places in zip(system.names, parts.scales, parts.moved, strict=True):
         called += [f"{called[i]} per {scale:.3g} {name}" for i in places]
         units += [units[i] for i in places] if problem.names.state_units else []
-    laws = [(begin, _law(parts, law, begin, until)) for begin, until, law in system.laws]
     costs = [None if q is None else Quadratic(np.pad(q.Q, (0, more)), np.pad(q.reference, (0, more)))
              for q in problem.cost.terms]  # fmt: skip
     return replace(
         problem,
-        system=VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:])),
+        system=System(tuple(_larger(parts, phase) for phase in system.phases), None, system.delay),
         initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(more)]),
         initial_set=_begun(begun, more) if begun is not None and more else begun,
         path=[one for entry, name in zip(problem.path, called_as, strict=True) for one in _seen(entry, name, corners)],
@@ -433,9 +433,10 @@ def _above(exact: Fraction) -> float:
     return nextafter(found, inf) if Fraction(found) < exact else found
 
 
-def _law(parts: Parts, law: LinearSystem, begin: float, until: float) -> LinearSystem:
-    made = {name: Larger(parts, name, law.entry(name)) for name in NAMES if law.entry(name) is not None}
-    return LinearSystem(made["A"], made["B"], made["E"], Box([begin], [until]), ("t",), made.get("c"))
+def _larger(parts: Parts, phase: Phase) -> Phase:
+    made = {name: Larger(parts, name, phase.entry(name)) for name in NAMES if phase.entry(name) is not None}
+    times = Box([phase.begin], [phase.until])
+    return Phase(made["A"], made["B"], made["E"], times, ("t",), made.get("c"), phase.begin, phase.until, timed=True)
 
 
 def _begun(bound: ConvexSet, more: int) -> ConvexSet:

@@ -21,7 +21,8 @@ import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.control.problem.expression import Entries, beside
-from sparserob_core.control.problem.system import LinearSystem, Matrix, System
+from sparserob_core.control.problem.phase import Matrix, Phase
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.sets.sets import Product, product
 from sparserob_core.control.term import SAME_TIME
 from sparserob_core.errors import InputError
@@ -53,13 +54,12 @@ class Disturbance:
     def __post_init__(self) -> None:
         sealed(self)
 
-    def entering(self, where: str, mode: LinearSystem) -> LinearSystem:
-        """One of the systems that take turns, under this disturbance alone; raises `InputError` where it does not
-        fit."""
+    def entering(self, where: str, phase: Phase) -> Phase:
+        """A phase under this disturbance alone; raises `InputError` where it does not fit."""
         if self.E is None:
-            return mode
+            return phase
         try:
-            return replace(mode, E=self.E)
+            return replace(phase, E=self.E)
         except InputError as error:
             raise InputError(error.sentence, path=f"{where}.E") from None
 
@@ -70,7 +70,7 @@ def joined(
     """The system under all of these disturbances side by side until the ``horizon``, the set of them together, their
     class, or that of every part of the set, and the breakpoints of every part where one has its own; raises
     `InputError` that begins with ``disturbance`` and the number of the one at fault."""
-    kind, first = every[0].kind, system.turns(horizon)[0][2]
+    kind, first = every[0].kind, system.phases[0]
     for i, one in enumerate(every):
         if one.kind not in get_args(DisturbanceClass):
             wanted = f"one of {', '.join(get_args(DisturbanceClass))}"
@@ -88,19 +88,19 @@ def joined(
         _checked(f"disturbance.{i}.set", one.set, one.entering(f"disturbance.{i}", first))
         for i, one in enumerate(every)
     ]
-    pieces: list[tuple[float, float, LinearSystem]] = []
-    for begin, until, mode in legs(system, {time for window in windows for time in window}, horizon):
+    phases: list[Phase] = []
+    for phase in legs(system, {time for window in windows for time in window}, horizon):
         columns = []
         for i, (one, (start, stop)) in enumerate(zip(every, windows, strict=True)):
-            E = _columns(one.entering(f"disturbance.{i}", mode))
-            acts = start < until - SAME_TIME * horizon and begin + SAME_TIME * horizon < stop
-            columns.append(E if acts else np.zeros((mode.states, sets[i].dimension)))
-        pieces.append((begin, until, replace(mode, E=reduce(beside, columns))))
+            E = _columns(one.entering(f"disturbance.{i}", phase))
+            acts = start < phase.until - SAME_TIME * horizon and phase.begin + SAME_TIME * horizon < stop
+            columns.append(E if acts else np.zeros((phase.states, sets[i].dimension)))
+        phases.append(replace(phase, E=reduce(beside, columns)))
     kinds = tuple(one.kind for one in every)
     together: tuple[ConvexSet, Classes] = (product(sets), kind)
     if len(set(kinds)) > 1 or grids is not None:
         together = Product(tuple(sets)), kinds if len(set(kinds)) > 1 else kind
-    return system.taking(pieces), *together, grids
+    return system.in_phases(phases), *together, grids
 
 
 def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
@@ -155,27 +155,28 @@ def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]
     return start, stop
 
 
-def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[tuple[float, float, LinearSystem]]:
-    """The `turns` of a system, cut at more times than its own, but not at rounding."""
-    for begin, until, mode in system.turns(horizon):
+def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[Phase]:
+    """The phases of a system, cut at more times than its own, but not at rounding."""
+    for phase in system.until(horizon):
+        begin, until = phase.begin, phase.until
         for time in sorted(cuts):
             if min(abs(time - begin), abs(until - time)) > SAME_TIME * horizon and begin < time < until:
-                yield begin, time, mode
+                yield phase.between(begin, time)
                 begin = time
-        yield begin, until, mode
+        yield phase.between(begin, until)
 
 
-def _columns(system: LinearSystem) -> Entries:
+def _columns(phase: Phase) -> Entries:
     """``E`` as an array, expressions or a function."""
-    entry: Entries = system.E  # type: ignore[assignment]  # a system has made it one of these
+    entry: Entries = phase.E  # type: ignore[assignment]  # a phase has made it one of these
     return entry
 
 
-def _checked(where: str, bound: object, system: LinearSystem) -> ConvexSet:
+def _checked(where: str, bound: object, phase: Phase) -> ConvexSet:
     if not isinstance(bound, ConvexSet):
         raise InputError(path=where, expected="a convex set, such as Box", got=f"{type(bound).__name__}")
-    if bound.dimension != system.disturbances:
-        expected = f"a set of dimension {system.disturbances}, the number of columns of E"
+    if bound.dimension != phase.disturbances:
+        expected = f"a set of dimension {phase.disturbances}, the number of columns of E"
         raise InputError(path=where, expected=expected, got=f"dimension {bound.dimension}")
     if not bound.is_bounded:
         raise InputError("the set must be bounded", path=where)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.control.policies.measurements import Measurements
-from sparserob_core.control.problem.cost import Cost
+from sparserob_core.control.problem.cost import WEIGHTS, Cost, checked_weights, counted, integrals
 from sparserob_core.control.problem.disturbances import (
     Breakpoints,
     Classes,
@@ -22,13 +22,7 @@ from sparserob_core.control.problem.disturbances import (
     joined,
 )
 from sparserob_core.control.problem.names import UNNAMED, Names
-from sparserob_core.control.problem.prices import WEIGHTS, checked_weights, counted, integrals
-from sparserob_core.control.problem.system import (
-    LinearSystem,
-    SwitchedSystem,
-    System,
-    VaryingSystem,
-)
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.problem.terms.repeat import RETURN, SAME, Repeating, ending, widths
 from sparserob_core.control.problem.terms.windows import (
@@ -185,8 +179,7 @@ class OptimalControlProblem(Term):
         self._set("terminal", tuple(self._terminal()))
         if self.repeat is not Repeating.IMPOSED:
             self._return()
-        if isinstance(self.system, VaryingSystem) and self.system.parameters is not None:
-            self._check_uncertain(self.system)
+        self._check_uncertain()
         self._set("execution", self._executed())
         sealed(self)
 
@@ -248,7 +241,7 @@ class OptimalControlProblem(Term):
         object.__setattr__(self, name, value)
 
     def _check_system(self) -> None:
-        if not isinstance(self.system, LinearSystem | SwitchedSystem | VaryingSystem):
+        if not isinstance(self.system, System):
             raise InputError(path="system", expected="a LinearSystem", got=f"{type(self.system).__name__}")
         if not (self.system.delay == 0.0 or SAME_TIME * self.horizon < self.system.delay < self.horizon):
             raise InputError(
@@ -258,13 +251,13 @@ class OptimalControlProblem(Term):
             )
         self.system.check_horizon(self.horizon)
 
-    def _check_uncertain(self, system: VaryingSystem) -> None:
+    def _check_uncertain(self) -> None:
         """Raise `InputError` for what is not proven of a system that changes with time and has parameters."""
-        if system.dependence is None:
+        system = self.system
+        if system.powers is not None:
             self._check_expanded()
-            return
         for i, end in enumerate(self.terminal):
-            if not isinstance(end, Equality):
+            if not isinstance(end, Equality) or system.dependence is None:
                 continue
             for parameter, state in np.argwhere(system.dependence.reached).tolist():
                 if state in end.fixed:
@@ -318,22 +311,15 @@ class OptimalControlProblem(Term):
 
     def _is_boxed(self) -> bool:
         """Whether parameters are in a box, or there are none."""
-        if isinstance(self.system, VaryingSystem) or not self.system.parameter_count:
-            return True
         try:
-            _ = VaryingSystem.made_of(self.system, self.horizon).dependence
+            _ = self.system.in_time(self.horizon)
         except InputError:
             return False
         return True
 
     def _is_expanded(self) -> bool:
         """Whether there are such of which the state is no affine function."""
-        system = self.system
-        if not isinstance(system, VaryingSystem):
-            if not system.parameter_count or not self._is_boxed():
-                return False
-            system = VaryingSystem.made_of(system, self.horizon)
-        return system.parameters is not None and system.dependence is None
+        return self._is_boxed() and self.system.in_time(self.horizon).powers is not None
 
     def _state(self) -> Array:
         d = self.system.states

@@ -21,7 +21,10 @@ KEYS = {"initial_set": "initial_state", "stop": "to", "start": "from"}
 def require_representable(problem: OptimalControlProblem) -> None:
     """Raise `InputError`, which begins with the key, for a number beyond `LARGEST`, and for a system that grows by more
     than that within the horizon: ``e^(a T)``, ``a`` the largest real part of an eigenvalue of a mode."""
+    several = len(problem.system.phases) > 1
     for path, value in _numbers(problem, ()):
+        if path[:2] == ("system", "phases"):
+            path = ("system", *(("pieces", path[2]) if several else ()), *path[3:])
         _require_small(path, value)
     if problem.system.varies:
         for mode in problem.system.modes:

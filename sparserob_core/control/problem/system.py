@@ -1,9 +1,8 @@
-"""Linear systems: uncertain ones ``x' = A(p) x + B(p) u + E(p) w + c(p)``, such that take turns, and such that change
-with time."""
+"""Uncertain linear systems ``x' = A x + B u + E w + c`` in phases, whose entries may depend on parameters and time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
@@ -11,26 +10,15 @@ from itertools import pairwise
 from typing import TypeAlias, final
 
 import numpy as np
-import numpy.typing as npt
 
-from sparserob_core.brief import noun
-from sparserob_core.control.enclosures.dependence import PARTS, Dependence, Spread, Superposed, dependence
-from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
-from sparserob_core.control.problem.expression import (
-    ExpressionMatrix,
-    above,
-    beside,
-    parse_column,
-    parse_definitions,
-    parse_matrix,
-)
-from sparserob_core.control.problem.tracing import SAME
-from sparserob_core.control.sets.sets import Box
-from sparserob_core.control.sets.strangers import require_consistent
+from sparserob_core.brief import noun, phrase
+from sparserob_core.control.enclosures.dependence import Dependence, Spread, Superposed, dependence
+from sparserob_core.control.problem.expression import parse_column, parse_definitions, parse_matrix
+from sparserob_core.control.problem.phase import PARTS, TIME, Matrix, Phase, PhaseInUnits, and_time, boxed
 from sparserob_core.control.term import SAME_TIME, over
-from sparserob_core.errors import InputError, NotEnclosable
-from sparserob_core.shapes import Float, dense, shaped
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.errors import InputError
+from sparserob_core.shapes import Float, shaped
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 InTime: TypeAlias = tuple[
     Sequence[Sequence[str | float]],
@@ -39,18 +27,281 @@ InTime: TypeAlias = tuple[
     Sequence[str | float] | None,
 ]
 """``A``, ``B``, ``E`` and ``c`` with entries in the time."""
-Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
-TIME = "t"
 PERIODIC = 1e-9
 """Of an entry, by how much its values at both ends of a period may differ. What a horizon of 53 bits misses of a period
 is a tenth of it where an entry changes by its size in a millionth of the period; of ten times more a rounded decimal
 would pass for the period."""
 LOOKS = 65  # times at which the size of a system is looked at; with ten times fewer a short pericentre is overlooked
-_Entry: TypeAlias = Array | Callable[..., object] | ExpressionMatrix
 
 
-@dataclass(frozen=True, eq=False)
-class LinearSystem:
+@dataclass(frozen=True, eq=False, repr=False)
+class System:
+    """``x'(t) = A(t, p) x(t) + B(t, p) u(t - delay) + E(t, p) w(t) + c(t, p)`` with state ``x (d,)``, control
+    ``u (m,)``, disturbance ``w (mw,)`` and a constant, unknown parameter ``p (nu,)`` in the bounded set ``parameters``,
+    which is ``None`` when everything is known.
+
+    The ``phases`` hold one after another, the first from 0 on; the state goes on where it is. Their entries depend on
+    the time in all of them, or in none. All have as many states, controls and disturbances. ``delay``: by how much
+    later the control acts, through the ``B`` of the time at which it acts; until then ``initial_control`` of the
+    problem acts. Made by `LinearSystem`, `SwitchedSystem` and `VaryingSystem`. Raises `InputError`.
+    """
+
+    phases: tuple[Phase, ...]
+    parameters: ConvexSet | None = None
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "delay", _duration(self.delay))
+        first, *others = self.phases
+        for i, phase in enumerate(others, 1):
+            for what in ("states", "controls", "disturbances"):
+                if getattr(phase, what) != getattr(first, what):
+                    raise InputError(
+                        path=f"system.pieces.{i}",
+                        expected=f"{getattr(first, what)} {what}, as the other pieces",
+                        got=f"{getattr(phase, what)}",
+                    )
+        if len({phase.c is None for phase in self.phases}) > 1:
+            object.__setattr__(self, "phases", tuple(phase.drifting() for phase in self.phases))
+        _ = self._depends
+
+    def __repr__(self) -> str:
+        if self.horizon < np.inf:
+            return noun(self)
+        every = {**vars(self.phases[0]), **vars(self)}
+        shown = [(name, every[name]) for name in ("A", "B", "E", "parameters", "names", "c", "delay")]
+        return phrase("LinearSystem", shown)
+
+    @property
+    def states(self) -> int:
+        """Number ``d`` of states."""
+        return self.phases[0].states
+
+    @property
+    def controls(self) -> int:
+        """Number ``m`` of controls."""
+        return self.phases[0].controls
+
+    @property
+    def disturbances(self) -> int:
+        """Number ``mw`` of disturbances that ``E`` takes."""
+        return self.phases[0].disturbances
+
+    @property
+    def parameter_count(self) -> int:
+        """Number ``nu`` of parameters, 0 for a known system."""
+        return 0 if self.parameters is None else self.parameters.dimension
+
+    @property
+    def box(self) -> Box:
+        """The set of the parameters beside the time, which is a box."""
+        assert isinstance(self.parameters, Box)
+        return self.parameters
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Names of the parameters."""
+        every = self.phases[0].names
+        return every[len(every) - self.parameter_count :]
+
+    @property
+    def drifts(self) -> bool:
+        """Whether there is a drift."""
+        return self.phases[0].c is not None
+
+    @property
+    def varies(self) -> bool:
+        """Whether entries depend on the time."""
+        return self.phases[0].timed
+
+    @property
+    def horizon(self) -> float:
+        """When the last phase ends; infinite where one lasts as long as one likes."""
+        return self.phases[-1].until
+
+    @property
+    def switches(self) -> tuple[float, ...]:
+        """When one phase follows another, where the entries are constant between; of a system that varies none: no
+        piece of a grid has to end where another law takes over."""
+        return () if self.varies else tuple(phase.begin for phase in self.phases[1:])
+
+    @cached_property
+    def forced(self) -> System:
+        """The same system with its drift as one more column of ``B``, whose control is always 1; itself without a
+        drift. Then it has no delay: that belongs to the times at which the controls act."""
+        return System(tuple(phase.forced for phase in self.phases), self.parameters) if self.drifts else self
+
+    @cached_property
+    def modes(self) -> tuple[Phase, ...]:
+        """The phases; of a system that varies what it is at several times, for what asks how large its numbers are:
+        nothing is proven by them. Of parameters that the state depends on affinely they are those in the middle of the
+        box."""
+        if not self.varies:
+            return self.phases
+        found = list[Phase]()
+        # Chebyshev's points, closer to the ends: an entry that is 0 at evenly spaced times is seen
+        shares = (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
+        for phase in self.phases:
+            times = phase.begin + (phase.until - phase.begin) * shares
+            if self.powers is not None:
+                found += [phase.during(time, self.parameters) for time in times[:, 0].tolist()]
+                continue
+            arguments = self._arguments(times)
+            A, B, E = phase.matrices(arguments)
+            drifts = list(phase.forced.matrices(arguments)[1][:, :, -1:]) if self.drifts else [None] * LOOKS
+            found += [Phase(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True)]
+        return tuple(found)
+
+    def _arguments(self, times: Array) -> Array:
+        """``times (k, 1)`` as arguments of a phase, the parameters being in the middle of their box."""
+        middle = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
+        return np.hstack([times, np.tile(middle, (len(times), 1))])
+
+    def until(self, horizon: float) -> tuple[Phase, ...]:
+        """The phases, the last one up to the horizon."""
+        last = self.phases[-1]
+        return *self.phases[:-1], last.between(last.begin, horizon)
+
+    def in_phases(self, phases: Sequence[Phase]) -> System:
+        """The same system in other phases up to the same time; a constant one alone lasts as long as this one."""
+        if len(phases) == 1:
+            phases = [phases[0].between(0.0, self.horizon)]
+        return System(tuple(phases), self.parameters, self.delay)
+
+    def with_parameters(self, parameters: ConvexSet) -> System:
+        """The same system with its parameters in another set."""
+        phases = tuple(phase.within(parameters, self.names) for phase in self.phases)
+        return System(phases, boxed(parameters) if self.varies else parameters, self.delay)
+
+    def with_delay(self, delay: float) -> System:
+        """The same system whose control acts so much later."""
+        return System(self.phases, self.parameters, delay)
+
+    def remaining(self, begin: float, horizon: float) -> System:
+        """What is left of it from a time on, which is 0 then, for as long as ``horizon``."""
+        if self.horizon == np.inf:
+            return self
+        left = [
+            (max(0.0, phase.begin - begin), phase)
+            for phase in self.phases
+            if not over(phase.until, begin, horizon) and (self.varies or not over(begin + horizon, phase.begin))
+        ]
+        ends = [*(start for start, _ in left[1:]), horizon if self.varies or len(left) > 1 else np.inf]
+        phases = tuple(phase.later(start, end, begin) for (start, phase), end in zip(left, ends, strict=True))
+        return System(phases, self.parameters, self.delay)
+
+    def in_time(self, horizon: float) -> System:
+        """The same system as one whose entries depend on the time, up to the ``horizon``; itself where they do. Raises
+        `InputError` where its parameters are in no box."""
+        if self.varies:
+            return self
+        ends = [*self.switches, horizon]
+        phases = tuple(phase.in_time(end) for phase, end in zip(self.phases, ends, strict=True))
+        return System(phases, None if self.parameters is None else boxed(self.parameters), self.delay)
+
+    def check_horizon(self, horizon: float) -> None:
+        """Raise `InputError` where the phases do not fill the horizon."""
+        if self.horizon < np.inf:
+            _check_ends([phase.until for phase in self.phases], horizon, self.varies and len(self.phases) == 1)
+
+    def check_period(self) -> None:
+        """Raise `InputError` where the horizon is no period of a law, but for what rounding it explains. Nothing is
+        proven by that: the law of a plan that repeats begins again at the horizon, as phases of a system do. Laws that
+        take turns may differ there as at any other time, and so may constant phases."""
+        if not self.varies or len(self.phases) > 1:
+            return
+        every = [[part[0] for part in mode.forced.matrices(mode.probes[:1])] for mode in self.modes]
+        sizes = [np.abs(parts).max(axis=0) for parts in zip(*every, strict=True)]
+        ends = self.phases[0].forced.matrices(self._arguments(np.array([[0.0], [self.horizon]])))
+        for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
+            for i, j in np.argwhere(np.abs(last - first) > PERIODIC * size):
+                entry = f"c[{i + 1}]" if name == "B" and j >= self.controls else f"{name}[{i + 1}][{j + 1}]"
+                raise InputError(
+                    path="repeat",
+                    expected="a horizon that is a period of the system, which begins again there",
+                    got=f"{entry} = {first[i, j]:.12g} at 0, and {last[i, j]:.12g} at {self.horizon:.12g}",
+                )
+
+    @property
+    def dependence(self) -> Dependence | None:
+        """How the state depends on parameters beside the time, where that is affinely."""
+        return None if isinstance(self._depends, int) else self._depends
+
+    @property
+    def powers(self) -> int | None:
+        """Where the state depends on parameters beside the time, and not affinely, the largest degree of an entry that
+        is a polynomial in them."""
+        return self._depends if isinstance(self._depends, int) else None
+
+    @cached_property
+    def _depends(self) -> Dependence | int | None:
+        """One of both; nothing without parameters beside the time."""
+        if not self.varies or self.parameters is None:
+            return None
+        return dependence([[phase.entry(name) for name in PARTS] for phase in self.phases], *self.deviations)
+
+    @property
+    def deviations(self) -> tuple[Array, Array]:
+        """The middle of a box of parameters, and the most that each deviates from it by."""
+        if self.parameters is None:
+            return np.zeros(0), np.zeros(0)
+        centre, box = self.box.interior_point(), self.box
+        sides = ((centre, box.upper), (box.lower, centre))
+        return centre, np.max([[_difference(a, b) for a, b in zip(*ends, strict=True)] for ends in sides], axis=0)
+
+    def superposed(self, depends: Dependence | Spread) -> System:
+        """The known system of all states that a dependence tells of."""
+        phases = []
+        for phase in self.phases:
+            parts = {name: phase.entry(name) for name in PARTS}
+            made = {name: Superposed(name, part, depends) for name, part in parts.items() if part is not None}
+            times = Box([phase.begin], [phase.until])
+            every = made["A"], made["B"], made["E"], times, (TIME,), made.get("c")
+            phases.append(Phase(*every, phase.begin, phase.until, timed=True))
+        return System(tuple(phases), None, self.delay)
+
+    def at(self, parameter: Array) -> System:
+        """The known system that one which varies is at one parameter ``(nu,)``."""
+        if self.parameters is None:
+            return self
+        return System(tuple(phase.at(parameter) for phase in self.phases), None, self.delay)
+
+    @shaped
+    def in_units(
+        self,
+        A: Float[Array, "d d"],
+        B: Float[Array, "d m"],
+        E: Float[Array, "d mw"],
+        parameters: Float[Array, " nu"],
+        c: Float[Array, "d 1"] | float = 1.0,
+        time: float = 1.0,
+    ) -> System:
+        """The system whose matrices are ``A``, ``B``, ``E``, ``c`` times these factors, entry by entry, and whose
+        parameters and times are this one's divided by ``parameters (nu,)`` and ``time``; exact for powers of two."""
+        arguments = np.concatenate([[time], parameters]) if self.varies else parameters
+        phases = tuple(phase.in_units(A, B, E, arguments, c, time) for phase in self.phases)
+        bound = None if self.parameters is None else self.parameters.in_units(parameters)
+        return System(phases, boxed(bound) if self.varies and bound is not None else bound, self.delay / time)
+
+    @property
+    def stated(self) -> System:
+        """The system in the units that it is stated in; itself where these are its own."""
+        first = self.phases[0]
+        if not isinstance(first, PhaseInUnits):
+            return self
+        units = first.units[first.count - self.parameter_count :]
+        bound = None if self.parameters is None else self.parameters.in_units(1.0 / units)
+        phases = tuple(phase.stated for phase in self.phases)
+        return System(phases, bound, self.delay * first.clock)
+
+    @shaped
+    def describe(self, parameter: Float[Array, " nu"]) -> str:
+        """A parameter vector in words, such as ``p1 = 0.1, p2 = -0.1``."""
+        return self.phases[0].describe(parameter)
+
+
+@final
+class LinearSystem(System):
     """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)`` with state ``x (d,)``, control ``u (m,)``,
     disturbance ``w (mw,)`` and a constant, unknown parameter ``p (nu,)`` in ``parameters``.
 
@@ -63,31 +314,17 @@ class LinearSystem:
     disagree or an entry is not finite somewhere that was looked at.
     """
 
-    A: Matrix
-    B: Matrix
-    E: Matrix | None = None
-    parameters: ConvexSet | None = None
-    names: Sequence[str] = ()
-    c: Matrix | None = None
-    delay: float = 0.0
-
-    __repr__ = noun
-
-    def __post_init__(self) -> None:
-        self._check_parameters()
-        object.__setattr__(self, "delay", _duration(self.delay))
-        for name in ("A", "B"):
-            object.__setattr__(self, name, self._matrix(name, getattr(self, name)))
-        d, columns = self._shape("A")
-        if d != columns:
-            raise InputError(f"A must be square, got shape {(d, columns)}", path="system")
-        object.__setattr__(self, "E", np.eye(d) if self.E is None else self._matrix("E", self.E))
-        for name in ("B", "E"):
-            if self._shape(name)[0] != d:
-                raise InputError(f"{name} must have {d} rows, as A has, got shape {self._shape(name)}", path="system")
-        if self.c is not None:
-            self._check_drift(d)
-        self.matrices(self.probes)
+    def __init__(
+        self,
+        A: Matrix,
+        B: Matrix,
+        E: Matrix | None = None,
+        parameters: ConvexSet | None = None,
+        names: Sequence[str] = (),
+        c: Matrix | None = None,
+        delay: float = 0.0,
+    ) -> None:
+        super().__init__((Phase(A, B, E, parameters, names, c),), parameters, delay)
 
     @staticmethod
     def from_statespace(
@@ -105,384 +342,9 @@ class LinearSystem:
 
         return LinearSystem(*matrices_of(plant), E, parameters, names, c, delay)
 
-    @property
-    def states(self) -> int:
-        """Number ``d`` of states."""
-        return self._shape("A")[0]
-
-    @property
-    def controls(self) -> int:
-        """Number ``m`` of controls."""
-        return self._shape("B")[1]
-
-    @property
-    def disturbances(self) -> int:
-        """Number ``mw`` of disturbances that ``E`` takes."""
-        return self._shape("E")[1]
-
-    @cached_property
-    def forced(self) -> LinearSystem:
-        """The same system with its drift as one more column of ``B``, whose control is always 1; itself without a
-        drift. It has no delay: that belongs to the times at which the controls act."""
-        if self.c is None:
-            return self
-        return LinearSystem(self.A, beside(self._entry("B"), self._entry("c")), self.E, self.parameters, self.names)
-
-    def with_parameters(self, parameters: ConvexSet) -> LinearSystem:
-        """The same system with its parameters in another set."""
-        return replace(self, parameters=parameters)
-
-    def remaining(self, begin: float, horizon: float) -> LinearSystem:
-        """Itself: it does not change with time."""
-        return self
-
-    def at_times(self, start: float, stop: float, later: float) -> LinearSystem:
-        """The same law of a first parameter that is the time, from ``start`` to ``stop`` of a clock that shows 0 so
-        much ``later``."""
-        assert isinstance(self.parameters, Box)
-        lower, upper = (
-            np.append(end, side[1:])
-            for end, side in zip((start, stop), (self.parameters.lower, self.parameters.upper), strict=True)
-        )
-        A, B, E, c = (_later(self.entry(name), later) for name in PARTS)
-        assert A is not None and B is not None
-        return LinearSystem(A, B, E, Box(lower, upper), self.names, c)
-
-    @shaped
-    def accumulating(self, rows: Float[Array, "k d"], inputs: Float[Array, "k m"]) -> LinearSystem:
-        """The same system with ``k`` more states after its own, ``z' = rows x + inputs u(t - delay)``: integrals of
-        what its state and its control do."""
-        k, d = rows.shape
-        below = {"B": inputs, "E": np.zeros((k, self.disturbances)), "c": np.zeros((k, 1))}
-        known = {
-            name: above(self._entry(name), part) for name, part in below.items() if name != "c" or self.c is not None
-        }
-        A = above(beside(self._entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
-        return LinearSystem(A, known["B"], known["E"], self.parameters, self.names, known.get("c"), self.delay)
-
-    @property
-    def modes(self) -> tuple[LinearSystem, ...]:
-        """The systems that take turns: this one alone."""
-        return (self,)
-
-    @property
-    def switches(self) -> tuple[float, ...]:
-        """When one mode follows another: never."""
-        return ()
-
-    @property
-    def varies(self) -> bool:
-        """Whether it changes with time all along, not at its switches alone."""
-        return False
-
-    def turns(self, horizon: float) -> tuple[tuple[float, float, LinearSystem], ...]:
-        """Between which times which of the systems acts, or of the laws: this one until the horizon."""
-        return ((0.0, horizon, self),)
-
-    def taking(self, turns: Sequence[tuple[float, float, LinearSystem]]) -> LinearSystem | SwitchedSystem:
-        """A system of the same kind whose `turns` are these."""
-        return turns[0][2] if len(turns) == 1 else _switched(turns, self.delay)
-
-    def check_horizon(self, horizon: float) -> None:
-        """Raise `InputError` where it does not last until the horizon."""
-
-    def check_period(self) -> None:
-        """Raise `InputError` where it does not begin again at the horizon; what does not change does."""
-
-    @property
-    def parameter_count(self) -> int:
-        """Number ``nu`` of parameters, 0 for a known system."""
-        return 0 if self.parameters is None else self.parameters.dimension
-
-    @shaped
-    def matrices(
-        self, parameters: Float[Array, "k nu"]
-    ) -> tuple[Float[Array, "k d d"], Float[Array, "k d m"], Float[Array, "k d mw"]]:
-        """``A (k, d, d)``, ``B (k, d, m)``, ``E (k, d, mw)`` at parameters ``(k, nu)``; raises `InputError` where they
-        are not finite."""
-        points = np.asarray(parameters, dtype=float)
-        if points.ndim != 2 or points.shape[1] != self.parameter_count:
-            raise InputError(
-                f"parameters must have shape (k, {self.parameter_count}), got {points.shape}", path="system"
-            )
-        A, B, E = (self._values(name, points) for name in ("A", "B", "E"))
-        return A, B, E
-
-    @shaped
-    def taylor(
-        self, space: TaylorSpace, centre: Float[Array, " nu"], radius: Float[Array, " nu"]
-    ) -> tuple[
-        Float[Array, "M d d"],
-        Float[Array, "d d"],
-        Float[Array, "M d m"],
-        Float[Array, "d m"],
-        Float[Array, "M d mw"],
-        Float[Array, "d mw"],
-    ]:
-        """Taylor models of all entries over the cell ``centre +- radius``, both ``(nu,)``.
-
-        Returns ``A_coefficients (M, d, d), A_remainder (d, d)`` and the same for ``B`` and ``E``.
-        Raises `NotEnclosable` when a function cannot be evaluated on Taylor models, or has a singularity on the cell.
-        """
-        p = np.empty(self.parameter_count, dtype=object)
-        p[:] = space.variables(centre, radius)
-        A, B, E = (self._enclosed(name, space, p) for name in ("A", "B", "E"))
-        return *A, *B, *E
-
-    @shaped
-    def in_units(
-        self,
-        A: Float[Array, "d d"],
-        B: Float[Array, "d m"],
-        E: Float[Array, "d mw"],
-        parameters: Float[Array, " nu"],
-        c: Float[Array, "d 1"] | float = 1.0,
-        time: float = 1.0,
-    ) -> LinearSystem:
-        """The system whose matrices are ``A``, ``B``, ``E``, ``c`` times these factors, entry by entry, and whose
-        parameter and delay are this one's divided by ``parameters (nu,)`` and ``time``; exact for powers of two."""
-        delay = self.delay / time
-        if self.parameters is None:
-            ours = [matrix[0] for matrix in self.matrices(np.zeros((1, 0)))]
-            drift = None if self.c is None else self._values("c", np.zeros((1, 0)))[0] * c
-            return LinearSystem(ours[0] * A, ours[1] * B, ours[2] * E, c=drift, delay=delay)
-        return SystemInUnits(
-            self.A,
-            self.B,
-            self.E,
-            self.parameters.in_units(parameters),
-            self.names,
-            self.c,
-            delay,
-            base=self,
-            factors={"A": A, "B": B, "E": E, "c": np.broadcast_to(c, (A.shape[0], 1))},
-            units=parameters,
-        )
-
-    @shaped
-    def describe(self, parameter: Float[Array, " nu"]) -> str:
-        """A parameter vector in words, such as ``p1 = 0.1, p2 = -0.1``."""
-        return ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.names, parameter, strict=True))
-
-    def entry(self, name: str) -> _Entry | None:
-        """``A``, ``B``, ``E`` or ``c (d, 1)`` as an array, expressions, or a function of ``p (nu,)``."""
-        return None if name == "c" and self.c is None else self._entry(name)
-
-    def _entry(self, name: str) -> _Entry:
-        entry: _Entry = getattr(self, name)
-        return entry
-
-    def _check_parameters(self) -> None:
-        given: object = self.parameters
-        if not isinstance(given, ConvexSet | None):
-            raise InputError(
-                path="system.parameters",
-                expected="a convex set, such as Box([-0.1], [0.1]), or None; C and D of a plant have no place here",
-                got=f"{type(given).__name__}",
-            )
-        if self.parameters is not None and not self.parameters.is_bounded:
-            raise InputError("the set of parameters must be bounded", path="system")
-        if self.parameters is not None:
-            require_consistent("system.parameters", self.parameters)
-        names = tuple(self.names) or tuple(f"p{i + 1}" for i in range(self.parameter_count))
-        if len(names) != self.parameter_count:
-            raise InputError(
-                path="system",
-                expected=f"{self.parameter_count} parameter names",
-                got=f"{len(names)}: {', '.join(names)}",
-            )
-        object.__setattr__(self, "names", names)
-
-    def _check_drift(self, d: int) -> None:
-        """``c`` as a matrix of one column; raises `InputError` when it has not one number per state."""
-        given = self.c
-        if callable(given) and not isinstance(given, ExpressionMatrix | _AsColumn):
-            given = _AsColumn(given)
-        elif not callable(given):
-            given = dense(given)
-            array = np.asarray(given, dtype=object)
-            if array.ndim == 0:
-                raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=f"{given!r}")
-            given = array[:, None].tolist() if array.ndim == 1 else given
-        object.__setattr__(self, "c", self._matrix("c", given))
-        if self._shape("c") != (d, 1):
-            rows, columns = self._shape("c")
-            got = f"{rows}" if columns == 1 else f"shape {(rows, columns)}"
-            raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=got)
-        self._values("c", self.probes)
-
-    def _matrix(self, name: str, value: object) -> _Entry:
-        if isinstance(value, ExpressionMatrix):
-            return (
-                value(np.zeros(len(value.names))).astype(float) if value.is_constant else self._known_names(name, value)
-            )
-        if callable(value):
-            if self.parameters is None:
-                raise InputError(
-                    f"{name} is a function of the parameters, but no set of parameters is given", path="system"
-                )
-            return value
-        try:
-            array = np.array(dense(value), dtype=float)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"{name} must be a matrix of numbers or a function of the parameters, got {value!r}", path="system"
-            ) from error
-        if array.ndim != 2 or array.size == 0 or not np.isfinite(array).all():
-            raise InputError(
-                f"{name} must be a matrix of finite numbers, rows by columns, got {_seen(array)}", path="system"
-            )
-        return array
-
-    def _known_names(self, name: str, matrix: ExpressionMatrix) -> ExpressionMatrix:
-        if matrix.names != tuple(self.names):
-            raise InputError(
-                f"the expressions of {name} are in the parameters {', '.join(matrix.names)}, the system has"
-                f" {', '.join(self.names) or 'none'}",
-                path="system",
-            )
-        return matrix
-
-    def _shape(self, name: str) -> tuple[int, int]:
-        entry = self._entry(name)
-        if isinstance(entry, np.ndarray | ExpressionMatrix):
-            rows, columns = entry.shape
-            return rows, columns
-        return self._probed_shape(name)
-
-    def _probed_shape(self, name: str) -> tuple[int, int]:
-        cache: dict[str, tuple[int, int]] = self.__dict__.setdefault("_shapes", {})
-        if name not in cache:
-            value = np.asarray(self._called(name, self.probes[0]))
-            if value.ndim != 2 or value.size == 0:
-                raise InputError(
-                    f"the function {name} must return a matrix, rows by columns, got {_seen(value)}", path="system"
-                )
-            cache[name] = (value.shape[0], value.shape[1])
-        return cache[name]
-
-    @property
-    def probes(self) -> Array:
-        """A few parameters ``(k, nu)`` at which a system is tried out: a middle one and support points."""
-        if self.parameters is None:
-            return np.empty((1, 0))
-        axes = np.eye(self.parameter_count)
-        points = self.parameters.support_point(np.vstack([axes, -axes]))
-        return np.vstack([self.parameters.interior_point(), points])
-
-    def _called(self, name: str, parameter: Array) -> Array:
-        function = self._entry(name)
-        assert callable(function)
-        try:
-            with np.errstate(all="ignore"):  # what is not finite is reported with its parameter
-                return np.asarray(function(parameter), dtype=float)
-        except (TypeError, ValueError, ArithmeticError, IndexError, KeyError, AttributeError) as error:
-            raise InputError(
-                f"the function {name} failed at {self.describe(parameter)}: {error}", path="system"
-            ) from error
-
-    @shaped
-    def _values(self, name: str, points: Float[Array, "k nu"]) -> Float[Array, "k rows columns"]:
-        entry = self._entry(name)
-        if isinstance(entry, np.ndarray):
-            return np.broadcast_to(entry, (len(points), *entry.shape)) if len(points) != 1 else _still(entry[None])
-        shape = self._shape(name)
-        if isinstance(entry, ExpressionMatrix):
-            values = entry.evaluate(points)
-        else:
-            rows = [self._called(name, point) for point in points]
-            other = next((row.shape for row in rows if row.shape != shape), None)
-            if other is not None:
-                raise InputError(f"the function {name} must always return shape {shape}, got {other}", path="system")
-            values = np.array(rows).reshape(len(points), *shape)
-        finite = np.isfinite(values).all(axis=(1, 2))
-        if not finite.all():
-            raise InputError(
-                f"{name} is not finite at {self.describe(points[np.flatnonzero(~finite)[0]])}", path="system"
-            )
-        return values
-
-    def _enclosed(self, name: str, space: TaylorSpace, p: npt.NDArray[np.object_]) -> tuple[Array, Array]:
-        entry, shape = self._entry(name), self._shape(name)
-        coefficients, remainder = np.zeros((space.size, *shape)), np.zeros(shape)
-        if isinstance(entry, np.ndarray):
-            coefficients[0] = entry
-            return coefficients, remainder
-        try:
-            models = np.array(entry(p), dtype=object)
-        except NotEnclosable as error:
-            raise NotEnclosable(f"system: {name}: {error}") from error
-        except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
-            raise NotEnclosable(
-                f"system: the function {name} cannot be enclosed over parameters; use arithmetic and numpy's "
-                f"sin, cos, tan, exp, log, sqrt, tanh on the entries of p only ({error})"
-            ) from error
-        if models.shape != shape:
-            raise NotEnclosable(
-                f"system: the function {name} returns shape {shape} for numbers, but {models.shape} for Taylor models"
-            )
-        every, left = coefficients.reshape(space.size, -1), remainder.reshape(-1)
-        for place, model in enumerate(models.ravel().tolist()):
-            if type(model) is int and not model:  # nearly all of them where states are coefficients of polynomials
-                continue
-            if isinstance(model, TaylorModel):
-                every[:, place], left[place] = model.coefficients, model.remainder
-            elif isinstance(model, int | float | np.integer | np.floating):
-                every[0, place] = model
-            else:
-                raise NotEnclosable(
-                    f"system: the function {name} returned {type(model).__name__} for an entry, expected a number"
-                )
-        if not isinstance(entry, ExpressionMatrix):
-            self._require_same(name, np.array([one.coefficients[0] for one in p]), coefficients[0], remainder)
-        return coefficients, remainder
-
-    def _require_same(self, name: str, centre: Array, value: Array, remainder: Array) -> None:
-        """Raise `InputError` where a function of the parameters is another one for numbers than for Taylor models,
-        whose ``value`` at the ``centre (nu,)`` of a cell is told: rows would be those of one system, and proofs those
-        of another. An expression is one and the same for both."""
-        given = self._called(name, centre)
-        apart = np.abs(given - value) - remainder
-        if not (apart <= SAME * max(float(np.abs(given).max()), float(np.abs(value).max()))).all():
-            row, column = (int(i) for i in np.unravel_index(int(apart.argmax()), apart.shape))
-            raise InputError(
-                path=f"system.{name}",
-                expected="a function that depends on its argument alone, by arithmetic",
-                got=f"{given[row, column]:.9g} and then {value[row, column]:.9g} in row {row + 1}, column {column + 1},"
-                f" at {self.describe(centre)}",
-            )
-
 
 @final
-@dataclass(frozen=True, eq=False)
-class _AsColumn:
-    """A function of the parameters that returns ``(d,)`` as one that returns ``(d, 1)``."""
-
-    function: Callable[..., object]
-
-    def __call__(self, parameter: object) -> object:
-        value = self.function(parameter)
-        array = np.array(value, dtype=object if _holds_models(value) else float)
-        return array[:, None] if array.ndim == 1 else array
-
-
-def _holds_models(value: object) -> bool:
-    return np.asarray(value, dtype=object).dtype == object and not all(
-        isinstance(entry, int | float | np.integer | np.floating) for entry in np.asarray(value, dtype=object).flat
-    )
-
-
-def _duration(value: object) -> float:
-    """A finite number that is not negative; raises `InputError`."""
-    usable = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not usable or not 0.0 <= float(value) < np.inf:  # type: ignore[arg-type]
-        raise InputError(path="system.delay", expected="a finite time, not negative", got=f"{value!r}")
-    return float(value)  # type: ignore[arg-type]
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class SwitchedSystem:
+class SwitchedSystem(System):
     """Linear systems that take turns at known times: ``pieces`` are pairs ``(until, LinearSystem)``, each with its own
     ``A``, ``B``, ``E`` and ``c``; the first begins at time 0, the last ``until`` is the horizon. The state goes on
     where it is.
@@ -492,133 +354,27 @@ class SwitchedSystem:
     acts. Raises `InputError`.
     """
 
-    pieces: Sequence[tuple[float, LinearSystem]]
-    delay: float = 0.0
-
-    __repr__ = noun
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "delay", _duration(self.delay))
-        given = list(self.pieces)
+    def __init__(self, pieces: Sequence[tuple[float, System]], delay: float = 0.0) -> None:
+        given = list(pieces)
         if not given:
             raise InputError(path="system.pieces", expected="pairs of a time and a LinearSystem", got="none")
         for i, pair in enumerate(given):
             _check_piece(i, pair, given[i - 1][0] if i else 0.0)
+        ends = [0.0, *(float(until) for until, _ in given)]
         first = next((one for _, one in given if one.parameters is not None), given[0][1])
-        for i, (_, system) in enumerate(given):
-            _check_alike(i, system, first)
-        drifts = any(one.c is not None for _, one in given)
-        known = [(float(until), _completed(one, first, drifts)) for until, one in given]
-        object.__setattr__(self, "pieces", tuple(known))
-
-    def with_parameters(self, parameters: ConvexSet) -> SwitchedSystem:
-        """As `LinearSystem.with_parameters`."""
-        return SwitchedSystem([(until, one.with_parameters(parameters)) for until, one in self.pieces], self.delay)
-
-    def remaining(self, begin: float, horizon: float) -> LinearSystem | SwitchedSystem:
-        """Those that still take their turn from the time ``begin`` on, for as long as ``horizon``."""
-        left = [
-            (until - begin, one)
-            for start, (until, one) in zip((0.0, *self.switches), self.pieces, strict=True)
-            if not over(until, begin, horizon) and not over(begin + horizon, start)
-        ]
-        return SwitchedSystem([*left[:-1], (horizon, left[-1][1])], self.delay) if len(left) > 1 else left[-1][1]
-
-    @property
-    def modes(self) -> tuple[LinearSystem, ...]:
-        """The systems that take turns."""
-        return tuple(system for _, system in self.pieces)
-
-    @property
-    def switches(self) -> tuple[float, ...]:
-        """When one follows another, ``(modes - 1,)``."""
-        return tuple(until for until, _ in self.pieces[:-1])
-
-    @property
-    def varies(self) -> bool:
-        """As `LinearSystem.varies`."""
-        return False
-
-    def turns(self, horizon: float) -> tuple[tuple[float, float, LinearSystem], ...]:
-        """As `LinearSystem.turns`."""
-        return _turns((0.0, *self.switches), self.modes, horizon)
-
-    def taking(self, turns: Sequence[tuple[float, float, LinearSystem]]) -> SwitchedSystem:
-        """As `LinearSystem.taking`."""
-        return _switched(turns, self.delay)
-
-    def check_horizon(self, horizon: float) -> None:
-        """As `LinearSystem.check_horizon`."""
-        _check_ends([until for until, _ in self.pieces], horizon, whole=False)
-
-    def check_period(self) -> None:
-        """As `LinearSystem.check_period`: its pieces take their turns again."""
-
-    @property
-    def states(self) -> int:
-        """Number ``d`` of states."""
-        return self.modes[0].states
-
-    @property
-    def controls(self) -> int:
-        """Number ``m`` of controls."""
-        return self.modes[0].controls
-
-    @property
-    def disturbances(self) -> int:
-        """Number ``mw`` of disturbances."""
-        return self.modes[0].disturbances
-
-    @property
-    def parameters(self) -> ConvexSet | None:
-        """The set of the parameters."""
-        return self.modes[0].parameters
-
-    @property
-    def parameter_count(self) -> int:
-        """Number ``nu`` of parameters."""
-        return self.modes[0].parameter_count
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of the parameters."""
-        return self.modes[0].names
-
-    @property
-    def c(self) -> Matrix | None:
-        """Whether there is a drift: that of the first piece."""
-        return self.modes[0].c
-
-    @cached_property
-    def forced(self) -> SwitchedSystem:
-        """As `LinearSystem.forced`, piece by piece."""
-        if self.c is None:
-            return self
-        return SwitchedSystem([(until, one.forced) for until, one in self.pieces])
-
-    @shaped
-    def in_units(
-        self,
-        A: Float[Array, "d d"],
-        B: Float[Array, "d m"],
-        E: Float[Array, "d mw"],
-        parameters: Float[Array, " nu"],
-        c: Float[Array, "d 1"] | float = 1.0,
-        time: float = 1.0,
-    ) -> SwitchedSystem:
-        """As `LinearSystem.in_units`."""
-        moved = [(until / time, one.in_units(A, B, E, parameters, c, time)) for until, one in self.pieces]
-        return SwitchedSystem(moved, self.delay / time)
-
-    @shaped
-    def describe(self, parameter: Float[Array, " nu"]) -> str:
-        """As `LinearSystem.describe`."""
-        return self.modes[0].describe(parameter)
+        for i, (_, one) in enumerate(given):
+            other = one.parameters
+            if other is not None and (not other.is_same(first.parameters) or one.names != first.names):
+                raise InputError(path=f"system.pieces.{i}", expected="the parameters of the other pieces", got="others")
+        phases = tuple(
+            one.phases[0].within(first.parameters, first.names).between(begin, until)
+            for (_, one), (begin, until) in zip(given, pairwise(ends), strict=True)
+        )
+        super().__init__(phases, first.parameters, delay)
 
 
 @final
-@dataclass(frozen=True, eq=False)
-class VaryingSystem:
+class VaryingSystem(System):
     """``x'(t) = A(t) x(t) + B(t) u(t - delay) + E(t) w(t) + c(t)`` for ``t`` from 0 to the ``horizon``.
 
     ``law``: a `LinearSystem` whose first parameter is the time: its matrices at ``p = (t,)`` are those at the time
@@ -628,85 +384,27 @@ class VaryingSystem:
     `of` and `taking_turns`. Raises `InputError`.
     """
 
-    law: LinearSystem
-    horizon: float
-    delay: float = 0.0
-    later: tuple[tuple[float, LinearSystem], ...] = ()
-    parameters: Box | None = None
-
-    __repr__ = noun
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "delay", _duration(self.delay))
-        every = [self.law, *(law for _, law in self.later)]
-        if any(law.parameter_count != 1 + self.parameter_count or law.delay for law in every):
+    def __init__(
+        self,
+        law: System,
+        horizon: float,
+        delay: float = 0.0,
+        later: Sequence[tuple[float, System]] = (),
+        parameters: Box | None = None,
+    ) -> None:
+        every, count = [law, *(one for _, one in later)], 0 if parameters is None else parameters.dimension
+        if any(one.parameter_count != 1 + count or one.delay or len(one.phases) > 1 for one in every):
             expected = "a law whose first parameter is the time, before those of the system, without a delay of its own"
             raise InputError(path="system", expected=expected, got="another")
-        times = [0.0, *(begin for begin, _ in self.later), self.horizon]
+        times = [0.0, *(begin for begin, _ in later), horizon]
         for i, (begin, until) in enumerate(pairwise(times)):
-            if self.later and not begin < until:
+            if later and not begin < until:
                 raise InputError(path=f"system.pieces.{i}.until", expected=f"a time after {begin:g}", got=f"{until:g}")
-        for i, law in enumerate(every[1:], 1):
-            for what in ("states", "controls", "disturbances"):
-                _check_as_many(i, what, law, self.law)
-        if self.later and len({law.c is None for law in every}) > 1:
-            drifting = [law if law.c is not None else replace(law, c=np.zeros((law.states, 1))) for law in every]
-            object.__setattr__(self, "law", drifting[0])
-            object.__setattr__(self, "later", tuple(zip(times[1:-1], drifting[1:], strict=True)))
-        if self.parameters is not None:
-            _ = self._depends
-
-    @property
-    def dependence(self) -> Dependence | None:
-        """How the state depends on the parameters, where that is affinely."""
-        return None if isinstance(self._depends, int) else self._depends
-
-    @cached_property
-    def _depends(self) -> Dependence | int:
-        """That, or the largest degree of an entry that is a polynomial in them."""
-        return dependence([[law.entry(name) for name in PARTS] for _, _, law in self.laws], *self.deviations)
-
-    @property
-    def deviations(self) -> tuple[Array, Array]:
-        """The middle of the parameters, and the most that each deviates from it by."""
-        if self.parameters is None:
-            return np.zeros(0), np.zeros(0)
-        centre, box = self.parameters.interior_point(), self.parameters
-        sides = ((centre, box.upper), (box.lower, centre))
-        return centre, np.max([[_difference(a, b) for a, b in zip(*ends, strict=True)] for ends in sides], axis=0)
-
-    @property
-    def powers(self) -> int | None:
-        """Of a system whose state is no affine function of its parameters, the largest degree of an entry that is a
-        polynomial in them."""
-        return self._depends if isinstance(self._depends, int) else None
-
-    def superposed(self, depends: Dependence | Spread) -> VaryingSystem:
-        """The known system of all states that a dependence tells of."""
-        laws = []
-        for begin, until, law in self.laws:
-            parts = {name: law.entry(name) for name in PARTS}
-            made = {name: Superposed(name, part, depends) for name, part in parts.items() if part is not None}
-            times = Box([begin], [until])
-            laws.append((begin, LinearSystem(made["A"], made["B"], made["E"], times, (TIME,), made.get("c"))))
-        return VaryingSystem(laws[0][1], self.horizon, self.delay, tuple(laws[1:]))
-
-    def at(self, parameter: Array) -> VaryingSystem:
-        """The known system at one parameter ``(nu,)``."""
-        if self.parameters is None:
-            return self
-        laws = []
-        for begin, until, law in self.laws:
-            A, B, E, c = (_at(law.entry(name), parameter) for name in PARTS)
-            assert A is not None and B is not None
-            laws.append((begin, LinearSystem(A, B, E, Box([begin], [until]), (TIME,), c)))
-        return VaryingSystem(laws[0][1], self.horizon, self.delay, tuple(laws[1:]))
-
-    def with_parameters(self, parameters: ConvexSet) -> VaryingSystem:
-        """The same system with its parameters in another box."""
-        box = boxed(parameters)
-        laws = [(begin, law.with_parameters(_and_time(begin, until, box))) for begin, until, law in self.laws]
-        return replace(self, law=laws[0][1], later=tuple(laws[1:]), parameters=box)
+        phases = tuple(
+            replace(one.phases[0], begin=begin, until=until, timed=True)
+            for one, (begin, until) in zip(every, pairwise(times), strict=True)
+        )
+        super().__init__(phases, parameters, delay)
 
     @staticmethod
     def of(
@@ -719,13 +417,12 @@ class VaryingSystem:
         delay: float = 0.0,
         parameters: ConvexSet | None = None,
         names: Sequence[str] = (),
-    ) -> VaryingSystem:
+    ) -> System:
         """The system whose entries are numbers and expressions in ``t``, in the ``names`` of uncertain ``parameters``
         (p1, p2, ... unless given), and in those that ``define`` gives to such expressions; see `parse_expression`.
         Raises `InputError` that begins with the key of a config."""
         known = _Uncertain.of(parameters, names)
-        law = _law("system", (A, B, E, c), (0.0, horizon), define, known)
-        return VaryingSystem(law, horizon, delay, parameters=known.box)
+        return System((_phase("system", (A, B, E, c), (0.0, horizon), define, known),), known.box, delay)
 
     @staticmethod
     def taking_turns(
@@ -734,234 +431,29 @@ class VaryingSystem:
         delay: float = 0.0,
         parameters: ConvexSet | None = None,
         names: Sequence[str] = (),
-    ) -> VaryingSystem:
+    ) -> System:
         """Systems as those of `of`, each up to a time with its ``A``, ``B``, ``E`` and ``c``; ``t`` counts from 0 in
         all of them, and the last one ends at the horizon."""
-        begins, known = [0.0, *(float(until) for until, _ in pieces[:-1])], _Uncertain.of(parameters, names)
-        laws = [
-            _law(f"system.pieces.{i}", given, (begin, float(until)), define, known)
-            for i, (begin, (until, given)) in enumerate(zip(begins, pieces, strict=True))
-        ]
-        later = tuple(zip(begins[1:], laws[1:], strict=True))
-        return VaryingSystem(laws[0], float(pieces[-1][0]), delay, later, known.box)
-
-    @staticmethod
-    def made_of(system: LinearSystem | SwitchedSystem, horizon: float) -> VaryingSystem:
-        """A system that does not change, or takes turns, as one whose law is constant in every turn. Raises
-        `InputError` where its parameters are in no box."""
-        begins, modes = [0.0, *system.switches], system.modes
-        ends, box = [*begins[1:], horizon], None if system.parameters is None else boxed(system.parameters)
-        laws = [
-            LinearSystem(
-                _at_any_time(mode.A),
-                _at_any_time(mode.B),
-                None if mode.E is None else _at_any_time(mode.E),
-                _and_time(begin, end, box),
-                (TIME, *mode.names[: 0 if box is None else box.dimension]),
-                None if mode.c is None else _at_any_time(mode.c),
-            )
-            for begin, end, mode in zip(begins, ends, modes, strict=True)
-        ]
-        return VaryingSystem(laws[0], horizon, system.delay, tuple(zip(begins[1:], laws[1:], strict=True)), box)
-
-    @property
-    def laws(self) -> tuple[tuple[float, float, LinearSystem], ...]:
-        """Between which times which law holds."""
-        ends = [*(begin for begin, _ in self.later), self.horizon]
-        begun = ((0.0, self.law), *self.later)
-        return tuple((begin, until, law) for (begin, law), until in zip(begun, ends, strict=True))
-
-    @property
-    def varies(self) -> bool:
-        """As `LinearSystem.varies`."""
-        return True
-
-    def turns(self, horizon: float) -> tuple[tuple[float, float, LinearSystem], ...]:
-        """As `LinearSystem.turns`: its laws."""
-        return _turns([begin for begin, _, _ in self.laws], [law for _, _, law in self.laws], horizon)
-
-    def taking(self, turns: Sequence[tuple[float, float, LinearSystem]]) -> VaryingSystem:
-        """As `LinearSystem.taking`."""
-        return self.lawful([(begin, law) for begin, _, law in turns])
-
-    def check_horizon(self, horizon: float) -> None:
-        """As `LinearSystem.check_horizon`."""
-        _check_ends([until for _, until, _ in self.laws], horizon, whole=not self.later)
-
-    def check_period(self) -> None:
-        """Raise `InputError` where the horizon is no period of a law, but for what rounding it explains. Nothing is
-        proven by that: the law of a plan that repeats begins again at the horizon, as pieces of a system do. Laws that
-        take turns may differ there as at any other time."""
-        if self.later:
-            return
-        every = [[part[0] for part in mode.forced.matrices(mode.probes[:1])] for mode in self.modes]
-        sizes = [np.abs(parts).max(axis=0) for parts in zip(*every, strict=True)]
-        ends = self.law.forced.matrices(self._points(np.array([[0.0], [self.horizon]])))
-        for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
-            for i, j in np.argwhere(np.abs(last - first) > PERIODIC * size):
-                entry = f"c[{i + 1}]" if name == "B" and j >= self.controls else f"{name}[{i + 1}][{j + 1}]"
-                raise InputError(
-                    path="repeat",
-                    expected="a horizon that is a period of the system, which begins again there",
-                    got=f"{entry} = {first[i, j]:.12g} at 0, and {last[i, j]:.12g} at {self.horizon:.12g}",
-                )
-
-    def lawful(self, laws: Sequence[tuple[float, LinearSystem]]) -> VaryingSystem:
-        """The same with other ``laws``, each with the time from which it holds, the first from 0 on."""
-        return replace(self, law=laws[0][1], later=tuple(laws[1:]))
-
-    def remaining(self, begin: float, horizon: float) -> VaryingSystem:
-        """What is left of it from a time on, which is 0 then."""
-        left = [
-            (max(0.0, start - begin), law.at_times(max(0.0, start - begin), until - begin, begin))
-            for start, until, law in self.laws
-            if not over(until, begin, horizon)
-        ]
-        return VaryingSystem(left[0][1], horizon, self.delay, tuple(left[1:]), self.parameters)
-
-    @property
-    def states(self) -> int:
-        """Number ``d`` of states."""
-        return self.law.states
-
-    @property
-    def controls(self) -> int:
-        """Number ``m`` of controls."""
-        return self.law.controls
-
-    @property
-    def disturbances(self) -> int:
-        """Number ``mw`` of disturbances."""
-        return self.law.disturbances
-
-    @property
-    def parameter_count(self) -> int:
-        """Number ``nu`` of uncertain parameters."""
-        return 0 if self.parameters is None else self.parameters.dimension
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of the uncertain parameters."""
-        return self.law.names[1:]
-
-    @property
-    def switches(self) -> tuple[float, ...]:
-        """None: where another law takes over, no piece of a grid has to end."""
-        return ()
-
-    @property
-    def c(self) -> Matrix | None:
-        """Whether there is a drift."""
-        return self.law.c
-
-    @cached_property
-    def forced(self) -> VaryingSystem:
-        """As `LinearSystem.forced`."""
-        return self if self.law.c is None else self.lawful([(begin, law.forced) for begin, _, law in self.laws])
-
-    @cached_property
-    def modes(self) -> tuple[LinearSystem, ...]:
-        """The system as it is at several times, for what asks how large its numbers are; nothing is proven by them. Of
-        parameters that the state depends on affinely they are those in the middle of the box."""
-        found = list[LinearSystem]()
-        # Chebyshev's points, closer to the ends: an entry that is 0 at evenly spaced times is seen
-        shares = (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
-        for begin, until, law in self.laws:
-            if self.powers is not None:
-                times = (begin + (until - begin) * shares[:, 0]).tolist()
-                every = [[_during(law.entry(name), time) for name in PARTS] for time in times]
-                bound, names = self.parameters, self.names
-                found += [LinearSystem(A, B, E, bound, names, c) for A, B, E, c in every]  # type: ignore[arg-type]
-                continue
-            times = self._points(begin + (until - begin) * shares)
-            A, B, E = law.matrices(times)
-            drifts = [None] * LOOKS if self.c is None else list(law.forced.matrices(times)[1][:, :, -1:])
-            found += [LinearSystem(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True)]
-        return tuple(found)
-
-    @shaped
-    def in_units(
-        self,
-        A: Float[Array, "d d"],
-        B: Float[Array, "d m"],
-        E: Float[Array, "d mw"],
-        parameters: Float[Array, " nu"],
-        c: Float[Array, "d 1"] | float = 1.0,
-        time: float = 1.0,
-    ) -> VaryingSystem:
-        """As `LinearSystem.in_units`; the time of the law is divided too."""
-        every = np.concatenate([[time], parameters])
-        first, *others = (law.in_units(A, B, E, every, c, 1.0) for _, _, law in self.laws)
-        later = tuple((begin / time, law) for (begin, _), law in zip(self.later, others, strict=True))
-        bound = None if self.parameters is None else boxed(self.parameters.in_units(parameters))
-        return VaryingSystem(first, self.horizon / time, self.delay / time, later, bound)
-
-    def _points(self, times: Array) -> Array:
-        """``times (k, 1)`` as parameters of the law, with those of the system in the middle of their box."""
-        middle = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
-        return np.hstack([times, np.tile(middle, (len(times), 1))])
-
-    @shaped
-    def describe(self, parameter: Float[Array, " nu"]) -> str:
-        """As `LinearSystem.describe`."""
-        return ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.names, parameter, strict=True))
+        ends, known = [0.0, *(float(until) for until, _ in pieces)], _Uncertain.of(parameters, names)
+        phases = tuple(
+            _phase(f"system.pieces.{i}", given, during, define, known)
+            for i, (during, (_, given)) in enumerate(zip(pairwise(ends), pieces, strict=True))
+        )
+        return System(phases, known.box, delay)
 
 
-System: TypeAlias = LinearSystem | SwitchedSystem | VaryingSystem
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class _At:
-    """A function of the time, and of parameters after it, at one ``parameter (nu,)``."""
-
-    entry: Callable[..., object]
-    parameter: Array
-
-    def __call__(self, p: npt.NDArray[np.object_]) -> object:
-        whole = np.empty(1 + self.parameter.size, dtype=object)
-        whole[0], nothing = p[0], 0.0 * p[0]
-        for i, value in enumerate(self.parameter.tolist()):
-            whole[1 + i] = nothing + value
-        return self.entry(whole)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class _During:
-    """A function of the time, and of parameters after it, at one ``time``, as one of the parameters."""
-
-    entry: Callable[..., object]
-    time: float
-
-    def __call__(self, p: npt.NDArray[np.object_]) -> object:
-        whole = np.empty(1 + len(p), dtype=object)
-        whole[0], whole[1:] = self.time, p
-        return self.entry(whole)
-
-
-def _during(entry: _Entry | None, time: float) -> _Entry | None:
-    return _During(entry, time) if callable(entry) else entry
-
-
-def _at(entry: _Entry | None, parameter: Array) -> _Entry | None:
-    return _At(entry, parameter) if callable(entry) else entry
+def _duration(value: object) -> float:
+    """A finite number that is not negative; raises `InputError`."""
+    usable = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not usable or not 0.0 <= float(value) < np.inf:  # type: ignore[arg-type]
+        raise InputError(path="system.delay", expected="a finite time, not negative", got=f"{value!r}")
+    return float(value)  # type: ignore[arg-type]
 
 
 def _difference(low: float, high: float) -> float:
     """``high - low``, or the next double above it."""
     exact, found = Fraction(float(high)) - Fraction(float(low)), float(high) - float(low)
     return found if Fraction(found) >= exact else float(np.nextafter(found, np.inf))
-
-
-def _turns(
-    begins: Sequence[float], systems: Sequence[LinearSystem], horizon: float
-) -> tuple[tuple[float, float, LinearSystem], ...]:
-    return tuple(zip(begins, (*begins[1:], horizon), systems, strict=True))
-
-
-def _switched(turns: Sequence[tuple[float, float, LinearSystem]], delay: float) -> SwitchedSystem:
-    return SwitchedSystem([(until, replace(one, delay=0.0)) for _, until, one in turns], delay)
 
 
 def _check_ends(ends: Sequence[float], horizon: float, whole: bool) -> None:
@@ -994,51 +486,10 @@ def _check_piece(i: int, pair: object, before: float) -> None:
         raise InputError(path=f"system.pieces.{i}.until", expected="a time", got=f"{until!r}")
     if not before < until < np.inf:
         raise InputError(path=f"system.pieces.{i}.until", expected=f"a time after {before:g}", got=f"{until:g}")
-    if not isinstance(system, LinearSystem) or system.delay:
-        said = "a delay of its own" if isinstance(system, LinearSystem) else type(system).__name__
+    plain = isinstance(system, System) and system.horizon == np.inf
+    if not plain or system.delay:
+        said = "a delay of its own" if plain else type(system).__name__
         raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=said)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class _Later:
-    """A function of the time, and of parameters after it, on a clock that shows 0 at the time ``begin``."""
-
-    entry: Callable[..., object]
-    begin: float
-
-    def __call__(self, p: npt.NDArray[np.object_]) -> object:
-        moved = p.copy()
-        moved[0] = p[0] + self.begin
-        return self.entry(moved)
-
-
-def _later(entry: _Entry | None, begin: float) -> _Entry | None:
-    return _Later(entry, begin) if callable(entry) else entry
-
-
-def _at_any_time(entry: Matrix) -> Matrix:
-    """A matrix, or a function of the parameters, as one of the time and of them."""
-    if not callable(entry):
-        return entry
-    function = entry
-    return lambda p: function(p[1:])
-
-
-def boxed(parameters: ConvexSet) -> Box:
-    """A set of parameters beside the time, which must be a box."""
-    if not parameters.is_box or not parameters.is_bounded:
-        raise InputError(
-            path="system.parameters", expected="a bounded box beside the time t, one interval each", got=parameters.kind
-        )
-    return parameters.bounding_box()
-
-
-def _and_time(begin: float, until: float, parameters: Box | None) -> Box:
-    """The times from one to another, and the parameters."""
-    if parameters is None:
-        return Box([begin], [until])
-    return Box(np.append(begin, parameters.lower), np.append(until, parameters.upper))
 
 
 @final
@@ -1061,14 +512,14 @@ class _Uncertain:
         return _Uncertain(box, (TIME, *given))
 
 
-def _law(
+def _phase(
     where: str,
     given: InTime,
     during: tuple[float, float],
     define: Mapping[str, str | float] | None,
     uncertain: _Uncertain,
-) -> LinearSystem:
-    """The law that is ``given`` at a key of a config, whose entries speak of the time between two."""
+) -> Phase:
+    """The phase that is ``given`` at a key of a config, whose entries speak of the time between two."""
     names, (A, B, E, c) = uncertain.names, given
     try:
         defined = parse_definitions(define or {}, names)
@@ -1077,124 +528,14 @@ def _law(
     begin, until = during
     if not begin < until < np.inf:
         raise InputError(path=f"{where}.until", expected=f"a time after {begin:g}", got=f"{until:g}")
-    return LinearSystem(
+    return Phase(
         parse_matrix(f"{where}.A", A, names, defined),
         parse_matrix(f"{where}.B", B, names, defined),
         None if E is None else parse_matrix(f"{where}.E", E, names, defined),
-        _and_time(begin, until, uncertain.box),
+        and_time(begin, until, uncertain.box),
         names,
         None if c is None else parse_column(f"{where}.c", c, names, defined),
+        begin,
+        until,
+        timed=True,
     )
-
-
-def _check_as_many(i: int, what: str, system: LinearSystem, first: LinearSystem) -> None:
-    if getattr(system, what) != getattr(first, what):
-        raise InputError(
-            path=f"system.pieces.{i}",
-            expected=f"{getattr(first, what)} {what}, as the other pieces",
-            got=f"{getattr(system, what)}",
-        )
-
-
-def _check_alike(i: int, system: LinearSystem, first: LinearSystem) -> None:
-    for what in ("states", "controls", "disturbances"):
-        _check_as_many(i, what, system, first)
-    mine, other = system.parameters, first.parameters
-    if mine is None:
-        return
-    if not mine.is_same(other) or system.names != first.names:
-        raise InputError(path=f"system.pieces.{i}", expected="the parameters of the other pieces", got="others")
-
-
-def _completed(system: LinearSystem, first: LinearSystem, drifts: bool) -> LinearSystem:
-    """The same system with the parameters of ``first``, and with a drift, of 0 where it has none."""
-    c = np.zeros((system.states, 1)) if system.c is None and drifts else system.c
-    if c is system.c and system.parameters is first.parameters:
-        return system
-    if isinstance(system, SystemInUnits):
-        return replace(system, c=c) if c is not None else system
-    return LinearSystem(system.A, system.B, system.E, first.parameters, first.names, c)
-
-
-@final
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SystemInUnits(LinearSystem):
-    """An uncertain system in other units: ``base`` at parameters times ``units (nu,)``, its matrices times
-    ``factors``."""
-
-    base: LinearSystem
-    factors: Mapping[str, Array]
-    units: Array
-
-    def __post_init__(self) -> None:
-        pass  # the base was checked
-
-    @cached_property
-    def forced(self) -> LinearSystem:
-        if self.c is None:
-            return self
-        base, factors = self.base.forced, self.factors
-        joined = {"A": factors["A"], "B": np.hstack([factors["B"], factors["c"]]), "E": factors["E"]}
-        return SystemInUnits(
-            base.A, base.B, base.E, self.parameters, self.names, base=base, factors=joined, units=self.units
-        )
-
-    @shaped
-    def describe(self, parameter: Float[Array, " nu"]) -> str:
-        return self.base.describe(parameter * self.units)
-
-    @shaped
-    def in_units(
-        self,
-        A: Float[Array, "d d"],
-        B: Float[Array, "d m"],
-        E: Float[Array, "d mw"],
-        parameters: Float[Array, " nu"],
-        c: Float[Array, "d 1"] | float = 1.0,
-        time: float = 1.0,
-    ) -> LinearSystem:
-        mine, units = self.factors, parameters * self.units
-        earlier = self.base.delay / self.delay if self.delay else 1.0
-        return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], units, c * mine["c"], time * earlier)
-
-    def entry(self, name: str) -> _Entry | None:
-        base, units = self.base.entry(name), self.units
-        if base is None:
-            return None
-        factor = self.factors[name]
-        if callable(base):
-            function = base
-            return lambda p: np.asarray(function(np.asarray(p, dtype=object) * units), dtype=object) * factor
-        return base * factor
-
-    def _shape(self, name: str) -> tuple[int, int]:
-        return self.base._shape(name)
-
-    @shaped
-    def _values(self, name: str, points: Float[Array, "k nu"]) -> Float[Array, "k rows columns"]:
-        return self.base._values(name, points * self.units) * self.factors[name]
-
-    @shaped
-    def taylor(
-        self, space: TaylorSpace, centre: Float[Array, " nu"], radius: Float[Array, " nu"]
-    ) -> tuple[
-        Float[Array, "M d d"],
-        Float[Array, "d d"],
-        Float[Array, "M d m"],
-        Float[Array, "d m"],
-        Float[Array, "M d mw"],
-        Float[Array, "d mw"],
-    ]:
-        found = self.base.taylor(space, centre * self.units, radius * self.units)
-        every = [part * self.factors[name] for name, part in zip("AABBEE", found, strict=True)]
-        return every[0], every[1], every[2], every[3], every[4], every[5]
-
-
-def _still(view: Array) -> Array:
-    """A view that nobody writes to."""
-    view.flags.writeable = False
-    return view
-
-
-def _seen(array: npt.NDArray[np.float64]) -> str:
-    return str(array.tolist()) if array.size <= 8 else f"an array of shape {array.shape}"

@@ -15,7 +15,8 @@ from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.control.problem.phase import Phase
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
 from sparserob_core.control.reach.support import InitialSupport, Support, Supports
 from sparserob_core.control.reach.varying_motion import (
@@ -148,7 +149,7 @@ class WorstCase:
         if model is not None:
             zero = np.zeros(model.channels)
             model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
-        if isinstance(system, VaryingSystem):
+        if system.varies:
             response = self.response
             if system.parameters is not None:
                 fixed = system.at(system.parameters.interior_point())
@@ -156,10 +157,9 @@ class WorstCase:
             exact = self._exactly
             return replace(self, response=response, disturbance=model, initial=None, shared=None, execution=exact)
         middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
-        modes = [LinearSystem(*(part[0] for part in mode.matrices(middle))) for mode in system.modes]
-        ends = (*system.switches, float(self.response.grid.breakpoints[-1]))
-        known = modes[0] if len(modes) == 1 else SwitchedSystem(list(zip(ends, modes, strict=True)))
-        response = Response(known, self.response.grid, self.response.initial_state)
+        known = [(phase, [part[0] for part in phase.matrices(middle)]) for phase in system.phases]
+        phases = tuple(Phase(A, B, E, begin=one.begin, until=one.until) for one, (A, B, E) in known)
+        response = Response(System(phases), self.response.grid, self.response.initial_state)
         return WorstCase(response, self.dictionary, model, names=self.names, execution=self._exactly)
 
     @property

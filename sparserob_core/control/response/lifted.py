@@ -43,6 +43,7 @@ from sparserob_core.control.enclosures.decoupling import (
 from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.system import LinearSystem, System
 from sparserob_core.control.response.response import TINY, Response, TimeGrid
 from sparserob_core.sip.convex_set import Array
@@ -646,10 +647,10 @@ def _applied(bounds: NormBounds, norms: Array) -> Array:
     return bounds.on(norms.reshape(*norms.shape[:2], -1)).reshape(norms.shape)
 
 
-def lift(system: LinearSystem, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:
+def lift(phase: Phase, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:
     """The lifted system over a cell, in the coordinates of `decoupled`; raises `NotEnclosable` when it has none."""
     space = _space(centre.size)
-    A, slack_A, B, slack_B, W, slack_W = system.taylor(space, centre, radius)
+    A, slack_A, B, slack_B, W, slack_W = phase.taylor(space, centre, radius)
     basis = decoupled(A[0])
     size, moved = np.abs(basis.inverse).astype(float), basis.matrix(A)
     coefficients, rounded = moved[0].copy(), moved[1].sum(axis=0)
@@ -693,9 +694,9 @@ def _row_sizes(entries: Array, starts: np.ndarray) -> Array:
     return block_norms(entries.T, starts).T
 
 
-def frozen(system: LinearSystem, grid: TimeGrid, initial_state: Array, parameter: Array) -> LiftedSystem:
+def frozen(phase: Phase, grid: TimeGrid, initial_state: Array, parameter: Array) -> LiftedSystem:
     """The system at one parameter, without any expansion."""
-    A, B, W = system.matrices(parameter[None])
+    A, B, W = phase.matrices(parameter[None])
     basis = identity(A.shape[1])
     none_A, none_B, none_W = (np.zeros((A.shape[1], part.shape[2])) for part in (A, B, W))
     return LiftedSystem(

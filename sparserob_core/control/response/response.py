@@ -20,7 +20,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.flows import FEW_STATES, Exponentials, Leaps
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transitions
-from sparserob_core.control.problem.system import System, VaryingSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.control.response.varying.spread import Parts, expanded
 from sparserob_core.shapes import Float, Int, shaped
@@ -403,9 +403,7 @@ class Propagator:
     def parts(self) -> Parts | None:
         """Of a system that changes with time and whose state is no affine function of its parameters, the parts of
         their box, on each of which it is expanded."""
-        if not isinstance(self.system, VaryingSystem) or self.system.powers is None:
-            return None
-        return expanded(self.system)
+        return None if self.system.powers is None else expanded(self.system)
 
     @cached_property
     def spread(self) -> tuple[tuple[Spread, Propagator], ...]:
@@ -454,7 +452,7 @@ class Propagator:
     @cached_property
     def _depends(self) -> bool:
         """Whether the system depends on parameters."""
-        return isinstance(self.system, VaryingSystem) or self.system.parameters is not None
+        return self.system.varies or self.system.parameters is not None
 
     def exponentials(self, mode: int = 0) -> Exponentials:
         """Those of a mode of a known system."""
@@ -533,7 +531,7 @@ class Propagator:
         `parts` where there are any."""
         if self.spread:
             return self.spread[0][1].expansion
-        return Expansion.of(self.system) if isinstance(self.system, VaryingSystem) else None
+        return Expansion.of(self.system) if self.system.varies else None
 
     @property
     def slack(self) -> float:

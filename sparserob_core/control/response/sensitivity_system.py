@@ -14,7 +14,8 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.phase import Phase
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
@@ -36,34 +37,35 @@ def tangent(response: Response) -> Response:
     system, blocks = response.system, 1 + response.system.parameter_count
     if blocks == 1:
         return response
-    modes = [_larger(mode) for mode in system.modes]
-    ends = (*system.switches, float(response.grid.breakpoints[-1]))
-    larger = modes[0] if len(modes) == 1 else SwitchedSystem(list(zip(ends, modes, strict=True)))
+    larger = System(tuple(_larger(phase) for phase in system.phases), system.parameters)
     return Response(
         larger, response.grid, np.concatenate([response.initial_state, np.zeros((blocks - 1) * system.states)])
     )
 
 
-def _larger(system: LinearSystem) -> LinearSystem:
-    at = Derivatives(system)
-    return LinearSystem(
+def _larger(phase: Phase) -> Phase:
+    at = Derivatives(phase)
+    return Phase(
         lambda p: _acting_on_rows(at(p)[0]),
         lambda p: np.concatenate(at(p)[1]),
         lambda p: np.concatenate(at(p)[2]),
-        parameters=system.parameters,
-        names=system.names,
+        phase.domain,
+        phase.names,
+        None,
+        phase.begin,
+        phase.until,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """The matrices of a system and their derivatives in the parameters, at one parameter at a time.
+    """The matrices of a phase and their derivatives in the parameters, at one parameter at a time.
 
     They are the first coefficients of Taylor models on a tiny cell, which is exact; where a function cannot be
     evaluated on Taylor models, second-order differences within the bounding box of the parameters.
     """
 
-    system: LinearSystem
+    phase: Phase
     _known: dict[bytes, tuple[Array, Array, Array]] = field(default_factory=dict, repr=False)
 
     def __call__(self, parameter: Array) -> tuple[Array, Array, Array]:
@@ -76,10 +78,10 @@ class Derivatives:
 
     @cached_property
     def _box(self) -> Box:
-        return ParameterIndex(self.system.parameters).box
+        return ParameterIndex(self.phase.domain).box
 
     def _at(self, parameter: Array) -> tuple[Array, Array, Array]:
-        values = self.system.matrices(parameter[None])
+        values = self.phase.matrices(parameter[None])
         try:
             slopes = self._enclosed(parameter)
         except NotEnclosable:
@@ -92,17 +94,17 @@ class Derivatives:
         width = box.upper - box.lower
         radius = CELL * np.where(width > 0, width, 1.0 + np.abs(parameter))
         space = TaylorSpace(parameter.size, 1)
-        parts = self.system.taylor(space, parameter, radius)
+        parts = self.phase.taylor(space, parameter, radius)
         linear = [space.index[tuple(exponents)] for exponents in np.eye(parameter.size, dtype=int).tolist()]
         A, B, E = (parts[part][linear] / radius[:, None, None] for part in (0, 2, 4))
         return A, B, E
 
     def _differenced(self, parameter: Array) -> tuple[Array, Array, Array]:
         box = self._box
-        shapes = [matrix.shape[1:] for matrix in self.system.matrices(parameter[None])]
+        shapes = [matrix.shape[1:] for matrix in self.phase.matrices(parameter[None])]
 
         def entries(points: Array, _: np.ndarray) -> Array:
-            return np.hstack([matrix.reshape(points.shape[0], -1) for matrix in self.system.matrices(points)])
+            return np.hstack([matrix.reshape(points.shape[0], -1) for matrix in self.phase.matrices(points)])
 
         slopes = differences(entries, parameter[None], box.lower, box.upper)[0]
         parts = np.split(slopes, np.cumsum([np.prod(shape) for shape in shapes])[:-1], axis=1)

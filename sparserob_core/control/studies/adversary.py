@@ -14,7 +14,6 @@ import numpy as np
 from sparserob_core.brief import brief
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.flows import Leaps
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.response.response import Response
@@ -266,9 +265,7 @@ Way: TypeAlias = _Way | _VaryingWay
 
 def _way(response: Response, parameter: Array, time: float, direction: Array) -> Way:
     if response.grid.varying:
-        system = response.system
-        if isinstance(system, VaryingSystem) and system.parameters is not None:
-            response = Response(system.at(parameter), response.grid, response.initial_state)
+        response = Response(response.system.at(parameter), response.grid, response.initial_state)
         return _VaryingWay(VaryingMotion(response.propagator, response.initial_state), direction, time)
     return _Way.of(response, parameter, time, direction)
 

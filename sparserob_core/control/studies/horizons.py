@@ -18,8 +18,9 @@ import numpy as np
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport, summed
 from sparserob_core.control.reach.support import InitialSupport
@@ -165,12 +166,8 @@ class Horizons:
         """The system at one parameter in the time ``s``, over the horizons of an interval."""
         at = (parameter / self._units.parameters)[None]
         A, B, E = (matrix[0] for matrix in self._own.system.forced.modes[0].matrices(at))
-        scaled = LinearSystem(
-            lambda T: A * T[0],
-            lambda T: B * T[0],
-            lambda T: E * T[0],
-            parameters=Box(np.array([low]), np.array([high])),
-        )
+        horizons = Box(np.array([low]), np.array([high]))
+        scaled = Phase(lambda T: A * T[0], lambda T: B * T[0], lambda T: E * T[0], horizons)
         middle, radius = np.array([(low + high) / 2]), np.array([(high - low) / 2])
         return lift(scaled, self._grid, self._start, middle, radius * (1.0 + 4.0 * np.finfo(float).eps))
 
@@ -227,7 +224,8 @@ class Horizons:
     @property
     def _unchanged(self) -> OptimalControlProblem:
         """The problem as it is up to the first change of the system."""
-        return replace(self.problem, system=self.problem.system.modes[0])
+        system = self.problem.system
+        return replace(self.problem, system=System((system.phases[0].between(0.0, np.inf),), system.parameters))
 
     @cached_property
     def _start(self) -> Array:

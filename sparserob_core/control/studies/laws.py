@@ -13,7 +13,6 @@ import numpy as np
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.dependence import Dependence
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -200,10 +199,9 @@ class ParametersInTime:
     def of(problem: OptimalControlProblem) -> ParametersInTime | None:
         """Those of a problem as it was stated; ``None`` where it has none."""
         every, system = at_corners(problem), in_time(problem).system
-        if every is None or not isinstance(system, VaryingSystem) or system.parameters is None:
+        if every is None or system.dependence is None:
             return None
-        assert system.dependence is not None
-        return ParametersInTime(system.parameters, system.dependence, every)
+        return ParametersInTime(system.box, system.dependence, every)
 
     def draw(self, law: LawName, count: int, directions: Array | None, rng: np.random.Generator) -> Array:
         """``count`` of them as rows on all states, ``(count, d, size)``: those of neighbours are near the corners that

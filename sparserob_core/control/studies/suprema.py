@@ -13,7 +13,6 @@ from sparserob_core.brief import brief
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.reach.functional import WorstCase
@@ -185,7 +184,7 @@ def followed(
     classes = problem.classes
     alike = len(classes) <= 1 and problem.disturbance_breakpoints is None
     erring = problem.execution is not None and theta.any()  # what stands still is delivered as it is commanded
-    if not isinstance(system, LinearSystem) or system.parameter_count or not alike or erring:
+    if system.varies or len(system.phases) > 1 or system.parameter_count or not alike or erring:
         return None
     changes: Array | None = None
     if classes == {"piecewise_constant"}:
@@ -195,8 +194,7 @@ def followed(
         changes = disturbance.breakpoints[[0, *jumps, -1]]
     elif problem.disturbance is not None and (classes != {"measurable"} or problem.disturbance.halfspaces() is None):
         return None
-    forced = system.forced
-    A, B, E = (part[0] for part in forced.matrices(np.zeros((1, 0))))
+    A, B, E = (part[0] for part in system.forced.phases[0].matrices(np.zeros((1, 0))))
     grid = grid_of(problem, control.breakpoints, disturbance.breakpoints)
     pieces = control.control(theta)
     inputs = np.hstack([B, E]) if problem.disturbance is not None else B

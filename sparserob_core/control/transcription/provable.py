@@ -8,7 +8,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import System, VaryingSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.reach.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.integrals import enclosed
@@ -32,7 +32,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     problem = superposed(problem)  # parameters beside the time are no obstacle
     if problem.measurable is not None and problem.system.parameter_count:
         paths = [entry.set for entry in problem.windows]
-        far = not isinstance(problem.system, VaryingSystem)
+        far = not problem.system.varies
         if far or any(one.halfspaces() is None for one in (*paths, *problem.terminal_sets)):
             over = f"uncertain parameters out of reach ({within_reach(problem)})" if far else "sets with curved sides"
             return (

@@ -17,7 +17,6 @@ import numpy as np
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.response import Propagator, TimeGrid
 from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.errors import InputError
@@ -84,7 +83,7 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     M = np.zeros((d + 1 + m, d + 1 + m))
     if state is not None:
         M[:d, :d] = state.Q
-    if isinstance(system, VaryingSystem):
+    if system.varies:
         propagator = Propagator(system.at(parameter).forced, grid)
         which, (flows, weights) = np.arange(grid.pieces), _in_time(propagator, reference, noise, given, M)
     else:

@@ -25,8 +25,9 @@ from sparserob_core.control.problem.expression import (
     parse_matrix,
 )
 from sparserob_core.control.problem.names import Names
+from sparserob_core.control.problem.phase import TIME
 from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
-from sparserob_core.control.problem.system import TIME, LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
@@ -214,7 +215,7 @@ class SystemOptions(Options):
 
     def _varying(
         self, every: list[tuple[str, float | None, Matrices]], horizon: float | None, parameters: ConvexSet | None
-    ) -> VaryingSystem:
+    ) -> System:
         if horizon is None:
             raise InputError(path="system", expected="a system that stays the same with time here", got="one in t")
         for where, _, of in every:
@@ -416,7 +417,7 @@ def _system(
     names: tuple[str, ...],
     delay: float = 0.0,
     defined: Definitions = (),
-) -> LinearSystem:
+) -> System:
     _check_shapes(where, of)
     A, B, E, c = of
 
@@ -546,8 +547,8 @@ class ProblemKeys(ProblemFactory, Options):
                     path=f"{where}.E", expected=f"{system.states} rows, one per state", got=f"{len(one.E)}"
                 )
             rows = None if one.E is None else one.E + [[0.0] * len(one.E[0])] * below
-            names = system.law.names if isinstance(system, VaryingSystem) else system.names
-            E = None if rows is None else parse_matrix(f"{where}.E", rows, tuple(names))
+            names = tuple(system.phases[0].names)
+            E = None if rows is None else parse_matrix(f"{where}.E", rows, names)
             width = system.disturbances if one.E is None else len(one.E[0])
             bound, times = one.bound.build(f"{where}.set", width), one.times(where, self.horizon)
             found.append(Disturbance(bound, E, one.kind, one.start or 0.0, one.stop, times))

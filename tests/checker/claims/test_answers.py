@@ -437,7 +437,7 @@ def test_chords_are_how_long_a_set_is_through_its_middle(shape, chords):
 
 def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
     judged = case_of()
-    delayed = replace(judged.problem.system, delay=0.5)
+    delayed = judged.problem.system.with_delay(0.5)
     free = replace(judged, problem=replace(judged.problem, system=delayed, disturbance_class="measurable"))
     with pytest.raises(Unchecked, match="undelayed"):
         Answers(free).loop  # noqa: B018

@@ -3,7 +3,6 @@ system that changes with time; against a walk of our own in which whatever may j
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -55,7 +54,7 @@ def precision() -> Any:
 def case_of(name: str, certificate: dict[str, Any] | None = None, **more: Any) -> Case:
     system = kind("varying" if name.startswith("in time") else "known").system
     if system.delay:
-        system = replace(system, delay=0.0)
+        system = system.with_delay(0.0)
     bound: Any = BOUND
     said: dict[str, Any] = {"disturbance_class": "measurable"}
     if not name.startswith("in time"):

@@ -41,7 +41,7 @@ def case_of(certificate: dict[str, Any] | None = None, delay: float = 0.0, **mor
         }
     )
     if delay:
-        object.__setattr__(problem, "system", replace(problem.system, delay=delay))
+        object.__setattr__(problem, "system", problem.system.with_delay(delay))
     grid = sr.Dictionary.indicators([0.0, 1.0, 2.0])
     return Case(problem, grid, grid, {"decision": [[-0.5, 0.5]], "repeat": True, **(certificate or {})})
 

@@ -482,7 +482,7 @@ def test_a_bound_against_every_causal_policy_is_by_hand():
         said = {**case.certificate["causal"], "multipliers": [{**entry, **wrong}]}
         with pytest.raises(Broken):
             causal_bound(case, said, priced=True)
-    late = replace(case, problem=replace(case.problem, system=replace(case.problem.system, delay=0.5)))
+    late = replace(case, problem=replace(case.problem, system=case.problem.system.with_delay(0.5)))
     # of the second piece only half is over by then
     assert float(causal_bound(late, case.certificate["causal"], priced=True).mid()) == pytest.approx(0.8 - 0.5)
     for change in (

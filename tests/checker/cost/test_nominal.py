@@ -167,7 +167,7 @@ def everything(varying: bool) -> sr.OptimalControlProblem:
 def integrated(problem, control: np.ndarray, edges: np.ndarray) -> tuple[float, list[np.ndarray]]:
     """The quadratic terms of a control, and the nominal states where it begins to act, by an integrator."""
     Q, r = np.array([[1.0, 0.5], [0.5, 0.25]]), np.array([0.2, -0.1])
-    varying = isinstance(problem.system, VaryingSystem)
+    varying = problem.system.varies
 
     def slope(t, z, u, late):
         damping = -0.2 if late else -0.5 + (np.sin(t) / 4 if varying else 0.0)

@@ -209,8 +209,8 @@ EACH = pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) 
 
 def numbers(system, time: float, p) -> np.ndarray:
     """``[A B c E]`` in floats."""
-    if isinstance(system, VaryingSystem):
-        law, given = next(one for begin, _, one in reversed(system.laws) if begin <= time), np.array([time, *p])
+    if system.varies:
+        law, given = next(one for one in reversed(system.phases) if one.begin <= time), np.array([time, *p])
     else:
         law, given = system.modes[int(np.searchsorted(system.switches, time, side="right"))], np.array(p)
     parts = [law.entry(name) for name in ("A", "B", "c", "E")]

@@ -70,7 +70,7 @@ def holds(law: Law, points, function, near: float) -> None:
 @pytest.mark.parametrize("text", ENTRIES)
 def test_numbers_at_every_time_are_in_narrow_balls_where_parameters_are_known(text: str) -> None:
     system = VaryingSystem.of([[text]], [["1"]], 2.0, [[1]], parameters=sr.Box([-0.3], [0.4]), names=["p"])
-    entry = system.law.entry("A")
+    entry = system.phases[0].entry("A")
     law = Law(Plant.of(system, 2.0), 2.0, Box((0.15,), (0.0,)))
     holds(law, [()], lambda t, p: [[float(entry(np.array([t, 0.15], dtype=object))[0, 0]), 1.0, 1.0]], 1e-25)
 
@@ -79,7 +79,7 @@ def test_numbers_at_every_time_are_in_narrow_balls_where_parameters_are_known(te
 @pytest.mark.parametrize("text", ENTRIES)
 def test_numbers_at_every_time_and_parameter_are_in_balls_that_narrow_with_the_degree(text: str, degree: int) -> None:
     system = VaryingSystem.of([[text]], [["1"]], 2.0, [[1]], parameters=sr.Box([-0.3], [0.4]), names=["p"])
-    entry = system.law.entry("A")
+    entry = system.phases[0].entry("A")
     law = Law(Plant.of(system, 2.0), 2.0, Box.between([-0.1], [0.2]), degree)
     points = [(-1.0,), (1.0,)]
     near = 1.0 if degree == 1 else 0.1
@@ -198,7 +198,7 @@ def test_a_pole_in_the_box_of_parameters_is_refused(text: str) -> None:
 
 def test_an_entry_that_is_no_arithmetic_is_left_unchecked() -> None:
     system = LinearSystem(lambda p: np.array([[p[0] * 1.0]]), np.ones((1, 1)), parameters=sr.Box([0.6], [0.8]))
-    object.__setattr__(system, "A", lambda p: np.array([[float(p[0])]]))
+    object.__setattr__(system.phases[0], "A", lambda p: np.array([[float(p[0])]]))
     with pytest.raises(Unchecked):
         _ = Law(Plant.of(system, 1.0), 1.0, Box((0.7,), (0.1,)), 2).stretches
 

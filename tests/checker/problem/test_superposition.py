@@ -3,6 +3,7 @@ these parameters, corners hold the box exactly, and what is not affine is refuse
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -14,7 +15,6 @@ from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.problem.superposition import Parts, parted
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.expression import parse_matrix
-from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, NormBall
 
 BOX, NAMES = Box([-0.1, 0.3, 2.0], [0.7, 0.8, 2.0]), ("p", "q", "r")
@@ -50,8 +50,8 @@ def matrix(law: Any, name: str, p: list[float]) -> np.ndarray:
 def test_seen_at_any_parameters_the_larger_system_is_the_one_at_these() -> None:
     rng, (system, parts) = np.random.default_rng(2), plant()
     larger = parted(problem_of(system)).system
-    assert isinstance(larger, sr.VaryingSystem)
-    ((_, _, law),), ((_, _, big),) = system.laws, larger.laws
+    assert larger.varies
+    (law,), (big,) = system.phases, larger.phases
     assert parts.moved == [[1, 2], [1, 2], []]
     assert parts.scales == pytest.approx([0.4, 0.25, 0.0], rel=1e-15)
     for _ in range(5):
@@ -160,10 +160,9 @@ def test_a_parameter_that_meets_a_state_that_depends_on_one_is_refused(place: tu
     system, _ = plant()
     rows = [list(row) for row in A]
     rows[place[0]][place[1]] = entry
-    law = system.laws[0][2]
-    other = LinearSystem(parse_matrix("A", rows, ("t", *NAMES)), law.B, law.E, law.parameters, ("t", *NAMES), law.c)
-    made = object.__new__(sr.VaryingSystem)
-    made.__dict__.update(system.__dict__ | {"law": other})
+    other = replace(system.phases[0], A=parse_matrix("A", rows, ("t", *NAMES)))
+    made = object.__new__(sr.System)
+    made.__dict__.update(system.__dict__ | {"phases": (other,)})
     with pytest.raises(Unchecked, match="affinely"):
         assert Parts(made, tuple(BOX.interior_point().tolist())).moved
 

@@ -10,7 +10,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.checker.problem.turns import in_turns
 from sparserob_core.control.problem.expression import parse_matrix
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 
 
 def system(text: str) -> LinearSystem:
@@ -27,10 +27,10 @@ def problem(plant: Any, **more: Any) -> sr.OptimalControlProblem:
 def test_laws_in_turns_are_those_of_the_systems_that_take_turns() -> None:
     turns = SwitchedSystem([(0.75, system("-p1")), (2.0, system("p1^2"))])
     found = in_turns(problem(turns, execution=np.array([0.1]))).system
-    assert isinstance(found, VaryingSystem) and found.horizon == 2.0
-    assert [begin for begin, *_ in found.laws] == [0.0, 0.75]
+    assert found.varies and found.horizon == 2.0
+    assert [phase.begin for phase in found.phases] == [0.0, 0.75]
     assert found.parameters is not None and found.parameters.bounding_box().upper.tolist() == [0.75]
-    for (_, _, law), expected in zip(found.laws, (-0.625, 0.625**2), strict=True):
+    for law, expected in zip(found.phases, (-0.625, 0.625**2), strict=True):
         at = np.array([0.8, 0.625])
         assert [float(np.asarray(law.entry(name)(at) if callable(law.entry(name)) else law.entry(name)).item())
                 for name in ("A", "B", "E", "c")] == [expected, 2.0, 3.0, 0.625]  # fmt: skip
@@ -49,5 +49,5 @@ def test_laws_in_turns_are_those_of_the_systems_that_take_turns() -> None:
 def test_only_what_is_followed_in_time_is_changed(plant: Any, more: dict[str, Any], changed: bool) -> None:
     given = problem(plant, **more)
     found = in_turns(given)
-    assert (found is not given) == changed == isinstance(found.system, VaryingSystem)
+    assert (found is not given) == changed == found.system.varies
     assert found.system.delay == plant.delay

@@ -330,8 +330,8 @@ def test_what_a_row_is_made_of_is_known_as_well_on_many_pieces_as_on_one() -> No
         row = duality.row(c, time, (), arb(0), disturbed=False)
         pushed = duality.pushed(c, time, ends[:-1].tolist())
         carried = duality.carried(c, time)
-    inverse = np.linalg.inv(stiff.A.T)
-    lags = np.array([scipy.linalg.expm(stiff.A.T * max(0.0, time - s)) @ c for s in ends])
+    inverse = np.linalg.inv(stiff.phases[0].A.T)
+    lags = np.array([scipy.linalg.expm(stiff.phases[0].A.T * max(0.0, time - s)) @ c for s in ends])
     assert [float(x.mid()) for x in carried] == pytest.approx(lags[0].tolist(), abs=1e-11)
     for found in (row.slope, pushed):
         assert np.array([[float(x.mid()) for x in one] for one in found]) == pytest.approx(

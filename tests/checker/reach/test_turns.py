@@ -39,7 +39,7 @@ def modes(spread: float) -> SwitchedSystem:
     for rows in ENTRIES:
         A, B, E = (parse_matrix(name, part, ("p1",)) for name, part in zip("ABE", rows, strict=True))
         uncertain = LinearSystem(A, B, E, parameters=Box([0.1 - spread], [0.1 + spread]), names=("p1",))
-        known = LinearSystem(*(matrix[0] for matrix in uncertain.matrices(np.array([[0.1]]))))
+        known = LinearSystem(*(matrix[0] for matrix in uncertain.phases[0].matrices(np.array([[0.1]]))))
         made.append(uncertain if spread else known)
     return SwitchedSystem(list(zip((*SWITCHES, HORIZON), made, strict=True)))
 

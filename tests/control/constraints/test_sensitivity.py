@@ -134,7 +134,7 @@ def decision(rng, family, system, grid="uniform"):
 def test_the_slope_in_time_is_that_of_the_worst_case(seed, bound, grid, shift):
     rng = np.random.default_rng(seed)
     system = random_system(rng)
-    system = LinearSystem(system.A + shift * np.eye(2), system.B, system.E)
+    system = LinearSystem(system.phases[0].A + shift * np.eye(2), system.phases[0].B, system.phases[0].E)
     family = family_of(rng, system, bound, grid=grid, disturbance=GRIDS["uneven"])
     indices = indices_in(rng, family)
     assert_it_is_the_derivative(family, decision(rng, family, system, grid), indices, some_rows(rng, family, indices))
@@ -189,8 +189,8 @@ def test_errors_of_execution_have_slopes_in_directions_too(varies):
     rng = np.random.default_rng(4)
     plant = random_system(rng, states=3)
     if varies:
-        dressed = [[f"{entry} + 0.1*sin(t)" for entry in row] for row in plant.A]
-        plant = VaryingSystem.of(dressed, np.asarray(plant.B).tolist(), HORIZON)
+        dressed = [[f"{entry} + 0.1*sin(t)" for entry in row] for row in plant.phases[0].A]
+        plant = VaryingSystem.of(dressed, np.asarray(plant.phases[0].B).tolist(), HORIZON)
     m = plant.controls
     problem = OptimalControlProblem(
         system=plant,

@@ -13,7 +13,6 @@ import pytest
 import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
 from sparserob_core.control.feedback.closed_loop import shared
-from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, STILL, Loop
@@ -48,7 +47,7 @@ def stepped(name):
 def cells(case: Loop, widths=(1.0, 0.3, 0.01)):
     """Cells of several widths, each within a piece of the grid, and of what a system in t is one polynomial on."""
     rng, found, ends = np.random.default_rng(2), [], case.grid
-    if isinstance(case.system, VaryingSystem):
+    if case.system.varies:
         ends = np.unique(np.append(ends, Expansion.of(case.system).ends))
     for start, stop in pairwise(ends.tolist()):
         for share in widths:

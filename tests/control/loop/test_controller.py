@@ -50,7 +50,9 @@ class Plant:
         problem = outcome.problem
         self.problem, self.bounds = problem, outcome.experiment.control.breakpoints
         system = problem.system
-        self.A, self.B, self.E = (np.asarray(one, dtype=float) for one in (system.A, system.B, system.E))
+        self.A, self.B, self.E = (
+            np.asarray(one, dtype=float) for one in (system.phases[0].A, system.phases[0].B, system.phases[0].E)
+        )
 
     def moved(self, state, u, w, length):
         """The states at ten times within a piece and at its end."""

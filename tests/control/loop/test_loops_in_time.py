@@ -37,10 +37,11 @@ def test_what_is_left_of_laws_that_take_turns_is_what_they_are_later() -> None:
     system = sr.VaryingSystem.taking_turns(turns)
     for begin, laws in ((0.4, 2), (1.0, 1), (2.0, 1)):
         left = system.remaining(begin, 3.0 - begin)
-        assert left.horizon == 3.0 - begin and len(left.laws) == laws
-        for start, stop, law in left.laws:
+        assert left.horizon == 3.0 - begin and len(left.phases) == laws
+        for law in left.phases:
+            start, stop = law.begin, law.until
             for time in (start, (start + stop) / 2, stop):
-                then = system.law if begin + time <= 1.0 and laws == 2 and stop < left.horizon else system.later[0][1]
+                then = system.phases[0 if begin + time <= 1.0 and laws == 2 and stop < left.horizon else 1]
                 both = (law.forced.matrices(np.array([[time]])), then.forced.matrices(np.array([[begin + time]])))
                 for ours, theirs in zip(*both, strict=True):
                     np.testing.assert_allclose(ours, theirs, rtol=1e-15)

@@ -35,7 +35,7 @@ def responses(outcome, first):
     innovations seen, controls that answer them."""
     stored = np.load(outcome.directory / "solution.npz")
     gains, system = stored["gains"], outcome.problem.system
-    A, B, E = (np.asarray(one, dtype=float) for one in (system.A, system.B, system.E))
+    A, B, E = (np.asarray(one, dtype=float) for one in (system.phases[0].A, system.phases[0].B, system.phases[0].E))
     part = LENGTH / FINE
     block = expm(np.block([[A, np.eye(2)], [np.zeros((2, 4))]]) * part)
     Phi, Gamma = block[:2, :2], block[:2, 2:]

@@ -73,14 +73,14 @@ def test_a_plant_of_scipy_is_a_system():
     signal = pytest.importorskip("scipy.signal")
     system = sr.LinearSystem.from_statespace(signal.StateSpace(A, B, np.eye(2), np.zeros((2, 1))), E=[[0.0], [1.0]])
     assert (system.states, system.controls, system.disturbances) == (2, 1, 1)
-    for found, given in zip(system.matrices(np.zeros((1, 0))), (A, B, [[0.0], [1.0]]), strict=True):
+    for found, given in zip(system.phases[0].matrices(np.zeros((1, 0))), (A, B, [[0.0], [1.0]]), strict=True):
         np.testing.assert_array_equal(found[0], given)
 
 
 def test_a_plant_of_python_control_is_a_system():
     control = pytest.importorskip("control")
     system = sr.LinearSystem.from_statespace(control.ss(A, B, np.eye(2), np.zeros((2, 1))))
-    found = system.matrices(np.zeros((1, 0)))
+    found = system.phases[0].matrices(np.zeros((1, 0)))
     np.testing.assert_array_equal(found[0][0], A)
     np.testing.assert_array_equal(found[1][0], B)
     np.testing.assert_array_equal(found[2][0], np.eye(2))

@@ -103,7 +103,7 @@ def linear(**changes) -> OptimalControlProblem:
 
 def test_the_documented_config_is_the_documented_problem() -> None:
     made = linear()
-    A, B, E = made.system.matrices(np.array([[0.1, -0.1, 0.05]]))
+    A, B, E = made.system.phases[0].matrices(np.array([[0.1, -0.1, 0.05]]))
     np.testing.assert_allclose(A[0], [[0, 1], [-1.9, -0.6]])
     np.testing.assert_allclose(B[0], [[0], [1.05]])
     np.testing.assert_array_equal(E[0], np.eye(2))

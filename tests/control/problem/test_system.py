@@ -38,14 +38,16 @@ def by_expressions() -> LinearSystem:
 def test_a_known_system_has_one_parameter_vector_of_length_zero() -> None:
     system = LinearSystem([[0, 1], [0, 0]], [[0], [1]])
     assert (system.states, system.controls, system.disturbances, system.parameter_count) == (2, 1, 2, 0)
-    A, B, E = system.matrices(np.zeros((3, 0)))
+    A, B, E = system.phases[0].matrices(np.zeros((3, 0)))
     assert A.shape == (3, 2, 2) and B.shape == (3, 2, 1)
     np.testing.assert_array_equal(E[2], np.eye(2))
 
 
 def test_callables_and_expressions_give_the_same_matrices() -> None:
     points = np.random.default_rng(0).uniform(BOX.lower, BOX.upper, (20, 2))
-    for left, right in zip(by_callables().matrices(points), by_expressions().matrices(points), strict=True):
+    for left, right in zip(
+        by_callables().phases[0].matrices(points), by_expressions().phases[0].matrices(points), strict=True
+    ):
         np.testing.assert_allclose(left, right)
     assert by_callables().names == ("p1", "p2")
     assert by_expressions().describe(np.array([1.0, 0.1])) == "omega = 1, zeta = 0.1"
@@ -58,10 +60,10 @@ def test_taylor_models_enclose_every_entry_over_the_cell(make, seed: int) -> Non
     rng = np.random.default_rng(seed)
     system, space = make(), TaylorSpace(2, 3)
     centre, radius = rng.uniform([0.8, -0.1], [1.2, 0.1]), rng.uniform(0, 0.1, 2)
-    models = system.taylor(space, centre, radius)
+    models = system.phases[0].taylor(space, centre, radius)
     delta = rng.uniform(-1, 1, (30, 2))
     for truth, coefficients, remainder in zip(
-        system.matrices(centre + radius * delta), models[::2], models[1::2], strict=True
+        system.phases[0].matrices(centre + radius * delta), models[::2], models[1::2], strict=True
     ):
         value = np.einsum("km,mij->kij", space.monomials(delta), coefficients)
         assert (np.abs(value - truth) <= remainder + 1e-13).all()
@@ -70,7 +72,7 @@ def test_taylor_models_enclose_every_entry_over_the_cell(make, seed: int) -> Non
 def test_constant_plus_parameter_times_array_is_enclosed() -> None:
     base, change = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.diag([1.0, 2.0])
     system = LinearSystem(lambda p: base + p[0] * change, [[0], [1]], parameters=Box([-1.0], [1.0]))
-    coefficients, remainder, *_ = system.taylor(TaylorSpace(1, 2), np.array([0.0]), np.array([0.5]))
+    coefficients, remainder, *_ = system.phases[0].taylor(TaylorSpace(1, 2), np.array([0.0]), np.array([0.5]))
     np.testing.assert_array_equal(coefficients[:2], [base, 0.5 * change])
     assert remainder[base != 0].max() == 0.0  # numbers are what they are
     assert 0.0 < remainder[change != 0].max() < 1e-14  # and a product is rounded
@@ -89,9 +91,9 @@ def test_constant_plus_parameter_times_array_is_enclosed() -> None:
 )
 def test_a_function_that_cannot_be_enclosed_says_so_only_when_asked(function) -> None:
     system = LinearSystem(function, [[1.0]], parameters=Box([-1.0], [1.0]))
-    assert system.matrices(np.array([[0.5]]))[0].shape == (1, 1, 1)
+    assert system.phases[0].matrices(np.array([[0.5]]))[0].shape == (1, 1, 1)
     with pytest.raises(NotEnclosable, match="A"):
-        system.taylor(TaylorSpace(1, 2), np.array([0.0]), np.array([1.0]))
+        system.phases[0].taylor(TaylorSpace(1, 2), np.array([0.0]), np.array([1.0]))
 
 
 @pytest.mark.parametrize(
@@ -148,7 +150,7 @@ def test_a_function_that_is_another_one_for_taylor_models_is_refused(function):
     system = LinearSystem(function, [[1.0]], parameters=Box([-0.5], [0.5]))
     space = TaylorSpace(1, 2)
     with pytest.raises(InputError, match=r"system\.A: expected a function that depends on its argument alone, .*p1 = "):
-        system.taylor(space, np.zeros(1), np.full(1, 0.5))
+        system.phases[0].taylor(space, np.zeros(1), np.full(1, 0.5))
 
 
 def test_a_function_that_cancels_is_the_same_for_taylor_models():
@@ -157,4 +159,4 @@ def test_a_function_that_cancels_is_the_same_for_taylor_models():
 
     system = LinearSystem(A, [[1.0], [0.0]], parameters=Box([-0.5], [0.5]))
     for centre in np.linspace(-0.5, 0.5, 7):
-        system.taylor(TaylorSpace(1, 3), np.array([centre]), np.full(1, 1e-3))
+        system.phases[0].taylor(TaylorSpace(1, 3), np.array([centre]), np.full(1, 1e-3))

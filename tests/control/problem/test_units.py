@@ -83,11 +83,13 @@ def test_an_uncertain_system_in_other_units_is_the_same_in_values_and_taylor_mod
     factors = (rate * d, rate * m, rate * w)
     other = plain.in_units(*factors, p)
     points = np.array([[1.0, 2.0], [1.5, 3.0]])
-    for ours, theirs, factor in zip(other.matrices(points / p), plain.matrices(points), factors, strict=True):
+    for ours, theirs, factor in zip(
+        other.phases[0].matrices(points / p), plain.phases[0].matrices(points), factors, strict=True
+    ):
         np.testing.assert_array_equal(ours, theirs * factor)
     middle, radius = np.array([1.25, 3.0]), np.array([0.25, 1.0])
     space = TaylorSpace(2, 3)
-    found, wanted = other.taylor(space, middle / p, radius / p), plain.taylor(space, middle, radius)
+    found, wanted = other.phases[0].taylor(space, middle / p, radius / p), plain.phases[0].taylor(space, middle, radius)
     for ours, theirs, name in zip(found, wanted, "AABBEE", strict=True):
         np.testing.assert_array_equal(ours, theirs * factors["ABE".index(name)])
     assert other.describe(points[0] / p) == plain.describe(points[0])
@@ -163,10 +165,10 @@ def problems() -> list[sr.OptimalControlProblem]:
 
 def numbers(record: Any, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
     """Every number of a record, with the fields that lead to it."""
-    if isinstance(record, sr.LinearSystem):
+    if isinstance(record, sr.System):
         yield from (
             (f"{path}.{name}", part[0])
-            for name, part in zip("ABE", record.forced.matrices(np.zeros((1, 0))), strict=True)
+            for name, part in zip("ABE", record.forced.phases[0].matrices(np.zeros((1, 0))), strict=True)
         )
         yield f"{path}.delay", np.array(record.delay)
     elif is_dataclass(record):

@@ -40,7 +40,7 @@ def support_of(name: str, grid: str, bound: str, uncertain: bool) -> Disturbance
     else:
         system, radius = LinearSystem(A, np.ones((2, 1)), E), np.zeros(0)
     functionals = worst_case(system, GRIDS[grid], bound=BOUNDS[bound])
-    lifted = lift(system, functionals.response.grid, np.zeros(2), 0.0 * radius, radius)
+    lifted = lift(system.phases[0], functionals.response.grid, np.zeros(2), 0.0 * radius, radius)
     assert functionals.disturbance is not None
     return DisturbanceSupport(lifted, functionals.disturbance, ROWS @ lifted.transform)
 
@@ -87,7 +87,7 @@ def test_rows_are_nowhere_larger_than_is_said_between_the_ends_of_a_span(A: list
     two ends, where their second derivative makes them so."""
     rng, system = np.random.default_rng(0), LinearSystem(A, np.ones((2, 1)))
     grid = worst_case(system, uniform(pieces, HORIZON)).response.grid
-    lifted = lift(system, grid, np.zeros(2), np.zeros(0), np.zeros(0))
+    lifted = lift(system.phases[0], grid, np.zeros(2), np.zeros(0), np.zeros(0))
     ends, nearest = lifted.fine.breakpoints, 0.0
     assert lifted.spans.size == lifted.fine.pieces
     rows = rng.normal(size=(60, 2))

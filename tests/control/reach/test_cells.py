@@ -41,7 +41,7 @@ KINDS: dict[str, dict[str, Any]] = {
         "initial_control": [0.4], "initial_set": Box([-0.05, -0.02], [0.05, 0.02]),
     },
     "late and unsure": {
-        "system": LinearSystem(UNSURE.A, B, E, parameters=UNSURE.parameters, delay=0.3), "disturbance": TRIANGLE,
+        "system": UNSURE.with_delay(0.3), "disturbance": TRIANGLE,
         "initial_set": NormBall(p=3.0, radius=0.05, dimension=2),
     },
     "few functions": {"disturbance": BOX, "noise": walsh(4, HORIZON, 3), "control_in": walsh(4, HORIZON, 2)},
@@ -112,7 +112,7 @@ def test_no_cell_is_bounded_below_what_is_met_in_it_and_narrow_ones_hardly_above
 
 
 def test_measurable_disturbances_beside_parameters_in_no_box_have_no_enclosure_and_that_is_said() -> None:
-    round_ = LinearSystem(UNSURE.A, B, E, parameters=Ellipsoid([0.0], [[0.0025]]))
+    round_ = LinearSystem(UNSURE.phases[0].A, B, E, parameters=Ellipsoid([0.0], [[0.0025]]))
     said = {"system": round_, "disturbance": BOX, "disturbance_class": "measurable", "path": FLAT[:1]}
     made = OptimalControlProblem(horizon=HORIZON, initial_state=[-1.0, 0.5], control=Box([-1.0], [1.0]), **said)
     family = prepare(made, uniform(4, HORIZON), uniform(4, HORIZON)).program.families[0]

@@ -47,7 +47,7 @@ def functionals(name: str, begun: bool = False, delay: float = 0.0, seed: int = 
     grid = merge_grids(GRID.breakpoints, noise.breakpoints, delay, np.array([0.4]) if delay else None)
     model = None if chosen is None else disturbance_model(chosen[0], chosen[1], noise, grid, chosen[3])
     system = random_system(rng)
-    system = LinearSystem(system.A, rng.normal(size=(2, 1)), rng.normal(size=(2, 2)), delay=delay)
+    system = LinearSystem(system.phases[0].A, rng.normal(size=(2, 1)), rng.normal(size=(2, 2)), delay=delay)
     response = Response(system, grid, np.array([0.7, -0.4]))
     return WorstCase(response, GRID, model, initial=BEGUN if begun else None)
 
@@ -81,7 +81,9 @@ def test_rows_values_parts_and_turning_directions_agree(name: str, begun: bool) 
     assert profile[3, 1] == pytest.approx(one.offsets(at[0][3:4], at[1][1:2], at[2][:1])[0], abs=1e-10)
     again = one.from_state(np.array([0.2, 0.1]))
     assert again.rows(*at)[1] - again.offsets(*at) == pytest.approx(
-        np.array([c @ expm(one.response.system.A * t) @ [0.2, 0.1] for t, c in zip(at[0], at[1], strict=True)])
+        np.array(
+            [c @ expm(one.response.system.phases[0].A * t) @ [0.2, 0.1] for t, c in zip(at[0], at[1], strict=True)]
+        )
     )
     assert again.measurable is one.measurable
 
@@ -162,7 +164,9 @@ def test_a_control_that_acts_later_is_what_it_is_without_delay_on_later_times() 
     system = one.response.system
     for time, c, value in zip(at[0], at[1], one.values(theta, *at), strict=True):
         ends = np.concatenate([[0.0], GRID.breakpoints[:-1] + 0.8, [HORIZON + 0.8]])
-        state = simulated(system.A, [(system.B, ends, np.append(0.4, theta)[None])], [0.7, -0.4], time, ends)
+        state = simulated(
+            system.phases[0].A, [(system.phases[0].B, ends, np.append(0.4, theta)[None])], [0.7, -0.4], time, ends
+        )
         assert value == pytest.approx(c @ state, abs=1e-10)
     G = one.rows(*at)[0]
     assert (G[:, 5] == 0.0).all() and G[-1, 4] != 0.0

@@ -33,7 +33,9 @@ BOUNDS = {
 
 def by_quadrature(system, bound, direction, time, parameter=None):
     """A midpoint sum of the support function, error about ``1e-7``."""
-    A, _, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0)) if parameter is None else parameter[None]))
+    A, _, E = (
+        matrix[0] for matrix in system.phases[0].matrices(np.zeros((1, 0)) if parameter is None else parameter[None])
+    )
     count = 20000
     step = time / count
     row, flow = direction @ expm(A * step / 2), expm(A * step)
@@ -133,7 +135,7 @@ FLAT = [name for name in BOUNDS if name != "ellipsoid"]
 def across_kinks(system, bound, direction, time):
     """The integral of the support function over parts between which one corner of the set takes over from another, each
     by Gauss and Legendre: to about ``1e-14``."""
-    A, _, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
+    A, _, E = (matrix[0] for matrix in system.phases[0].matrices(np.zeros((1, 0))))
     corners = np.unique(
         bound.support_point(np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 7, 4001)])), axis=0
     )
@@ -185,7 +187,7 @@ def test_bounds_over_turns_hold_what_both_systems_add_and_are_close(name, short)
     first, second, direction = (*(random_system(rng, speed=6.0) for _ in range(2)), rng.normal(size=2))
     turn, grid = 0.9, merge_grids(uniform(4, HORIZON).breakpoints, np.array([0.0, HORIZON]), switches=[0.9])
     response = Response(SwitchedSystem([(turn, first), (HORIZON, second)]), grid, np.zeros(2))
-    support, A = measurable.MeasurableSupport(response, BOUNDS[name]), second.matrices(np.zeros((1, 0)))[0][0]
+    support, A = measurable.MeasurableSupport(response, BOUNDS[name]), second.phases[0].matrices(np.zeros((1, 0)))[0][0]
     for time in (0.4, HORIZON):
         with patch.object(measurable, "SHORT", short):
             ((low, high),) = support.enclosed(np.array([time]), direction[None])

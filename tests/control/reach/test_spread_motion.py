@@ -50,7 +50,7 @@ def test_what_is_beyond_a_degree_is_bounded_and_not_by_far_more_than_it_is(degre
 def test_bounds_on_cells_hold_what_the_closed_form_gives_there(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     system = SYSTEM
     if most < 64:  # so few numbers that the box is in parts
-        system = replace(SYSTEM, law=replace(SYSTEM.law))  # what is known of a law is remembered
+        system = SYSTEM.in_phases([replace(phase) for phase in SYSTEM.phases])  # what is known of a law is remembered
         monkeypatch.setattr(expansions, "LEFT", ((1e-10, most),))
     problem = sr.OptimalControlProblem(
         system=system, horizon=3.0, initial_state=[1.0], control=sr.Box([-1.0], [1.0]), path=[sr.Box([-0.5], [0.5])]
@@ -183,7 +183,7 @@ def test_rows_and_outputs_at_any_time_and_parameter_are_those_of_an_integrator(
 ) -> None:
     monkeypatch.setattr(expansions, "LEFT", ((1e-8, most),))  # fewer numbers are several parts
     breaks, rng = np.linspace(0.0, 3.0, 3), np.random.default_rng(4)
-    system = replace(PUSHED, law=replace(PUSHED.law))
+    system = PUSHED.in_phases([replace(phase) for phase in PUSHED.phases])
     response = Response(system, merge_grids(breaks, breaks, varying=True), np.array([1.0, -0.5]))
     assert (len(response.propagator.spread) > 1) == (most == 30)
     times, c = np.array([0.4, 1.5, 2.3, 3.0]), rng.normal(size=(4, 2))

@@ -77,7 +77,7 @@ def test_the_support_is_that_of_a_linear_program_over_all_coefficients(seed, nam
     system, time = random_system(rng), rng.uniform(0.2, HORIZON)
     functionals = worst_case(system, COARSE, dictionary, bound)
     direction = rng.normal(size=2)
-    A, _, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
+    A, _, E = (matrix[0] for matrix in system.phases[0].matrices(np.zeros((1, 0))))
     ends = dictionary.breakpoints
     weights = np.array([weight_on_piece(A, E, direction, time, a, b) for a, b in itertools.pairwise(ends)])
     truth = by_linear_program(bound, dictionary, weights)
@@ -131,7 +131,7 @@ def test_the_l1_ball_is_attained_at_one_of_its_vertices(seed, functions):
     dictionary, half = walsh(4, HORIZON, functions), rng.uniform(0, 1, 2)
     system, time, direction = random_system(rng), rng.uniform(0.1, HORIZON), rng.normal(size=2)
     functionals = worst_case(system, COARSE, dictionary, Box(-half, half), kind="l1_ball")
-    A, _, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
+    A, _, E = (matrix[0] for matrix in system.phases[0].matrices(np.zeros((1, 0))))
     ends = dictionary.breakpoints
     weights = np.array([weight_on_piece(A, E, direction, time, a, b) for a, b in itertools.pairwise(ends)])
     truth = sum(half[i] * np.abs(dictionary.values @ weights[:, i]).max() for i in range(2))

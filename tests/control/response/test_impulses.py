@@ -35,7 +35,7 @@ def symmetric(rng, rates, horizon):
 
 def exact(system, V, rates, grid, times, directions):
     """The weights in closed form, and the sums of absolute values that they are made of."""
-    rates, (_, B, E) = np.array(rates) / grid.breakpoints[-1], (part[0] for part in system.matrices(NONE))
+    rates, (_, B, E) = np.array(rates) / grid.breakpoints[-1], (part[0] for part in system.phases[0].matrices(NONE))
     M, along, pieces = V.T @ np.hstack([B, E]), directions @ V, grid.locate(times)
     sums = np.zeros((2, times.size, grid.pieces, 3))
     for number, piece in enumerate(pieces):
@@ -90,7 +90,7 @@ def test_rows_over_stretches_are_the_closed_form(kind, pieces, lengths):
 def test_rows_by_baby_and_giant_steps_are_those_of_the_plain_recursion(seed, pieces, states, fast):
     rng, ends = np.random.default_rng(seed), np.linspace(0, 2, pieces + 1)
     plain, grid = random_system(rng, states), merge_grids(ends, ends)
-    A, B, E = (part[0] for part in plain.matrices(NONE))
+    A, B, E = (part[0] for part in plain.phases[0].matrices(NONE))
     response = Response(LinearSystem(fast * A / np.linalg.norm(A, 2), B, E), grid, np.zeros(states))
     times = np.concatenate([[0.0, 2.0], rng.choice(ends, 5), rng.uniform(0, 2, 13)])
     given = times, rng.normal(size=(20, states)), np.zeros((20, 0))

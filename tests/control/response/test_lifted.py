@@ -102,7 +102,9 @@ def made(name, grid, scale=1.0, bound=None):
     centre, radius = np.array(centre), scale * np.array(radius)
     system = LinearSystem(A, B, E, parameters=Box(centre - radius, centre + radius))
     functionals = worst_case(system, GRIDS[grid], bound=bound, initial_state=np.arange(1.0, 1 + system.states))
-    return functionals, lift(system, functionals.response.grid, functionals.response.initial_state, centre, radius)
+    return functionals, lift(
+        system.phases[0], functionals.response.grid, functionals.response.initial_state, centre, radius
+    )
 
 
 def deltas(rng, nu):
@@ -123,7 +125,7 @@ def test_the_taylor_model_of_the_state_encloses_every_trajectory_of_the_cell(nam
     _, _, _, centre, radius = SYSTEMS[name]
     for delta in deltas(rng, lifted.space.nu):
         p = np.array(centre) + scale * np.array(radius) * delta
-        A, B, _ = (matrix[0] for matrix in system.matrices(p[None]))
+        A, B, _ = (matrix[0] for matrix in system.phases[0].matrices(p[None]))
         polynomial = np.einsum("a,lai->li", lifted.space.monomials(delta[None])[0], nodes)
         for piece, stop in enumerate(response.grid.breakpoints[1:]):
             truth = simulated(A, [(B, GRIDS[grid].breakpoints, control)], response.initial_state, stop, np.array([0.0]))
@@ -142,7 +144,7 @@ def test_the_taylor_model_of_a_functional_encloses_it_over_the_cell(name):
     direction = rng.normal(size=lifted.states)
     nodes, remainder = lifted.row_nodes(direction[None])[0], lifted.row_bounds(direction[None])[1][0]
     for delta in deltas(rng, lifted.space.nu):
-        A = functionals.response.system.matrices((np.array(centre) + np.array(radius) * delta)[None])[0][0]
+        A = functionals.response.system.phases[0].matrices((np.array(centre) + np.array(radius) * delta)[None])[0][0]
         T = lifted.transform
         for piece, stop in enumerate(lifted.fine.breakpoints[1:]):
             truth = direction @ np.linalg.solve(T, expm(A * stop) @ T)
@@ -194,10 +196,13 @@ def test_products_of_a_functional_and_an_uncertain_disturbance_matrix_are_enclos
     )
     for rate in (1.0, 3.0, 10.0):
         quick = LinearSystem(
-            lambda p, rate=rate: np.array([[rate * 0.3 * p[0]]]), [[1.0]], system.E, parameters=system.parameters
+            lambda p, rate=rate: np.array([[rate * 0.3 * p[0]]]),
+            [[1.0]],
+            system.phases[0].E,
+            parameters=system.parameters,
         )
         functionals = worst_case(quick, uniform(200, 1.0), bound=Box([1.0], [1.0]), initial_state=[0.0])
-        lifted = lift(quick, functionals.response.grid, np.zeros(1), np.zeros(nu), np.ones(nu))
+        lifted = lift(quick.phases[0], functionals.response.grid, np.zeros(1), np.zeros(nu), np.ones(nu))
         sigma = DisturbanceSupport(lifted, functionals.disturbance, lifted.transform)
         coefficients, excess = sigma.at(np.array([1.0]), np.zeros((1, 1, nu)))
         enclosed = coefficients[0, 0] @ lifted.space.monomials(np.ones((1, nu)))[0]
@@ -212,7 +217,7 @@ def test_what_is_neglected_counts_the_size_of_the_functions_of_an_l1_ball():
     system = LinearSystem(lambda p: np.array([[3 * p[0]]]), [[1.0]], parameters=Box([-1.0], [1.0]))
     large = Dictionary(np.array([0.0, 1.0]), np.array([[1000.0]]))
     functionals = worst_case(system, uniform(100, 1.0), large, Box([-1.0], [1.0]), "l1_ball", [0.0])
-    lifted = lift(system, functionals.response.grid, np.zeros(1), np.zeros(1), np.ones(1))
+    lifted = lift(system.phases[0], functionals.response.grid, np.zeros(1), np.zeros(1), np.ones(1))
     sigma = DisturbanceSupport(lifted, functionals.disturbance, lifted.transform)
     coefficients, excess = sigma.at(np.array([1.0]), np.zeros((1, 1, 1)))
     enclosed = coefficients[0, 0] @ lifted.space.monomials(np.ones((1, 1)))[0]
@@ -224,7 +229,7 @@ def test_what_is_neglected_counts_the_size_of_the_functions_of_an_l1_ball():
 def test_of_a_known_system_only_rounding_is_left_out():
     system = LinearSystem([[0, 1], [-1, 0]], [[0.0], [1.0]])
     functionals = worst_case(system, GRIDS["uniform"], bound=Box([-1, -1], [1, 1]), initial_state=[1.0, 0.0])
-    lifted = lift(system, functionals.response.grid, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
+    lifted = lift(system.phases[0], functionals.response.grid, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
     assert lifted.state_remainder(np.ones((1, 6)))[0].max() < 1e-11
     assert DisturbanceSupport(lifted, functionals.disturbance, lifted.transform).neglected.max() < 1e-11
     states = functionals.response.states(np.ones((1, 6)), np.zeros((1, 0)))[0]
@@ -234,7 +239,9 @@ def test_of_a_known_system_only_rounding_is_left_out():
 def test_a_frozen_system_is_the_system_at_that_parameter():
     functionals, _ = made("everything", "uniform")
     p = np.array([0.2, 0.1, 1.4])
-    lifted = frozen(functionals.response.system, functionals.response.grid, functionals.response.initial_state, p)
+    lifted = frozen(
+        functionals.response.system.phases[0], functionals.response.grid, functionals.response.initial_state, p
+    )
     control = np.ones((1, 6))
     assert np.allclose(lifted.nodes(control)[:, 0], functionals.response.states(control, p[None])[0], rtol=1e-12)
 
@@ -337,7 +344,11 @@ def known(name, grid):
         system, dictionary, bound=Box(-np.ones(d), np.ones(d)), initial_state=np.arange(1.0, d + 1)
     )
     return functionals, lambda: lift(
-        system, functionals.response.grid, functionals.response.initial_state, np.zeros(0), np.zeros(0)
+        system.phases[0],
+        functionals.response.grid,
+        functionals.response.initial_state,
+        np.zeros(0),
+        np.zeros(0),
     )
 
 
@@ -418,7 +429,7 @@ def test_what_the_proof_leaves_out_of_known_systems_does_not_grow_with_the_piece
         system = LinearSystem(KNOWN["oscillating"][0], [[0.0], [1.0]])
         bound = Box([-0.1, -0.1], [0.1, 0.1])
         functionals = worst_case(system, uniform_of_many(pieces, 3.0), bound=bound, initial_state=[1.0, 0.5])
-        lifted = lift(system, functionals.response.grid, np.array([1.0, 0.5]), np.zeros(0), np.zeros(0))
+        lifted = lift(system.phases[0], functionals.response.grid, np.array([1.0, 0.5]), np.zeros(0), np.zeros(0))
         control = np.ones((1, pieces))
         control[:, pieces // 3 :] = -1.0
         rows = np.eye(2) @ lifted.transform
@@ -431,7 +442,7 @@ def test_what_the_proof_leaves_out_of_known_systems_does_not_grow_with_the_piece
 def test_spans_of_many_pieces_are_short_where_the_system_moves_much():
     system = LinearSystem([[30.0, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
     grid = worst_case(system, uniform(2000, 3.0)).response.grid
-    lifted = lift(system, grid, np.ones(2), np.zeros(0), np.zeros(0))
+    lifted = lift(system.phases[0], grid, np.ones(2), np.zeros(0), np.zeros(0))
     assert lifted.spans.size < 2000
     assert 30.0 * np.diff(grid.breakpoints[lifted.spans]).max() <= lifted_module.SHORT
     assert np.isfinite(lifted.state_remainder(np.ones((1, 2000)))[0]).all()
@@ -443,7 +454,9 @@ def test_what_is_bounded_of_many_states_takes_no_more_memory_than_the_path():
     stiffness = 2.0 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
     A = np.block([[np.zeros((masses, masses)), np.eye(masses)], [-stiffness, -0.1 * stiffness]])
     functionals = worst_case(LinearSystem(A, np.eye(40)[:, -1:], np.eye(40)[:, -2:]), uniform_of_many(20_000, 5.0))
-    lifted = lift(functionals.response.system, functionals.response.grid, np.ones(40), np.zeros(0), np.zeros(0))
+    lifted = lift(
+        functionals.response.system.phases[0], functionals.response.grid, np.ones(40), np.zeros(0), np.zeros(0)
+    )
     control = np.ones((1, 20_000))
     path = lifted.nodes(control).nbytes
     tracemalloc.start()

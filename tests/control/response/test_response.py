@@ -67,7 +67,7 @@ def test_rows_times_the_decision_are_the_simulated_worst_case(seed, control, dis
     values = functionals.values(theta, times, directions, parameters)
     signal = theta.reshape(2, -1) @ control.values
     for k, time in enumerate(times):
-        A, B, E = (matrix[0] for matrix in system.matrices(parameters[k][None]))
+        A, B, E = (matrix[0] for matrix in system.phases[0].matrices(parameters[k][None]))
         worst = functionals.worst_disturbance(time, directions[k], parameters[k])
         state = simulated(
             A, [(B, control.breakpoints, signal), (E, grid.breakpoints, worst)], start, time, grid.breakpoints
@@ -83,7 +83,7 @@ def test_the_rows_agree_with_an_integrator_of_tight_tolerance():
     system = random_system(rng)
     functionals = worst_case(system, UNEVEN, initial_state=[1.0, -1.0])
     theta = rng.normal(size=functionals.variables)
-    A, B, _ = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
+    A, B, _ = (matrix[0] for matrix in system.phases[0].matrices(np.zeros((1, 0))))
     state, time = np.array([1.0, -1.0]), 0.0
     for piece, stop in enumerate(UNEVEN.breakpoints[1:]):
         state = solve_ivp(
@@ -122,7 +122,7 @@ def test_states_under_disturbances_agree_with_single_simulations():
     response = Response(system, merge_grids(np.linspace(0, HORIZON, 4), UNEVEN.breakpoints), np.array([1.0, 2.0]))
     control = rng.normal(size=(1, 3))
     states = response.states(control, np.zeros((1, 0)), signal)
-    A, B, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
+    A, B, E = (matrix[0] for matrix in system.phases[0].matrices(np.zeros((1, 0))))
     for v in range(3):
         drives = [(B, np.linspace(0, HORIZON, 4), control), (E, UNEVEN.breakpoints, signal[v])]
         assert np.allclose(
@@ -138,7 +138,7 @@ def test_the_push_by_age_equals_the_push_by_adjoints(seed, pieces, nu):
     known = LinearSystem(A0, np.ones((2, 1)), E)
     system = LinearSystem(lambda p: A0 + p[0] * A1, np.ones((2, 1)), E, parameters=Box([-0.1], [0.1])) if nu else known
     functionals = worst_case(system, uniform(pieces, HORIZON), bound=Box([-0.1, -0.2], [0.3, 0.1]))
-    lifted = lift(system, functionals.response.grid, np.zeros(2), np.zeros(nu), np.full(nu, 0.1))
+    lifted = lift(system.phases[0], functionals.response.grid, np.zeros(2), np.zeros(nu), np.full(nu, 0.1))
     rows = rng.normal(size=(3, 2))
     times = np.concatenate([functionals.response.grid.breakpoints, rng.uniform(0, HORIZON, 5)])
     ends = rng.integers(-1, 2, (times.size, 3, nu)).astype(float)
@@ -191,7 +191,7 @@ def test_ages_are_powers_of_the_transition():
     response = Response(
         random_system(np.random.default_rng(1)), merge_grids(np.linspace(0, 2, 12), np.linspace(0, 2, 12)), np.zeros(2)
     )
-    A = response.system.matrices(np.zeros((1, 0)))[0][0]
+    A = response.system.phases[0].matrices(np.zeros((1, 0)))[0][0]
     _, F = transitions(A[None], np.array([2 / 11]))
     for age in range(11):
         assert np.allclose(response.kernel[:, age], expm(A * age * 2 / 11) @ F[0], rtol=1e-11, atol=1e-12)
@@ -267,7 +267,7 @@ def test_no_times_give_no_rows():
 def test_a_stiff_system_keeps_its_accuracy(rate):
     system = LinearSystem([[rate, 1.0], [0.0, -1.0]], [[1.0], [1.0]])
     functionals = worst_case(system, uniform(3, HORIZON), initial_state=[1.0, 1.0])
-    A, B, _ = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
+    A, B, _ = (matrix[0] for matrix in system.phases[0].matrices(np.zeros((1, 0))))
     control = np.array([[1.0, -2.0, 0.5]])
     for time in (1e-3, 0.7, 2.0, HORIZON):
         truth = simulated(A, [(B, np.linspace(0, HORIZON, 4), control)], [1.0, 1.0], time, np.array([0.0]))

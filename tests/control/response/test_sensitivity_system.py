@@ -23,7 +23,7 @@ def test_the_derivatives_of_the_matrices_are_exact_where_they_can_be_enclosed(en
 
     system = LinearSystem(A, [[1.0], [2.0]], parameters=Box([-1.0, 0.0], [1.0, 2.0]))
     for p in ([-1.0, 0.0], [1.0, 2.0], [0.3, 0.7], [0.0, 0.0]):
-        values, B, E = Derivatives(system)(np.array(p))
+        values, B, E = Derivatives(system.phases[0])(np.array(p))
         truth = [[[3 * p[0] ** 2, 0.0], [p[1], 0.0]], [[0.0, np.cos(p[1])], [p[0], 0.0]]]
         assert np.allclose(values[0], A(np.array(p)))
         assert np.allclose(values[1:], truth, rtol=0, atol=1e-15 if enclosable else 1e-9)
@@ -33,8 +33,8 @@ def test_the_derivatives_of_the_matrices_are_exact_where_they_can_be_enclosed(en
 
 def test_the_derivative_beside_a_singularity_stays_inside_the_parameters():
     system = LinearSystem(lambda p: np.array([[p[0] ** 1.5]]), [[1.0]], parameters=Box([0.0], [1.0]))
-    assert abs(Derivatives(system)(np.array([0.0]))[0][1, 0, 0]) <= 1e-2
-    assert abs(Derivatives(system)(np.array([1.0]))[0][1, 0, 0] - 1.5) <= 1e-9
+    assert abs(Derivatives(system.phases[0])(np.array([0.0]))[0][1, 0, 0]) <= 1e-2
+    assert abs(Derivatives(system.phases[0])(np.array([1.0]))[0][1, 0, 0] - 1.5) <= 1e-9
 
 
 def test_the_tangent_of_a_known_system_is_the_system_itself():

@@ -58,7 +58,7 @@ def transcribed(convex, kind, dictionary, parameters=None):
 
 def reached(model, one, u):
     """The state at the adversary's time, one augmented exponential per piece of its own signal."""
-    A, B, E = (matrix[0] for matrix in model.stated.system.matrices(one.parameter[None]))
+    A, B, E = (matrix[0] for matrix in model.stated.system.phases[0].matrices(one.parameter[None]))
     cuts = np.unique(np.concatenate([one.breakpoints, model.control.breakpoints, [one.time]]))
     state = np.array(model.problem.initial_state, dtype=float)
     for left, right in pairwise(cuts[cuts <= one.time]):
@@ -136,7 +136,7 @@ def test_the_worst_case_is_sought_in_own_units_and_is_that_of_the_users():
 def test_the_worst_measurable_disturbance_switches_where_the_adjoint_changes_its_sign():
     model = transcribed(sr.Box([-0.1, 0.0], [0.1, 0.0]), "measurable", indicators([0.0, 2.0]))
     breakpoints, signal = worst_signal(model.functionals, 1.9, np.array([1.0, 0.0]), np.zeros(0))
-    A = model.response.system.matrices(np.zeros((1, 0)))[0][0]
+    A = model.response.system.phases[0].matrices(np.zeros((1, 0)))[0][0]
     switches = breakpoints[1:-1][np.diff(signal[0]) != 0]
     switches = switches[switches < 1.9 - 1e-9]
     assert switches.size > 0
@@ -148,7 +148,7 @@ def test_a_set_without_corners_is_attained_as_far_as_constants_go():
     time, direction = 1.9, np.array([1.0, 0.5])
     best = model.functionals.offsets(np.array([time]), direction[None], np.zeros((1, 0)))[0]
     breakpoints, signal = worst_signal(model.functionals, time, direction, np.zeros(0))
-    A, _, E = (matrix[0] for matrix in model.response.system.matrices(np.zeros((1, 0))))
+    A, _, E = (matrix[0] for matrix in model.response.system.phases[0].matrices(np.zeros((1, 0))))
     state = np.zeros(2)
     for left, right, w in zip(breakpoints[:-1], breakpoints[1:], signal.T, strict=True):
         if right <= time + 1e-12:

@@ -132,7 +132,9 @@ def test_expressions_of_parameters_can_be_pickled_too(tmp_path):
     again = pickle.loads(pickle.dumps(outcome.result))
     np.testing.assert_array_equal(again.tube([2.0]).upper, outcome.tube([2.0]).upper)
     at = np.array([[0.05]])
-    for mine, other in zip(outcome.problem.system.matrices(at), again.problem.system.matrices(at), strict=True):
+    for mine, other in zip(
+        outcome.problem.system.phases[0].matrices(at), again.problem.system.phases[0].matrices(at), strict=True
+    ):
         np.testing.assert_array_equal(mine, other)
 
 

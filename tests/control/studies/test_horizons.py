@@ -37,9 +37,9 @@ def truth(of: sr.OptimalControlProblem, rows: list[Multiplier], T: float, low: f
     is the worst constant on every piece."""
     edges, total, slopes = np.linspace(0.0, T, PIECES + 1), 0.0, np.zeros((PIECES, 2))
     for one in rows:
-        A, B, E = (matrix[0] for matrix in of.system.matrices(one.parameter[None]))
+        A, B, E = (matrix[0] for matrix in of.system.phases[0].matrices(one.parameter[None]))
         time = T * max(one.share, one.earliest / low)
-        drift = np.zeros(2) if of.system.c is None else np.asarray(of.system.c, dtype=float)[:, 0]
+        drift = np.zeros(2) if of.system.phases[0].c is None else np.asarray(of.system.phases[0].c, dtype=float)[:, 0]
         free = one.direction @ expm(A * time)
         value = free @ of.initial_state - one.limit
         value += 0.0 if of.initial_set is None else float(of.initial_set.support(free[None])[0])

@@ -60,7 +60,7 @@ def problem_of(
 def by_quadrature(problem: OptimalControlProblem, control: Array) -> float:
     """The quadratic terms along the nominal trajectory, from one event to the next, by Gauss and Legendre."""
     system, (state, effort, final) = problem.system, problem.cost.terms
-    pairs = [(HORIZON, system)] if isinstance(system, LinearSystem) else system.pieces
+    pairs = [(phase.until, phase) for phase in system.until(HORIZON)]
     events = [
         0.0,
         HORIZON,

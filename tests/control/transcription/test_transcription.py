@@ -86,7 +86,7 @@ def test_terminal_equalities_fix_the_simulated_state():
     problem = problem_of(rng, terminal=[Equality([0.3, np.nan, -0.2])])
     program = transcribe(problem, UNEVEN)
     theta = np.linalg.lstsq(program.finite.A, program.finite.b, rcond=None)[0]
-    A, B, _ = (matrix[0] for matrix in problem.system.matrices(np.zeros((1, 0))))
+    A, B, _ = (matrix[0] for matrix in problem.system.phases[0].matrices(np.zeros((1, 0))))
     end = simulated(
         A, [(B, UNEVEN.breakpoints, theta.reshape(2, -1))], problem.initial_state, HORIZON, UNEVEN.breakpoints
     )
@@ -166,7 +166,7 @@ def test_every_family_states_the_simulated_worst_case(seed):
     )
     program = transcribe(problem, UNEVEN, uniform(4, HORIZON))
     theta = rng.normal(size=8)
-    A, B, E = (matrix[0] for matrix in problem.system.matrices(np.zeros((1, 0))))
+    A, B, E = (matrix[0] for matrix in problem.system.phases[0].matrices(np.zeros((1, 0))))
     for family, convex in zip(program.families, [problem.path[0].set, problem.terminal[0]], strict=True):
         time = HORIZON if family.name == "terminal" else rng.uniform(0, HORIZON)
         H, h = convex.halfspaces()

@@ -67,8 +67,8 @@ def test_a_matrix_from_a_file_is_the_matrix_that_it_is_dense_or_sparse(tmp_path:
     loaded = [load_config(beside(tmp_path / name, **arrays)) for name, arrays in files_of.items()]
     for one in loaded:
         problem = problem_of(one)
-        assert np.array_equal(problem.system.A, A) and np.array_equal(problem.system.B, B)
-        assert np.array_equal(problem.system.c, [[0.0], [0.1], [0.0]])
+        assert np.array_equal(problem.system.phases[0].A, A) and np.array_equal(problem.system.phases[0].B, B)
+        assert np.array_equal(problem.system.phases[0].c, [[0.0], [0.1], [0.0]])
         assert np.array_equal(problem.terminal[0].H, A[:2])
     digests = {one.config.model_copy(update={"title": ""}).digest() for one in loaded}
     assert len(digests) == 1  # neither the path nor the form is part of what a run is
@@ -100,7 +100,7 @@ def test_an_override_names_a_file_of_the_working_directory(tmp_path: Path, monke
     np.savez(tmp_path / "other.npz", A=2 * A)
     monkeypatch.chdir(tmp_path)
     loaded = load_config(config, ["problem.system.A={file: other.npz, name: A}"])
-    assert np.array_equal(problem_of(loaded).system.A, 2 * A)
+    assert np.array_equal(problem_of(loaded).system.phases[0].A, 2 * A)
 
 
 class Danger:
@@ -224,7 +224,11 @@ def test_a_directory_that_somebody_left_names_no_file(tmp_path: Path) -> None:
 
 def test_sparse_matrices_of_scipy_stand_where_arrays_do() -> None:
     system = sr.LinearSystem(csr_array(A), csr_array(B), csr_array(np.eye(3)), c=csr_array(B))
-    assert np.array_equal(system.A, A) and np.array_equal(system.B, B) and np.array_equal(system.c, B)
+    assert (
+        np.array_equal(system.phases[0].A, A)
+        and np.array_equal(system.phases[0].B, B)
+        and np.array_equal(system.phases[0].c, B)
+    )
     assert np.array_equal(sr.Polytope(csr_array(A[:2]), [1, 1]).H, A[:2])
     assert np.array_equal(sr.Ellipsoid(np.zeros(3), csr_array(np.eye(3))).shape, np.eye(3))
     problem = sr.OptimalControlProblem(
@@ -244,7 +248,7 @@ def test_sparse_matrices_of_scipy_stand_where_arrays_do() -> None:
 def test_a_config_in_python_takes_sparse_matrices() -> None:
     config = copy.deepcopy(WRITTEN)
     config["problem"]["system"]["A"] = csr_array(A)
-    assert np.array_equal(problem_of(load_config(config)).system.A, A)
+    assert np.array_equal(problem_of(load_config(config)).system.phases[0].A, A)
 
 
 @needs_plants

@@ -11,6 +11,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.problem.cost import Quadratic
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.experiment.assemble import problem_of
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.reading.reader import Source, require_readable, write_yaml
@@ -103,14 +104,15 @@ PROBLEMS: dict[str, Callable[[], sr.OptimalControlProblem]] = {
 
 def same(one: object, other: object) -> bool:
     """Whether two records say the same: arrays bit for bit, functions of the parameters by their values."""
-    if isinstance(one, sr.LinearSystem) and isinstance(other, sr.LinearSystem):
-        if not same(one.parameters, other.parameters) or tuple(one.names) != tuple(other.names):
-            return False
+    if isinstance(one, sr.System) and isinstance(other, sr.System):
+        told = [(system.delay, system.varies, tuple(system.names)) for system in (one, other)]
+        return told[0] == told[1] and same(one.parameters, other.parameters) and same(one.phases, other.phases)
+    if isinstance(one, Phase) and isinstance(other, Phase):
         # expressions are evaluated in the order of the function, up to how numpy squares
         pairs = zip(one.matrices(one.probes), other.matrices(one.probes), strict=True)
         drifts = (one.forced.matrices(one.probes)[1], other.forced.matrices(one.probes)[1])
         close = [np.allclose(a, b, rtol=1e-14, atol=0.0) for a, b in (*pairs, drifts)]
-        return all(close) and one.delay == other.delay
+        return all(close) and (one.begin, one.until) == (other.begin, other.until)
     if isinstance(one, np.ndarray):
         return isinstance(other, np.ndarray) and np.array_equal(one, other, equal_nan=True)
     if isinstance(one, tuple | list):

@@ -83,7 +83,9 @@ def driven(outcome: sr.Outcome, worst: Adversary) -> np.ndarray:
     """The controls ``(K, m)`` of a loop around a known system without drift, under the disturbance of a worst case."""
     assert isinstance(outcome.experiment, ControlExperiment) and worst.disturbance is not None
     system, acting = outcome.experiment.problem.system, sr.controller(outcome)
-    A, B, E = (np.asarray(matrix, dtype=float) for matrix in (system.A, system.B, system.E))
+    A, B, E = (
+        np.asarray(matrix, dtype=float) for matrix in (system.phases[0].A, system.phases[0].B, system.phases[0].E)
+    )
     x, acted, starts = worst.initial_state, list[np.ndarray](), acting.breakpoints[:-1]
     for begin, end in pairwise(np.unique(np.concatenate([starts, worst.breakpoints]))):
         if begin in starts:

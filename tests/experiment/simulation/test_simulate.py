@@ -213,8 +213,8 @@ def test_trajectories_agree_with_an_integrator_and_with_augmented_exponentials(n
         assert {0.0, 0.123, 1.5} <= set(times.tolist())
         for position in (0, 3, times.size // 2, times.size - 1):
             exact = simulated(
-                system.A,
-                [(system.B, control.breakpoints, u), (system.E, disturbance.breakpoints, w[1])],
+                system.phases[0].A,
+                [(system.phases[0].B, control.breakpoints, u), (system.phases[0].E, disturbance.breakpoints, w[1])],
                 problem.initial_state,
                 times[position],
                 np.zeros(1),
@@ -222,11 +222,15 @@ def test_trajectories_agree_with_an_integrator_and_with_augmented_exponentials(n
             assert np.abs(paths[position, :, 1] - exact).max() <= 1e-12 * max(1.0, np.abs(exact).max())
         state = problem.initial_state
         for left, right in zip(grid.breakpoints[:-1], grid.breakpoints[1:], strict=True):
-            force = system.B @ held(control.breakpoints, u, (left + right) / 2) + system.E @ held(
+            force = system.phases[0].B @ held(control.breakpoints, u, (left + right) / 2) + system.phases[0].E @ held(
                 disturbance.breakpoints, w[2], (left + right) / 2
             )
             state = solve_ivp(
-                lambda t, x, force=force, A=system.A: A @ x + force, (left, right), state, rtol=1e-11, atol=1e-12
+                lambda t, x, force=force, A=system.phases[0].A: A @ x + force,
+                (left, right),
+                state,
+                rtol=1e-11,
+                atol=1e-12,
             ).y[:, -1]
         assert np.abs(paths[-1, :, 2] - state).max() <= 1e-8 * max(1.0, np.abs(state).max())
 
@@ -248,7 +252,7 @@ def test_every_trajectory_has_its_own_parameter():
         )
     )
     for number in range(4):
-        A, B, E = (matrix[0] for matrix in model.response.system.matrices(parameters[[number]]))
+        A, B, E = (matrix[0] for matrix in model.response.system.phases[0].matrices(parameters[[number]]))
         exact = simulated(
             A, [(B, np.linspace(0, 2, 9), u), (E, grid.breakpoints, disturbances[number])], [1.0, 0.0], 2.0, np.zeros(1)
         )

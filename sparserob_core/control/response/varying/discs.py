@@ -19,7 +19,8 @@ from sparserob_core.control.enclosures.dependence import AnyNumber, Left, Split
 from sparserob_core.control.enclosures.elementary import KEPLER_CIRCLES, eccentric_anomaly
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON
 from sparserob_core.control.problem.expression import ExpressionMatrix
-from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.control.problem.phase import Phase
+from sparserob_core.control.problem.system import System
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -194,7 +195,7 @@ class Cauchy:
     """The entries of a system on discs over cells of time: ``far (s, r, d, d + n)``, how far those of ``[A B c E]`` are
     from a constant, between ``ends (s + 1,)`` and for all `RADII`; ``sizes (d, d + n)``: about how large they are."""
 
-    system: VaryingSystem
+    system: System
     ends: Array
     far: Array
     sizes: Array
@@ -214,13 +215,13 @@ class Cauchy:
         return float(A + (inputs / np.where(whole > 0.0, whole, 1.0)).max(initial=0.0))
 
 
-def cauchy(system: VaryingSystem) -> Cauchy:
+def cauchy(system: System) -> Cauchy:
     """The entries of a system with parameters on discs; raises `InputError`, which names an entry, a time and
     parameters, where one has a pole or is no real number."""
     wanted, ends, found, sizes = beyond(system, 0), [0.0], list[Array](), list[Array]()
-    for number, (begin, until, _) in enumerate(system.laws):
-        count = max(1, int(np.ceil(FIRST * (until - begin) / system.horizon)))
-        for _, stop, far, size in _Law(system, number).cells(np.linspace(begin, until, count + 1), wanted):
+    for law in system.phases:
+        count = max(1, int(np.ceil(FIRST * (law.until - law.begin) / system.horizon)))
+        for _, stop, far, size in _Law(system, law).cells(np.linspace(law.begin, law.until, count + 1), wanted):
             ends.append(stop)
             found.append(far)
             sizes.append(size + far[0])
@@ -230,15 +231,10 @@ def cauchy(system: VaryingSystem) -> Cauchy:
 @final
 @dataclass(frozen=True, eq=False)
 class _Law:
-    """``[A B c E]`` of one law of a system, the ``number``-th."""
+    """``[A B c E]`` of one law of a system."""
 
-    system: VaryingSystem
-    number: int
-
-    @property
-    def law(self) -> LinearSystem:
-        """The law."""
-        return self.system.laws[self.number][2]
+    system: System
+    law: Phase
 
     @cached_property
     def places(self) -> list[tuple[str, int]]:
@@ -299,8 +295,7 @@ class _Law:
     def _without_pole(self, start: float, stop: float, wanted: np.ndarray) -> None:
         """Raise `InputError` where an entry that is ``wanted`` has a pole, or is no real number, at a time and
         parameters."""
-        box = self.system.parameters
-        assert box is not None
+        box = self.system.box
         lower, upper = np.append(start, box.lower), np.append(stop, box.upper)
         widths, todo = np.maximum(upper - lower, np.finfo(float).tiny), [(lower, upper)]
         for _ in range(SEARCHED):
@@ -329,7 +324,8 @@ class _Law:
         name, j = self.places[column]
         entry = self.law.entry(name)
         text = entry.entries[row][j].text if isinstance(entry, ExpressionMatrix) else "a function of them"
-        where = f"system.pieces.{self.number}" if self.system.later else "system"
+        phases = self.system.phases
+        where = f"system.pieces.{phases.index(self.law)}" if len(phases) > 1 else "system"
         told = self.system.describe(at[1:])
         return InputError(
             path=where,  # the entry tells itself where it is: a drift may be one more column of B by now
@@ -346,10 +342,10 @@ def _least(far: Array, degree: int) -> Array:
     return np.asarray(found.min(axis=1) * OUTWARD)
 
 
-def beyond(system: VaryingSystem, degree: int) -> np.ndarray:
+def beyond(system: System, degree: int) -> np.ndarray:
     """Which entries of ``[A B c E]`` are no polynomials of so high a degree at most, ``(d, d + n)``."""
     tables = []
-    for _, _, law in system.laws:
+    for law in system.phases:
         parts = []
         for name in NAMES:
             if law.entry(name) is not None:

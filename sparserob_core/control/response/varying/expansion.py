@@ -21,7 +21,8 @@ import numpy as np
 from sparserob_core.control.enclosures.dependence import Spread, Superposed
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.system import LinearSystem, SystemInUnits, VaryingSystem
+from sparserob_core.control.problem.phase import Phase, PhaseInUnits
+from sparserob_core.control.problem.system import System
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
@@ -37,7 +38,7 @@ SLOW = 0.25  # norm to which a slow part is brought by units of its own: four ti
 SHARPEST = 1e-13  # remainder on a segment, as a share of the numbers: ten times less is below what is rounded
 BLUNTEST = 1e-10  # from which on a segment is halved even where that did not help: else what a state misses shows
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
-_KNOWN: WeakKeyDictionary[LinearSystem, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[Phase, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
 FIRST = 8  # segments to begin with
 MOST = 100_000
 """Segments at most. Ten times as many take an hour and gigabytes; of a tenth systems would be refused that are solved
@@ -107,28 +108,23 @@ class Expansion:
     spread: Spread | None = None
 
     @staticmethod
-    def of(system: VaryingSystem) -> Expansion:
+    def of(system: System) -> Expansion:
         """The expansion of a system; raises `InputError`, which names a time, where there is none, as at a pole or at
         the root of a negative number."""
-        kept, law = _KNOWN.setdefault(system.law, {}), system.law
-        key = system.horizon, *((begin, ref(later)) for begin, later in system.later)
+        first, stated = system.phases[0], system.stated
+        kept = _KNOWN.setdefault(first, {})
+        key = system.horizon, *((phase.begin, ref(phase)) for phase in system.phases[1:])
         if key not in kept:
-            if isinstance(law, SystemInUnits):
-                unit, bases = float(law.units[0]), list[tuple[float, LinearSystem]]()
-                for begin, later in system.later:
-                    assert isinstance(later, SystemInUnits)  # as the first one is
-                    bases.append((begin * unit, later.base))
-                base = VaryingSystem(law.base, system.horizon * unit, later=tuple(bases))
-                kept[key] = Expansion.of(base)._in_units(law, system)
-            else:
-                kept[key] = Expansion._made(system)
+            kept[key] = Expansion._made(system) if stated is system else Expansion.of(stated)._in_units(system)
         return kept[key]
 
-    def _in_units(self, law: SystemInUnits, system: VaryingSystem) -> Expansion:
+    def _in_units(self, system: System) -> Expansion:
+        law = system.phases[0]
+        assert isinstance(law, PhaseInUnits)
         factors = np.hstack([law.factors[name] * np.ones(part) for name, part in self._shapes])
         states = np.sqrt(law.factors["A"][:, 0] / law.factors["A"][0, :])  # old units over new ones, but for a factor
         return Expansion(
-            self.ends / float(law.units[0]),
+            self.ends / law.clock,
             self.coefficients * factors,
             self.remainder * factors,
             self.units * states,
@@ -144,7 +140,7 @@ class Expansion:
         return [("A", (d, d)), ("B", (d, m)), ("E", (d, mw))]
 
     @staticmethod
-    def _made(system: VaryingSystem) -> Expansion:
+    def _made(system: System) -> Expansion:
         space, horizon = TaylorSpace(1, DEGREE), system.horizon
         A = np.max([np.abs(np.asarray(mode.A, dtype=float)) for mode in system.modes], axis=0)
         spread = _spread_of(system)
@@ -155,8 +151,8 @@ class Expansion:
         look = Look(space, units, size, spread is None)
         todo = [
             (start, stop, np.inf, law)
-            for begin, until, law in system.laws
-            for start, stop in pairwise(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
+            for law in system.phases
+            for start, stop in pairwise(_cut(law.begin, law.until, horizon))
         ][::-1]
         ends, found = [0.0], list[Segment]()
         while todo:
@@ -172,7 +168,7 @@ class Expansion:
                 raise InputError(f"near t = {centre:.9g} the system {segment.why}", path="system")
             else:
                 todo += [(centre, stop, segment.off, law), (start, centre, segment.off, law)]
-        turns = tuple(ends.index(begin) for begin, _ in system.later)
+        turns = tuple(ends.index(law.begin) for law in system.phases[1:])
         channels = system.controls, system.disturbances
         every, lost, owns = (np.array(part) for part in zip(*(one.parts for one in found), strict=True))
         return Expansion(np.array(ends), every, lost, units, owns, channels, turns, spread)
@@ -532,7 +528,7 @@ class Look:
     size: float
     steadies: bool
 
-    def at(self, law: LinearSystem, start: float, stop: float, before: float) -> Segment:
+    def at(self, law: Phase, start: float, stop: float, before: float) -> Segment:
         """The segment from ``start`` to ``stop``; twice as long a one left ``before`` out."""
         units, centre, own = self.units, (start + stop) / 2, np.ones(self.units.size)
         radius = float(np.nextafter(max(stop - centre, centre - start), np.inf))
@@ -551,7 +547,7 @@ class Look:
                 own, sharp = steady, missed <= SHARPEST
         return Segment(sharp, off, "has a pole, or is too steep to be enclosed", (coefficients, rest, own))
 
-    def length(self, law: LinearSystem, time: float, longest: float, shortest: float) -> float:
+    def length(self, law: Phase, time: float, longest: float, shortest: float) -> float:
         """About how long a segment around a ``time`` may be, halving after halving of the ``longest``; infinite where
         even the ``shortest`` is too long: then there is a pole, and not a number of segments."""
         before = np.inf
@@ -563,13 +559,19 @@ class Look:
         return np.inf
 
 
-def _require_few(system: VaryingSystem, look: Look, ends: Sequence[float]) -> None:
+def _cut(begin: float, until: float, horizon: float) -> list[float]:
+    """The ends of the segments to begin with of a law between two times."""
+    return list(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
+
+
+def _require_few(system: System, look: Look, ends: Sequence[float]) -> None:
     """Raise `InputError` where the segments between ``ends``, and those that the rest of the horizon takes, are more
     than can be followed; these are counted by how long some of them are."""
     done, horizon = ends[-1], system.horizon
     needed = float(len(ends) - 1)
-    for begin, until, law in system.laws:
-        each = (until - max(begin, done)) / SAMPLED
+    for law in system.phases:
+        begin = law.begin
+        each = (law.until - max(begin, done)) / SAMPLED
         for k in range(SAMPLED if each > 0.0 else 0):
             time = max(begin, done) + (k + 0.5) * each
             needed += each / look.length(law, time, each, SHORTEST * horizon)
@@ -603,9 +605,9 @@ def _tail(sizes: Array, shares: Array, summed: int | None = None) -> tuple[int, 
     return terms, tail
 
 
-def _spread_of(system: VaryingSystem) -> Spread | None:
+def _spread_of(system: System) -> Spread | None:
     """The polynomials of which the states of a system are the coefficients, where they are."""
-    entry = system.law.entry("A")
+    entry = system.phases[0].entry("A")
     depends = entry.dependence if isinstance(entry, Superposed) else None
     return depends if isinstance(depends, Spread) else None
 

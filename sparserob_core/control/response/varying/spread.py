@@ -14,7 +14,8 @@ import numpy as np
 
 from sparserob_core.control.enclosures.dependence import MOST_POWERS, Left, Split, Spread
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.system import LinearSystem, SystemInUnits, VaryingSystem
+from sparserob_core.control.problem.phase import Phase, PhaseInUnits
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.discs import NAMES, Cauchy, beyond, cauchy
 from sparserob_core.control.response.varying.expansion import balanced
 from sparserob_core.control.sets.sets import Box
@@ -31,7 +32,7 @@ FURTHER = 40  # degrees beyond, of which what is left out is added up: of norms 
 LOOKS = 17  # times at which the coefficients of A are looked at; of an estimate, with which nothing is proven
 FAR = 600.0  # exponents of what is too far in any case, whose exponential is a number
 MOST_PARTS = 64  # of the box: an expansion of each takes as long as one of the whole, and each is proven alone
-_KNOWN: WeakKeyDictionary[LinearSystem, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
 
 
 @final
@@ -42,7 +43,7 @@ class Parts:
     all their products, those of the last parameter one after another. All have the same polynomials."""
 
     edges: tuple[Array, ...]
-    every: tuple[tuple[Spread, VaryingSystem], ...]
+    every: tuple[tuple[Spread, System], ...]
 
     def of(self, parameters: Array) -> np.ndarray:
         """The part that each of ``parameters (k, nu)`` is in, ``(k,)``; at an edge any one that has it."""
@@ -92,18 +93,18 @@ class Looks(NamedTuple):
     analytic: Cauchy | None
 
 
-def expanded(system: VaryingSystem) -> Parts:
+def expanded(system: System) -> Parts:
     """How the state of a system depends on its parameters: parts of their box, as many as take the least work; raises
     `InputError` where too many were needed."""
-    kept, box = _KNOWN.setdefault(system.law, {}), system.parameters
-    assert box is not None
-    key = system.horizon, box.lower.tobytes(), box.upper.tobytes(), *((begin, ref(one)) for begin, one in system.later)
+    first, *others = system.phases
+    kept, box = _KNOWN.setdefault(first, {}), system.box
+    key = system.horizon, box.lower.tobytes(), box.upper.tobytes(), *((phase.begin, ref(phase)) for phase in others)
     if key not in kept:
-        kept[key] = _in_units(system) if isinstance(system.law, SystemInUnits) else _expanded(system)
+        kept[key] = _expanded(system) if system.stated is system else _in_units(system)
     return kept[key]
 
 
-def _expanded(system: VaryingSystem) -> Parts:
+def _expanded(system: System) -> Parts:
     """`expanded` of a system in the units that it is stated in."""
     edges, looks, degree = _parted(system)
     every = []
@@ -116,17 +117,12 @@ def _expanded(system: VaryingSystem) -> Parts:
     return Parts(edges, tuple(every))
 
 
-def _in_units(system: VaryingSystem) -> Parts:
+def _in_units(system: System) -> Parts:
     """`expanded` of one in its own units, which are powers of two: the same polynomials, in these units."""
-    laws, law = list[tuple[float, LinearSystem]](), system.law
-    assert isinstance(law, SystemInUnits) and system.parameters is not None
-    time, units = float(law.units[0]), law.units[1:]
-    for begin, _, one in system.laws:
-        assert isinstance(one, SystemInUnits)  # as the first one is
-        laws.append((begin * time, one.base))
-    box = system.parameters.in_units(1.0 / units)
-    base = VaryingSystem(laws[0][1], system.horizon * time, system.delay * time, tuple(laws[1:]), box)
-    known, every = expanded(base), list[tuple[Spread, VaryingSystem]]()
+    law = system.phases[0]
+    assert isinstance(law, PhaseInUnits)
+    time, units = law.clock, law.units[1:]
+    known, every = expanded(system.stated), list[tuple[Spread, System]]()
     of = {name: law.factors[name] * np.ones(law._shape(name)) for name in NAMES if law.entry(name) is not None}
     for how, part in known.every:
         size, left = how.space.size, how.left
@@ -139,19 +135,19 @@ def _in_units(system: VaryingSystem) -> Parts:
     return Parts(tuple(edges / one for edges, one in zip(known.edges, units, strict=True)), tuple(every))
 
 
-def _boxes(system: VaryingSystem, edges: tuple[Array, ...]) -> list[VaryingSystem]:
+def _boxes(system: System, edges: tuple[Array, ...]) -> list[System]:
     """The system with its parameters in every part of their box."""
     ends = [list(pairwise(one.tolist())) for one in edges]
     corners = [np.array(one).T for one in product(*ends)]
     return [system] if len(corners) == 1 else [system.with_parameters(Box(low, high)) for low, high in corners]
 
 
-def _parted(system: VaryingSystem) -> tuple[tuple[Array, ...], list[Looks], int]:
+def _parted(system: System) -> tuple[tuple[Array, ...], list[Looks], int]:
     """Where the parts of every parameter begin and end, how far they move the state, and the degree: of 1, 2, 4, ...
     parts, halved along the parameter that moves the state most, those that take the least work, which is about that of
     the square of how many numbers an expansion has."""
-    box, powers, d = system.parameters, system.powers, system.states
-    assert box is not None and powers is not None
+    box, powers, d = system.box, system.powers, system.states
+    assert powers is not None
     nu, best, first = box.dimension, None, _looks(system)
     paces = first.paces / float(MOST_PARTS) ** np.arange(1, first.paces.size + 1)  # of the smallest parts there may be
     counts, hopeless = (
@@ -204,7 +200,7 @@ def _degree(looks: Sequence[Looks], nu: int, d: int, powers: int) -> int | None:
     return None
 
 
-def _looks(system: VaryingSystem) -> Looks:
+def _looks(system: System) -> Looks:
     """How far its parameters move the state of a system."""
     (centre, units), powers = system.deviations, system.powers
     assert powers is not None
@@ -214,7 +210,8 @@ def _looks(system: VaryingSystem) -> Looks:
     analytic = cauchy(system) if beyond(system, powers).any() else None
     most = MOST_POWERS if analytic is None else orders[-1]
     scale, paces, shares = balanced(A, system.horizon), np.zeros(1 + max(powers, most)), np.zeros(nu)
-    for begin, until, law in system.laws:
+    for law in system.phases:
+        begin, until = law.begin, law.until
         for time in np.linspace(begin, until, LOOKS).tolist():
             parts = Split.of(law.entry("A"), time, centre, units, most).parts
             for key, table in parts.items():

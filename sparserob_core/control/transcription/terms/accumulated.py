@@ -10,8 +10,9 @@ import numpy as np
 
 from sparserob_core.control.problem.disturbances import legs
 from sparserob_core.control.problem.names import Corners, Names, measured_in
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, System
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
 from sparserob_core.control.sets.sets import Polytope, cylinder
 from sparserob_core.control.term import SAME_TIME
@@ -134,12 +135,12 @@ def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -
 def _system(system: System, running: list[Running], horizon: float) -> System:
     """The system beside what is integrated of it; of pieces where one of the integrals begins later than at 0, or ends
     before it is looked at."""
-    slack, pieces = SAME_TIME * horizon, list[tuple[float, float, LinearSystem]]()
-    for begin, until, mode in legs(system, {time for one in running for time in (one.start, one.stop)}, horizon):
-        acts = np.array([[one.start <= begin + slack and until <= one.stop + slack] for one in running])
+    slack, phases = SAME_TIME * horizon, list[Phase]()
+    for phase in legs(system, {time for one in running for time in (one.start, one.stop)}, horizon):
+        acts = np.array([[one.start <= phase.begin + slack and phase.until <= one.stop + slack] for one in running])
         h, g = np.stack([one.h for one in running]), np.stack([one.g for one in running])
-        pieces.append((begin, until, mode.accumulating(acts * h, acts * g)))
-    return system.taking(pieces)
+        phases.append(phase.accumulating(acts * h, acts * g))
+    return system.in_phases(phases)
 
 
 def _names(names: Names, states: int, running: list[Running]) -> Names:

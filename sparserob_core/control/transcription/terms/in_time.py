@@ -11,7 +11,6 @@ import numpy as np
 
 from sparserob_core.control.enclosures.dependence import Dependence
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.response.varying.spread import expanded
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
@@ -28,11 +27,11 @@ def in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
     become states (`superposed`). Measurable disturbances beside parameters that are not within reach stay as they are:
     of these nothing is proven."""
     system = problem.system
-    if isinstance(system, VaryingSystem):
+    if system.varies:
         return problem
-    plain = isinstance(system, LinearSystem) and not system.delay and not system.parameter_count
+    plain = not (system.switches or system.delay or system.parameter_count)
     if problem.execution is not None:
-        return problem if plain else replace(problem, system=VaryingSystem.made_of(system, problem.horizon))
+        return problem if plain else replace(problem, system=system.in_time(problem.horizon))
     if problem.measurable is None or not system.parameter_count:
         return problem
     if problem not in _KNOWN:
@@ -44,14 +43,12 @@ def in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
 def within_reach(problem: OptimalControlProblem) -> OptimalControlProblem | str:
     """A problem with parameters with a system that changes with time, whose state can be followed over all of them; or
     why it cannot."""
-    system = problem.system
     try:
-        if not isinstance(system, VaryingSystem):
-            system = VaryingSystem.made_of(system, problem.horizon)
+        system = problem.system.in_time(problem.horizon)
         found, depends = replace(problem, system=system), system.dependence
-        if depends is None:
+        if system.powers is not None:
             expanded(system.forced)
-        else:
+        elif depends is not None:
             corners_of_box(depends)
             system.superposed(depends)
     except (InputError, NotEnclosable) as error:

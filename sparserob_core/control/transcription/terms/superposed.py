@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.control.enclosures.dependence import Dependence
 from sparserob_core.control.problem.names import Corners, Names
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.windows import everywhere
 from sparserob_core.control.sets.sets import Equality, cylinder
 from sparserob_core.control.transcription.terms.in_time import corners_of_box, in_time
@@ -28,10 +28,8 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
     """
     problem = in_time(problem)
     system = problem.system
-    if not isinstance(system, VaryingSystem) or system.parameters is None:
-        return problem
     depends, rows = system.dependence, at_corners(problem)
-    if depends is None or rows is None:  # whose parameters stay in the index
+    if depends is None or rows is None:  # there are none, or they stay in the index
         return problem
     return larger(
         problem,
@@ -56,19 +54,16 @@ def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
     """The stated states at every corner of the box of parameters beside the time, as rows ``(d, size)`` on those of one
     in the middle and on what the parameters add; ``None`` where there are none that the state is an affine function
     of."""
-    system = in_time(problem).system
-    if not isinstance(system, VaryingSystem) or system.parameters is None or system.dependence is None:
-        return None
-    return [system.dependence.rows(corner) for corner in corners_of_box(system.dependence)]
+    depends = in_time(problem).system.dependence
+    return None if depends is None else [depends.rows(corner) for corner in corners_of_box(depends)]
 
 
 def corners_of(problem: OptimalControlProblem) -> Corners:
     """The corners of a problem as it is stated; none where it has no parameters beside the time."""
     system, rows = in_time(problem).system, at_corners(problem)
-    if rows is None or not isinstance(system, VaryingSystem) or system.parameters is None:
+    if rows is None or system.dependence is None:
         return Corners()
-    assert system.dependence is not None
-    box, reached = system.parameters, system.dependence.reached
+    box, reached = system.box, system.dependence.reached
     ends = [
         sorted({low, high}) if any(one) else [low]
         for low, high, one in zip(box.lower.tolist(), box.upper.tolist(), reached, strict=True)
@@ -76,7 +71,7 @@ def corners_of(problem: OptimalControlProblem) -> Corners:
     return Corners(rows, np.array(list(every_choice(*ends))), system.names)
 
 
-def _names(names: Names, system: VaryingSystem, depends: Dependence) -> Names:
+def _names(names: Names, system: System, depends: Dependence) -> Names:
     """Those of the states, and of what a parameter adds to one per unit of it."""
     added = [
         (i, name)

@@ -14,8 +14,9 @@ import numpy as np
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.repeat import widths
 from sparserob_core.control.problem.terms.windows import MixedConstraint, UntilHorizon
 from sparserob_core.control.problem.tracing import traced
@@ -37,7 +38,7 @@ WRITTEN = {
 CALLED = {"start": "from", "stop": "to"}
 """Fields of a term that a config calls otherwise."""
 MANY = 2500  # entries of a matrix that nobody reads: of ten times more a config has as many values as it may have
-WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
+WRITTEN_OF_SYSTEM = {"phases", "parameters", "delay"}
 
 
 def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
@@ -119,47 +120,39 @@ def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
 
 
 def _system_keys(system: System) -> dict[str, Any]:
-    if isinstance(system, VaryingSystem):
-        late: dict[str, Any] = {"delay": system.delay} if system.delay else {}
-        late.update(_defined_keys([law for _, _, law in system.laws]))
-        if system.parameters is not None:
-            late["parameters"] = _parameter_keys(system.parameters, system.names)
-        if not system.later:
-            return {**_matrix_keys(system.law), **late}
-        return {"pieces": [{"until": until, **_matrix_keys(law)} for _, until, law in system.laws], **late}
-    unknown = {one.name for mode in system.modes for one in fields(mode)} - WRITTEN_OF_SYSTEM
-    if unknown:
-        raise InputError(path=f"system.{sorted(unknown)[0]}", expected="a system in its own units", got="another")
-    first = system.modes[0]
-    shared: dict[str, Any] = {**({"delay": system.delay} if system.delay else {}), **_defined_keys(system.modes)}
-    if first.parameters is not None:
-        shared["parameters"] = _parameter_keys(first.parameters, first.names)
-    if isinstance(system, SwitchedSystem):
-        return {"pieces": [{"until": until, **_matrix_keys(mode)} for until, mode in system.pieces], **shared}
-    return {**_matrix_keys(first), **shared}
+    unknown = {one.name for one in fields(system)} - WRITTEN_OF_SYSTEM
+    if unknown or system.stated is not system:
+        raise InputError(path="system", expected="a system in the units of the user", got="another")
+    phases = system.phases
+    shared: dict[str, Any] = {**({"delay": system.delay} if system.delay else {}), **_defined_keys(phases)}
+    if system.parameters is not None:
+        shared["parameters"] = _parameter_keys(system.parameters, system.names)
+    if len(phases) == 1 and (system.varies or system.horizon == np.inf):
+        return {**_matrix_keys(phases[0]), **shared}
+    return {"pieces": [{"until": phase.until, **_matrix_keys(phase)} for phase in phases], **shared}
 
 
-def _matrix_keys(system: LinearSystem) -> dict[str, Any]:
-    keys: dict[str, Any] = {name: _rows(system, name) for name in ("A", "B", "E")}
-    if system.c is not None:
-        keys["c"] = [row[0] for row in _rows(system, "c")]
+def _matrix_keys(phase: Phase) -> dict[str, Any]:
+    keys: dict[str, Any] = {name: _rows(phase, name) for name in ("A", "B", "E")}
+    if phase.c is not None:
+        keys["c"] = [row[0] for row in _rows(phase, "c")]
     return keys
 
 
-def _defined_keys(systems: Sequence[LinearSystem]) -> dict[str, Any]:
-    """What the entries of systems use by name; of several, which share it, that of any."""
-    entries = [getattr(one, name) for one in systems for name in ("A", "B", "E", "c")]
+def _defined_keys(phases: Sequence[Phase]) -> dict[str, Any]:
+    """What the entries of phases use by name; of several, which share it, that of any."""
+    entries = [getattr(one, name) for one in phases for name in ("A", "B", "E", "c")]
     defined = next((one.defined for one in entries if isinstance(one, ExpressionMatrix) and one.defined), ())
     return {"define": {name: one.text for name, one in defined}} if defined else {}
 
 
-def _rows(system: LinearSystem, name: str) -> Any:
+def _rows(phase: Phase, name: str) -> Any:
     """Rows of numbers and expressions, or large ones in one text."""
-    given = getattr(system, name)
+    given = getattr(phase, name)
     if isinstance(given, ExpressionMatrix):
         return [[entry.text for entry in row] for row in given.entries]
     if callable(given):
-        return traced(name, given, system.names, system.probes)
+        return traced(name, given, phase.names, phase.probes)
     matrix: Array = np.asarray(given, dtype=float)
     return pack(matrix) if matrix.size > MANY else matrix.tolist()
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.control.problem.prices import by_time
+from sparserob_core.control.problem.cost import by_time
 from sparserob_core.control.sets.curved import NormBall
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.transcription.rounding import rounded_down

@@ -76,7 +76,7 @@ ENTRIES = [
 def test_what_is_beyond_a_degree_is_bounded_and_not_by_far_more_than_it_is(text: str) -> None:
     box = sr.Box([-0.3], [0.4])
     system = sr.VaryingSystem.of([[text]], [["1"]], 2.0, [[1]], parameters=box, names=["p"])
-    known, (centre, units), entry = cauchy(system), system.deviations, system.law.entry("A")
+    known, (centre, units), entry = cauchy(system), system.deviations, system.phases[0].entry("A")
     for degree in (1, 4, 7):
         left = known.left(degree)
         assert (left.sizes[:, :, 1:] == 0.0).all()

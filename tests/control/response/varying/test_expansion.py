@@ -218,7 +218,7 @@ def integrated(system: VaryingSystem, start: float, stop: float) -> Array:
     """What an interval makes of a state and of inputs, by an integrator."""
 
     def rates(t: float, values: Array) -> Array:
-        A, B, E = (part[0] for part in system.law.matrices(np.array([[t]])))
+        A, B, E = (part[0] for part in system.phases[0].matrices(np.array([[t]])))
         return np.asarray(A @ values.reshape(2, -1) + np.column_stack([np.zeros((2, 2)), B, E])).ravel()
 
     first = np.column_stack([np.eye(2), np.zeros((2, 2))]).ravel()

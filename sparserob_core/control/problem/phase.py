@@ -1,0 +1,593 @@
+"""What a system does between two times: ``x' = A x + B u + E w + c``, whose entries are numbers, or functions of
+uncertain parameters, or of the time and of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import TypeAlias, final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.brief import noun
+from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
+from sparserob_core.control.problem.expression import ExpressionMatrix, above, beside
+from sparserob_core.control.problem.tracing import SAME
+from sparserob_core.control.sets.sets import Box
+from sparserob_core.control.sets.strangers import require_consistent
+from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.shapes import Float, dense, shaped
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
+TIME = "t"
+PARTS = ("A", "B", "E", "c")
+_Entry: TypeAlias = Array | Callable[..., object] | ExpressionMatrix
+_Arguments: TypeAlias = npt.NDArray[np.object_]
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """``x' = A x + B u + E w + c`` from the time ``begin`` ``until`` another.
+
+    ``A (d, d)``, ``B (d, m)``, ``E (d, mw)`` and ``c (d, 1)`` are arrays, or functions of arguments ``(n,)`` that
+    return such arrays; ``E`` is the identity unless given, and without a ``c`` there is no drift. The arguments are in
+    the bounded ``domain``, which is ``None`` where there are none, and have ``names`` for messages, p1, p2, ... unless
+    given. Of a phase that is ``timed`` the first one is the time. Raises `InputError` when shapes disagree or an entry
+    is not finite somewhere that was looked at.
+    """
+
+    A: Matrix
+    B: Matrix
+    E: Matrix | None = None
+    domain: ConvexSet | None = None
+    names: Sequence[str] = ()
+    c: Matrix | None = None
+    begin: float = 0.0
+    until: float = np.inf
+    timed: bool = False
+
+    __repr__ = noun
+
+    def __post_init__(self) -> None:
+        self._check_domain()
+        for name in ("A", "B"):
+            object.__setattr__(self, name, self._matrix(name, getattr(self, name)))
+        d, columns = self._shape("A")
+        if d != columns:
+            raise InputError(f"A must be square, got shape {(d, columns)}", path="system")
+        object.__setattr__(self, "E", np.eye(d) if self.E is None else self._matrix("E", self.E))
+        for name in ("B", "E"):
+            if self._shape(name)[0] != d:
+                raise InputError(f"{name} must have {d} rows, as A has, got shape {self._shape(name)}", path="system")
+        if self.c is not None:
+            self._check_drift(d)
+        self.matrices(self.probes)
+
+    @property
+    def states(self) -> int:
+        """Number ``d`` of states."""
+        return self._shape("A")[0]
+
+    @property
+    def controls(self) -> int:
+        """Number ``m`` of controls."""
+        return self._shape("B")[1]
+
+    @property
+    def disturbances(self) -> int:
+        """Number ``mw`` of disturbances that ``E`` takes."""
+        return self._shape("E")[1]
+
+    @property
+    def count(self) -> int:
+        """Number ``n`` of arguments, 0 where all entries are numbers."""
+        return 0 if self.domain is None else self.domain.dimension
+
+    @property
+    def stated(self) -> Phase:
+        """The phase in the units that it is stated in: itself."""
+        return self
+
+    @cached_property
+    def forced(self) -> Phase:
+        """The same with its drift as one more column of ``B``, whose control is always 1; itself without a drift."""
+        if self.c is None:
+            return self
+        return replace(self, B=beside(self._entry("B"), self._entry("c")), c=None)
+
+    def between(self, begin: float, until: float) -> Phase:
+        """The same from and until other times."""
+        return self if (begin, until) == (self.begin, self.until) else replace(self, begin=begin, until=until)
+
+    def drifting(self) -> Phase:
+        """The same with a drift, of 0 where it has none."""
+        return self if self.c is not None else replace(self, c=np.zeros((self.states, 1)))
+
+    def within(self, parameters: ConvexSet | None, names: Sequence[str]) -> Phase:
+        """The same, its uncertain parameters in this set and with these names."""
+        if self.timed:
+            box = None if parameters is None else boxed(parameters)
+            return replace(self, domain=and_time(self.begin, self.until, box), names=(TIME, *names))
+        return self if parameters is self.domain else replace(self, domain=parameters, names=tuple(names))
+
+    def later(self, begin: float, until: float, later: float) -> Phase:
+        """The same from and until other times, of a clock that shows 0 so much ``later``."""
+        if not self.timed:
+            return self.between(begin, until)
+        assert isinstance(self.domain, Box)
+        ends = zip((begin, self.until - later), (self.domain.lower, self.domain.upper), strict=True)
+        domain = Box(*(np.append(time, side[1:]) for time, side in ends))
+        return self._through(partial(_moved, later), domain, self.names, begin, until)
+
+    def at(self, parameter: Array) -> Phase:
+        """A timed phase at one uncertain ``parameter (nu,)``."""
+        domain = and_time(self.begin, self.until, None)
+        return self._through(partial(_with_parameter, parameter), domain, (TIME,), self.begin, self.until)
+
+    def during(self, time: float, parameters: ConvexSet | None) -> Phase:
+        """A timed phase as it is at one ``time``, whose arguments are the uncertain ``parameters`` alone."""
+        return self._through(partial(_at_time, time), parameters, self.names[1:], timed=False)
+
+    def in_time(self, until: float) -> Phase:
+        """The same as one that is timed, up to a time. Raises `InputError` where its parameters are in no box."""
+        domain = and_time(self.begin, until, None if self.domain is None else boxed(self.domain))
+        return self._through(_without_time, domain, (TIME, *self.names), self.begin, until)
+
+    def _through(
+        self,
+        arguments: Callable[[_Arguments], _Arguments],
+        domain: ConvexSet | None,
+        names: Sequence[str],
+        begin: float = 0.0,
+        until: float = np.inf,
+        timed: bool = True,
+    ) -> Phase:
+        """The phase whose entries are functions of other ``arguments``."""
+        A, B, E, c = (through(self.entry(name), arguments) for name in PARTS)
+        assert A is not None and B is not None
+        return Phase(A, B, E, domain, names, c, begin, until, timed)
+
+    @shaped
+    def accumulating(self, rows: Float[Array, "k d"], inputs: Float[Array, "k m"]) -> Phase:
+        """The same with ``k`` more states after its own, ``z' = rows x + inputs u(t - delay)``: integrals of what its
+        state and its control do."""
+        k, d = rows.shape
+        below = {"B": inputs, "E": np.zeros((k, self.disturbances)), "c": np.zeros((k, 1))}
+        known = {
+            name: above(self._entry(name), part) for name, part in below.items() if name != "c" or self.c is not None
+        }
+        A = above(beside(self._entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
+        return replace(self, A=A, B=known["B"], E=known["E"], c=known.get("c"))
+
+    @shaped
+    def matrices(
+        self, arguments: Float[Array, "k n"]
+    ) -> tuple[Float[Array, "k d d"], Float[Array, "k d m"], Float[Array, "k d mw"]]:
+        """``A (k, d, d)``, ``B (k, d, m)``, ``E (k, d, mw)`` at parameters ``(k, nu)``; raises `InputError` where they
+        are not finite."""
+        points = np.asarray(arguments, dtype=float)
+        if points.ndim != 2 or points.shape[1] != self.count:
+            raise InputError(f"parameters must have shape (k, {self.count}), got {points.shape}", path="system")
+        A, B, E = (self._values(name, points) for name in ("A", "B", "E"))
+        return A, B, E
+
+    @shaped
+    def taylor(
+        self, space: TaylorSpace, centre: Float[Array, " n"], radius: Float[Array, " n"]
+    ) -> tuple[
+        Float[Array, "M d d"],
+        Float[Array, "d d"],
+        Float[Array, "M d m"],
+        Float[Array, "d m"],
+        Float[Array, "M d mw"],
+        Float[Array, "d mw"],
+    ]:
+        """Taylor models of all entries over the cell ``centre +- radius``, both ``(nu,)``.
+
+        Returns ``A_coefficients (M, d, d), A_remainder (d, d)`` and the same for ``B`` and ``E``.
+        Raises `NotEnclosable` when a function cannot be evaluated on Taylor models, or has a singularity on the cell.
+        """
+        p = np.empty(self.count, dtype=object)
+        p[:] = space.variables(centre, radius)
+        A, B, E = (self._enclosed(name, space, p) for name in ("A", "B", "E"))
+        return *A, *B, *E
+
+    @shaped
+    def in_units(
+        self,
+        A: Float[Array, "d d"],
+        B: Float[Array, "d m"],
+        E: Float[Array, "d mw"],
+        arguments: Float[Array, " n"],
+        c: Float[Array, "d 1"] | float = 1.0,
+        time: float = 1.0,
+    ) -> Phase:
+        """The phase whose matrices are ``A``, ``B``, ``E``, ``c`` times these factors, entry by entry, and whose
+        arguments and times are this one's divided by ``arguments (n,)`` and ``time``; exact for powers of two."""
+        begin, until = self.begin / time, self.until / time
+        if self.domain is None:
+            ours = [matrix[0] for matrix in self.matrices(np.zeros((1, 0)))]
+            drift = None if self.c is None else self._values("c", np.zeros((1, 0)))[0] * c
+            return Phase(ours[0] * A, ours[1] * B, ours[2] * E, c=drift, begin=begin, until=until)
+        return PhaseInUnits(
+            self.A,
+            self.B,
+            self.E,
+            self.domain.in_units(arguments),
+            self.names,
+            self.c,
+            begin,
+            until,
+            self.timed,
+            base=self,
+            factors={"A": A, "B": B, "E": E, "c": np.broadcast_to(c, (A.shape[0], 1))},
+            units=arguments,
+            clock=time,
+        )
+
+    @shaped
+    def describe(self, arguments: Float[Array, " n"]) -> str:
+        """Arguments, or the last ones of them, in words, such as ``p1 = 0.1, p2 = -0.1``."""
+        names = self.names[len(self.names) - arguments.size :]
+        return ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, arguments, strict=True))
+
+    def entry(self, name: str) -> _Entry | None:
+        """``A``, ``B``, ``E`` or ``c (d, 1)`` as an array, expressions, or a function of ``p (nu,)``."""
+        return None if name == "c" and self.c is None else self._entry(name)
+
+    def _entry(self, name: str) -> _Entry:
+        entry: _Entry = getattr(self, name)
+        return entry
+
+    def _check_domain(self) -> None:
+        given: object = self.domain
+        if not isinstance(given, ConvexSet | None):
+            raise InputError(
+                path="system.parameters",
+                expected="a convex set, such as Box([-0.1], [0.1]), or None; C and D of a plant have no place here",
+                got=f"{type(given).__name__}",
+            )
+        if self.domain is not None and not self.domain.is_bounded:
+            raise InputError("the set of parameters must be bounded", path="system")
+        if self.domain is not None:
+            require_consistent("system.parameters", self.domain)
+        names = tuple(self.names) or tuple(f"p{i + 1}" for i in range(self.count))
+        if len(names) != self.count:
+            raise InputError(
+                path="system", expected=f"{self.count} parameter names", got=f"{len(names)}: {', '.join(names)}"
+            )
+        object.__setattr__(self, "names", names)
+
+    def _check_drift(self, d: int) -> None:
+        """``c`` as a matrix of one column; raises `InputError` when it has not one number per state."""
+        given = self.c
+        if callable(given) and not isinstance(given, ExpressionMatrix | _AsColumn):
+            given = _AsColumn(given)
+        elif not callable(given):
+            given = dense(given)
+            array = np.asarray(given, dtype=object)
+            if array.ndim == 0:
+                raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=f"{given!r}")
+            given = array[:, None].tolist() if array.ndim == 1 else given
+        object.__setattr__(self, "c", self._matrix("c", given))
+        if self._shape("c") != (d, 1):
+            rows, columns = self._shape("c")
+            got = f"{rows}" if columns == 1 else f"shape {(rows, columns)}"
+            raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=got)
+        self._values("c", self.probes)
+
+    def _matrix(self, name: str, value: object) -> _Entry:
+        if isinstance(value, ExpressionMatrix):
+            return (
+                value(np.zeros(len(value.names))).astype(float) if value.is_constant else self._known_names(name, value)
+            )
+        if callable(value):
+            if self.domain is None:
+                raise InputError(
+                    f"{name} is a function of the parameters, but no set of parameters is given", path="system"
+                )
+            return value
+        try:
+            array = np.array(dense(value), dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"{name} must be a matrix of numbers or a function of the parameters, got {value!r}", path="system"
+            ) from error
+        if array.ndim != 2 or array.size == 0 or not np.isfinite(array).all():
+            raise InputError(
+                f"{name} must be a matrix of finite numbers, rows by columns, got {_seen(array)}", path="system"
+            )
+        return array
+
+    def _known_names(self, name: str, matrix: ExpressionMatrix) -> ExpressionMatrix:
+        if matrix.names != tuple(self.names):
+            raise InputError(
+                f"the expressions of {name} are in the parameters {', '.join(matrix.names)}, the system has"
+                f" {', '.join(self.names) or 'none'}",
+                path="system",
+            )
+        return matrix
+
+    def _shape(self, name: str) -> tuple[int, int]:
+        entry = self._entry(name)
+        if isinstance(entry, np.ndarray | ExpressionMatrix):
+            rows, columns = entry.shape
+            return rows, columns
+        return self._probed_shape(name)
+
+    def _probed_shape(self, name: str) -> tuple[int, int]:
+        cache: dict[str, tuple[int, int]] = self.__dict__.setdefault("_shapes", {})
+        if name not in cache:
+            value = np.asarray(self._called(name, self.probes[0]))
+            if value.ndim != 2 or value.size == 0:
+                raise InputError(
+                    f"the function {name} must return a matrix, rows by columns, got {_seen(value)}", path="system"
+                )
+            cache[name] = (value.shape[0], value.shape[1])
+        return cache[name]
+
+    @property
+    def probes(self) -> Array:
+        """A few parameters ``(k, nu)`` at which a system is tried out: a middle one and support points."""
+        if self.domain is None:
+            return np.empty((1, 0))
+        axes = np.eye(self.count)
+        points = self.domain.support_point(np.vstack([axes, -axes]))
+        return np.vstack([self.domain.interior_point(), points])
+
+    def _called(self, name: str, parameter: Array) -> Array:
+        function = self._entry(name)
+        assert callable(function)
+        try:
+            with np.errstate(all="ignore"):  # what is not finite is reported with its parameter
+                return np.asarray(function(parameter), dtype=float)
+        except (TypeError, ValueError, ArithmeticError, IndexError, KeyError, AttributeError) as error:
+            raise InputError(
+                f"the function {name} failed at {self.describe(parameter)}: {error}", path="system"
+            ) from error
+
+    @shaped
+    def _values(self, name: str, points: Float[Array, "k n"]) -> Float[Array, "k rows columns"]:
+        entry = self._entry(name)
+        if isinstance(entry, np.ndarray):
+            return np.broadcast_to(entry, (len(points), *entry.shape)) if len(points) != 1 else _still(entry[None])
+        shape = self._shape(name)
+        if isinstance(entry, ExpressionMatrix):
+            values = entry.evaluate(points)
+        else:
+            rows = [self._called(name, point) for point in points]
+            other = next((row.shape for row in rows if row.shape != shape), None)
+            if other is not None:
+                raise InputError(f"the function {name} must always return shape {shape}, got {other}", path="system")
+            values = np.array(rows).reshape(len(points), *shape)
+        finite = np.isfinite(values).all(axis=(1, 2))
+        if not finite.all():
+            raise InputError(
+                f"{name} is not finite at {self.describe(points[np.flatnonzero(~finite)[0]])}", path="system"
+            )
+        return values
+
+    def _enclosed(self, name: str, space: TaylorSpace, p: npt.NDArray[np.object_]) -> tuple[Array, Array]:
+        entry, shape = self._entry(name), self._shape(name)
+        coefficients, remainder = np.zeros((space.size, *shape)), np.zeros(shape)
+        if isinstance(entry, np.ndarray):
+            coefficients[0] = entry
+            return coefficients, remainder
+        try:
+            models = np.array(entry(p), dtype=object)
+        except NotEnclosable as error:
+            raise NotEnclosable(f"system: {name}: {error}") from error
+        except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
+            raise NotEnclosable(
+                f"system: the function {name} cannot be enclosed over parameters; use arithmetic and numpy's "
+                f"sin, cos, tan, exp, log, sqrt, tanh on the entries of p only ({error})"
+            ) from error
+        if models.shape != shape:
+            raise NotEnclosable(
+                f"system: the function {name} returns shape {shape} for numbers, but {models.shape} for Taylor models"
+            )
+        every, left = coefficients.reshape(space.size, -1), remainder.reshape(-1)
+        for place, model in enumerate(models.ravel().tolist()):
+            if type(model) is int and not model:  # nearly all of them where states are coefficients of polynomials
+                continue
+            if isinstance(model, TaylorModel):
+                every[:, place], left[place] = model.coefficients, model.remainder
+            elif isinstance(model, int | float | np.integer | np.floating):
+                every[0, place] = model
+            else:
+                raise NotEnclosable(
+                    f"system: the function {name} returned {type(model).__name__} for an entry, expected a number"
+                )
+        if not isinstance(entry, ExpressionMatrix):
+            self._require_same(name, np.array([one.coefficients[0] for one in p]), coefficients[0], remainder)
+        return coefficients, remainder
+
+    def _require_same(self, name: str, centre: Array, value: Array, remainder: Array) -> None:
+        """Raise `InputError` where a function of the parameters is another one for numbers than for Taylor models,
+        whose ``value`` at the ``centre (nu,)`` of a cell is told: rows would be those of one system, and proofs those
+        of another. An expression is one and the same for both."""
+        given = self._called(name, centre)
+        apart = np.abs(given - value) - remainder
+        if not (apart <= SAME * max(float(np.abs(given).max()), float(np.abs(value).max()))).all():
+            row, column = (int(i) for i in np.unravel_index(int(apart.argmax()), apart.shape))
+            raise InputError(
+                path=f"system.{name}",
+                expected="a function that depends on its argument alone, by arithmetic",
+                got=f"{given[row, column]:.9g} and then {value[row, column]:.9g} in row {row + 1}, column {column + 1},"
+                f" at {self.describe(centre)}",
+            )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _AsColumn:
+    """A function of the parameters that returns ``(d,)`` as one that returns ``(d, 1)``."""
+
+    function: Callable[..., object]
+
+    def __call__(self, parameter: object) -> object:
+        value = self.function(parameter)
+        array = np.array(value, dtype=object if _holds_models(value) else float)
+        return array[:, None] if array.ndim == 1 else array
+
+
+def _holds_models(value: object) -> bool:
+    return np.asarray(value, dtype=object).dtype == object and not all(
+        isinstance(entry, int | float | np.integer | np.floating) for entry in np.asarray(value, dtype=object).flat
+    )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Through:
+    """An entry as a function of other arguments, of which ``arguments`` makes its own; times a ``factor (rows,
+    columns)``."""
+
+    entry: Callable[..., object]
+    arguments: Callable[[_Arguments], _Arguments]
+    factor: Array | None = None
+
+    def __call__(self, p: _Arguments) -> object:
+        """The entry at other arguments ``(n,)``."""
+        found = self.entry(self.arguments(p))
+        return found if self.factor is None else np.asarray(found, dtype=object) * self.factor
+
+
+def through(entry: _Entry | None, arguments: Callable[[_Arguments], _Arguments]) -> _Entry | None:
+    """An entry as a function of other arguments; itself where it has none."""
+    return Through(entry, arguments) if callable(entry) else entry
+
+
+def _moved(later: float, p: _Arguments) -> _Arguments:
+    """On a clock that shows 0 so much later, the time being the first argument."""
+    moved = p.copy()
+    moved[0] = p[0] + later
+    return moved
+
+
+def _with_parameter(parameter: Array, p: _Arguments) -> _Arguments:
+    """The time, and one parameter ``(nu,)`` after it."""
+    whole = np.empty(1 + parameter.size, dtype=object)
+    whole[0], nothing = p[0], 0.0 * p[0]
+    for i, value in enumerate(parameter.tolist()):
+        whole[1 + i] = nothing + value
+    return whole
+
+
+def _at_time(time: float, p: _Arguments) -> _Arguments:
+    """One time before the parameters."""
+    whole = np.empty(1 + len(p), dtype=object)
+    whole[0], whole[1:] = time, p
+    return whole
+
+
+def _without_time(p: _Arguments) -> _Arguments:
+    """The parameters after the time."""
+    return p[1:]
+
+
+def _times(units: Array, p: _Arguments) -> _Arguments:
+    """Arguments in other units."""
+    return np.asarray(np.asarray(p, dtype=object) * units)
+
+
+def boxed(parameters: ConvexSet) -> Box:
+    """A set of parameters beside the time, which must be a box."""
+    if not parameters.is_box or not parameters.is_bounded:
+        raise InputError(
+            path="system.parameters", expected="a bounded box beside the time t, one interval each", got=parameters.kind
+        )
+    return parameters.bounding_box()
+
+
+def and_time(begin: float, until: float, parameters: Box | None) -> Box:
+    """The times from one to another, and the parameters."""
+    if parameters is None:
+        return Box([begin], [until])
+    return Box(np.append(begin, parameters.lower), np.append(until, parameters.upper))
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PhaseInUnits(Phase):
+    """A phase in other units: the ``base`` at arguments times ``units (n,)``, its matrices times ``factors``, one unit
+    of time being ``clock`` of its own."""
+
+    base: Phase
+    factors: Mapping[str, Array]
+    units: Array
+    clock: float
+
+    def __post_init__(self) -> None:
+        pass  # the base was checked
+
+    @property
+    def stated(self) -> Phase:
+        return self.base
+
+    @cached_property
+    def forced(self) -> Phase:
+        if self.c is None:
+            return self
+        base, factors = self.base.forced, self.factors
+        joined = {"A": factors["A"], "B": np.hstack([factors["B"], factors["c"]]), "E": factors["E"]}
+        return replace(self, A=base.A, B=base.B, E=base.E, c=None, base=base, factors=joined)
+
+    @shaped
+    def describe(self, arguments: Float[Array, " n"]) -> str:
+        return self.base.describe(arguments * self.units[self.units.size - arguments.size :])
+
+    @shaped
+    def in_units(
+        self,
+        A: Float[Array, "d d"],
+        B: Float[Array, "d m"],
+        E: Float[Array, "d mw"],
+        arguments: Float[Array, " n"],
+        c: Float[Array, "d 1"] | float = 1.0,
+        time: float = 1.0,
+    ) -> Phase:
+        mine, units = self.factors, arguments * self.units
+        return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], units, c * mine["c"], time * self.clock)
+
+    def entry(self, name: str) -> _Entry | None:
+        entry = self.base.entry(name)
+        if entry is None:
+            return None
+        factor = self.factors[name]
+        return Through(entry, partial(_times, self.units), factor) if callable(entry) else entry * factor
+
+    def _shape(self, name: str) -> tuple[int, int]:
+        return self.base._shape(name)
+
+    @shaped
+    def _values(self, name: str, points: Float[Array, "k n"]) -> Float[Array, "k rows columns"]:
+        return self.base._values(name, points * self.units) * self.factors[name]
+
+    @shaped
+    def taylor(
+        self, space: TaylorSpace, centre: Float[Array, " n"], radius: Float[Array, " n"]
+    ) -> tuple[
+        Float[Array, "M d d"],
+        Float[Array, "d d"],
+        Float[Array, "M d m"],
+        Float[Array, "d m"],
+        Float[Array, "M d mw"],
+        Float[Array, "d mw"],
+    ]:
+        found = self.base.taylor(space, centre * self.units, radius * self.units)
+        every = [part * self.factors[name] for name, part in zip("AABBEE", found, strict=True)]
+        return every[0], every[1], every[2], every[3], every[4], every[5]
+
+
+def _still(view: Array) -> Array:
+    """A view that nobody writes to."""
+    view.flags.writeable = False
+    return view
+
+
+def _seen(array: npt.NDArray[np.float64]) -> str:
+    return str(array.tolist()) if array.size <= 8 else f"an array of shape {array.shape}"
