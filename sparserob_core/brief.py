@@ -45,11 +45,7 @@ def _shown(record: Any) -> list[tuple[str, object]]:
     return [(name, getattr(record, name)) for name in names]
 
 
-def _given(record: Any) -> list[tuple[str, object]]:
-    return _known(_shown(record))
-
-
-def _known(shown: Sequence[tuple[str, object]]) -> list[tuple[str, object]]:
+def _given(shown: Sequence[tuple[str, object]]) -> list[tuple[str, object]]:
     return [(name, value) for name, value in shown if not (value is None or _is_empty(value))]
 
 
@@ -65,7 +61,7 @@ def noun(record: Any) -> str:
 
 def phrase(heading: str, shown: Sequence[tuple[str, object]]) -> str:
     """A record with this heading as `noun` says it, of which these fields are shown."""
-    given = _known(shown)
+    given = _given(shown)
     line = f"{heading}({', '.join(f'{name}={_value(value)}' for name, value in given)})"
     return line if len(line) <= WIDTH else _lines(heading, given)
 
