@@ -10,7 +10,7 @@ so do convex sets.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
@@ -36,218 +36,48 @@ if TYPE_CHECKING:
     from sparserob_core.control.problem.terms.windows import PathConstraint
 
 NAMES = ("A", "B", "E", "c")
-FREE: tuple[int, ...] = ()  # the key of what no parameter multiplies; others are the numbers of those that do, in order
-LARGEST_POWER = 64  # of a natural number, what is multiplied out
-MOST_FACTORS = 8
-"""Parameters of which one product may be made where entries are to be polynomials; expansions of such systems have
-hundreds of parts, and where there are more factors an entry is as good as any other function."""
+NO_PLANE = "the checker knows parameters beside the time that the state depends on affinely"
 
 
 @final
-class Something:
-    """Any number at all, as a time of which nothing is known; nothing that is made of it counts as 0."""
+class Affine:
+    """A number of which it is known only that it is an affine function of some ``parameters``, by their places, at any
+    time; ``bent``: or any other function of them."""
 
-    def _any(self, *_: object) -> Something:
+    __slots__ = ("bent", "parameters")
+
+    def __init__(self, parameters: frozenset[int] = frozenset(), bent: bool = False) -> None:
+        self.parameters, self.bent = parameters, bent
+
+    def _sum(self, other: object, product: bool = False) -> Affine:
+        if not isinstance(other, Affine):
+            return self
+        both = product and bool(self.parameters) and bool(other.parameters)
+        return Affine(self.parameters | other.parameters, self.bent or other.bent or both)
+
+    def _product(self, other: object) -> Affine:
+        return self._sum(other, product=True)
+
+    def _curved(self, *_: object) -> Affine:
+        return Affine(self.parameters, self.bent or bool(self.parameters))
+
+    def _same(self) -> Affine:
         return self
 
-    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = __rtruediv__ = __pow__ = _any
-    __rpow__ = __neg__ = __pos__ = sin = cos = tan = exp = sqrt = log = tanh = kepler = _any
+    def __truediv__(self, other: object) -> Affine:
+        return self * other._curved() if isinstance(other, Affine) else self
 
+    def __pow__(self, other: object) -> Affine:
+        if isinstance(other, Affine):
+            return self._curved() * other._curved()
+        if other == 0:
+            return Affine()
+        return self if other == 1 else self._curved()
 
-@final
-class Sum:
-    """A power series in the shares ``s_j`` up to so many factors, ``most``: each of the ``parts`` times those whose
-    numbers are its key; ``bent``: it is, or may be, more than that.
-
-    Functions are made by the operator that multiplies a product by its number of factors, ``D = sum_j s_j d/ds_j``, for
-    which ``D g(f) = g'(f) D f``: a part of ``g`` with ``n`` factors is a sum over those with fewer.
-    """
-
-    __slots__ = ("bent", "most", "parts")
-
-    def __init__(self, parts: dict[tuple[int, ...], Any], most: int = MOST_FACTORS, bent: bool = False) -> None:
-        self.parts, self.most, self.bent = parts, most, bent
-
-    @property
-    def is_free(self) -> bool:
-        return not self.bent and self.parts.keys() == {FREE}
-
-    def _of(self, other: object) -> Sum:
-        return other if isinstance(other, Sum) else Sum({FREE: other}, self.most)
-
-    def __add__(self, other: object) -> Sum:
-        more, parts = self._of(other), dict(self.parts)
-        for key, value in more.parts.items():
-            parts[key] = parts[key] + value if key in parts else value
-        return Sum(parts, self.most, self.bent or more.bent)
-
-    def __neg__(self) -> Sum:
-        return Sum({key: -value for key, value in self.parts.items()}, self.most, self.bent)
-
-    def __pos__(self) -> Sum:
-        return self
-
-    def __sub__(self, other: object) -> Sum:
-        return self + -self._of(other)
-
-    def __rsub__(self, other: object) -> Sum:
-        return self._of(other) + -self
-
-    def __mul__(self, other: object) -> Sum:
-        more, parts = self._of(other), dict[tuple[int, ...], Any]()
-        bent = self.bent or more.bent
-        for one, value in self.parts.items():
-            for two, factor in more.parts.items():
-                if len(one) + len(two) > self.most:
-                    bent = True
-                    continue
-                key, made = tuple(sorted(one + two)), value * factor
-                parts[key] = parts[key] + made if key in parts else made
-        return Sum(parts, self.most, bent)
-
-    def __truediv__(self, other: object) -> Sum:
-        under = self._of(other)
-        if not under.is_free:
-            return self * under._inverse()
-        return Sum({key: value / under.parts[FREE] for key, value in self.parts.items()}, self.most, self.bent)
-
-    def __rtruediv__(self, other: object) -> Sum:
-        return self._of(other) / self
-
-    def __pow__(self, other: object) -> Sum:
-        exponent = self._of(other)
-        if self.is_free and exponent.is_free:
-            return Sum({FREE: self.parts[FREE] ** exponent.parts[FREE]}, self.most)
-        power = exponent.parts[FREE]
-        if exponent.is_free and isinstance(power, int | float) and power == int(power) and abs(power) <= LARGEST_POWER:
-            found = Sum({FREE: 1.0}, self.most)
-            for _ in range(abs(int(power))):
-                found = found * self
-            return found if power >= 0 else found._inverse()
-        return (exponent * self.log()).exp()
-
-    def __rpow__(self, other: object) -> Sum:
-        return self._of(other) ** self
-
-    __radd__, __rmul__ = __add__, __mul__
-
-    def _levels(self) -> list[dict[tuple[int, ...], Any]]:
-        """The parts by how many factors they have, ``most + 1`` of them."""
-        found: list[dict[tuple[int, ...], Any]] = [{} for _ in range(self.most + 1)]
-        for key, value in self.parts.items():
-            found[len(key)][key] = value
-        return found
-
-    def _joined(self, levels: list[dict[tuple[int, ...], Any]]) -> Sum:
-        return Sum({key: value for level in levels for key, value in level.items()}, self.most, True)
-
-    def _through(self, function: Callable[[Any], Any]) -> Sum:
-        return Sum({FREE: function(self.parts[FREE])}, self.most)
-
-    def _inverse(self) -> Sum:
-        """``g`` with ``f g = 1``."""
-        f, first = self._levels(), 1.0 / self.parts[FREE]
-        g = [{FREE: first}]
-        for n in range(1, self.most + 1):
-            g.append(_mixed([(-1.0, f[k], g[n - k]) for k in range(1, n + 1)], first))
-        return self._joined(g)
-
-    def exp(self) -> Sum:
-        if self.is_free:
-            return self._through(np.exp)
-        f, g = self._levels(), [{FREE: np.exp(self.parts[FREE])}]
-        for n in range(1, self.most + 1):
-            g.append(_mixed([(k / n, f[k], g[n - k]) for k in range(1, n + 1)]))
-        return self._joined(g)
-
-    def log(self) -> Sum:
-        if self.is_free:
-            return self._through(np.log)
-        slopes = (self._slope() * self._inverse())._levels()
-        return self._joined(
-            [{FREE: np.log(self.parts[FREE])}, *(_mixed([(1.0 / n, slopes[n], ONE)]) for n in range(1, self.most + 1))]
-        )
-
-    def _slope(self) -> Sum:
-        """``D f``."""
-        return Sum({key: value * float(len(key)) for key, value in self.parts.items() if key}, self.most, self.bent)
-
-    def sqrt(self) -> Sum:
-        """``g`` with ``g g = f``."""
-        if self.is_free:
-            return self._through(np.sqrt)
-        f, first = self._levels(), np.sqrt(self.parts[FREE])
-        g, half = [{FREE: first}], 0.5 / first
-        for n in range(1, self.most + 1):
-            within = [(-1.0, g[k], g[n - k]) for k in range(1, n)]
-            g.append(_mixed([(1.0, f[n], ONE), *within], half))
-        return self._joined(g)
-
-    def _circular(self) -> tuple[Sum, Sum]:
-        f, first = self._levels(), self.parts[FREE]
-        s, c = [{FREE: np.sin(first)}], [{FREE: np.cos(first)}]
-        for n in range(1, self.most + 1):
-            ahead = _mixed([(k / n, f[k], c[n - k]) for k in range(1, n + 1)])
-            c.append(_mixed([(-k / n, f[k], s[n - k]) for k in range(1, n + 1)]))
-            s.append(ahead)
-        return self._joined(s), self._joined(c)
-
-    def sin(self) -> Sum:
-        return self._through(np.sin) if self.is_free else self._circular()[0]
-
-    def cos(self) -> Sum:
-        return self._through(np.cos) if self.is_free else self._circular()[1]
-
-    def tan(self) -> Sum:
-        return self._through(np.tan) if self.is_free else self._steep(np.tan, 1.0)
-
-    def tanh(self) -> Sum:
-        return self._through(np.tanh) if self.is_free else self._steep(np.tanh, -1.0)
-
-    def _steep(self, function: Callable[[Any], Any], sign: float) -> Sum:
-        """``g`` with ``D g = h D f`` and ``h = 1 + sign g g``, so that ``D h = 2 sign g h D f``: of sums of balls with
-        fewer that cancel."""
-        f, first = self._levels(), function(self.parts[FREE])
-        g, h = [{FREE: first}], [{FREE: 1.0 + sign * (first * first)}]
-        both = [{FREE: first * h[0][FREE]}]
-        for n in range(1, self.most + 1):
-            g.append(_mixed([(k / n, f[k], h[n - k]) for k in range(1, n + 1)]))
-            h.append(_mixed([(2.0 * sign * k / n, f[k], both[n - k]) for k in range(1, n + 1)]))
-            both.append(_mixed([(1.0, g[k], h[n - k]) for k in range(n + 1)]))
-        return self._joined(g)
-
-    def kepler(self, eccentricity: float) -> Sum:
-        """``E`` with ``D E = D M + e cos E D E``."""
-        from sparserob_core.control.problem.expression import kepler
-
-        first = kepler(self.parts[FREE], eccentricity)
-        if self.is_free:
-            return Sum({FREE: first}, self.most)
-        M, E, s, c = self._levels(), [{FREE: first}], [{FREE: np.sin(first)}], [{FREE: np.cos(first)}]
-        steep = 1.0 / (1.0 - c[0][FREE] * eccentricity)
-        for n in range(1, self.most + 1):
-            within = [(eccentricity * k / n, E[k], c[n - k]) for k in range(1, n)]
-            E.append(_mixed([(1.0, M[n], ONE), *within], steep))
-            ahead = _mixed([(k / n, E[k], c[n - k]) for k in range(1, n + 1)])
-            c.append(_mixed([(-k / n, E[k], s[n - k]) for k in range(1, n + 1)]))
-            s.append(ahead)
-        return self._joined(E)
-
-
-ONE: dict[tuple[int, ...], Any] = {FREE: 1.0}
-
-
-def _mixed(
-    terms: list[tuple[float, dict[tuple[int, ...], Any], dict[tuple[int, ...], Any]]], factor: Any = 1.0
-) -> dict[tuple[int, ...], Any]:
-    """A sum of products of parts, each times a number, and all of it times a ``factor``."""
-    found = dict[tuple[int, ...], Any]()
-    for number, left, right in terms:
-        for one, value in left.items():
-            for two, other in right.items():
-                key, made = tuple(sorted(one + two)), value * other * number
-                found[key] = found[key] + made if key in found else made
-    return {key: value * factor for key, value in found.items()}
+    __add__ = __radd__ = __sub__ = __rsub__ = _sum
+    __mul__ = __rmul__ = _product
+    __neg__ = __pos__ = _same
+    __rtruediv__ = __rpow__ = sin = cos = tan = exp = sqrt = log = tanh = kepler = _curved
 
 
 @final
@@ -270,33 +100,34 @@ class Parts:
             for low, high, middle in every
         ]
 
-    def coefficients(
-        self, entry: object, time: object, most: int = MOST_FACTORS, middle: Sequence[Any] | None = None
-    ) -> tuple[dict[tuple[int, ...], np.ndarray], np.ndarray]:
-        """A matrix at a time as a power series in the shares up to so many factors, by their numbers, the constant one
-        first, about the `middle` or any other number; and of which entries it is not all."""
-        nothing: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
-        p = np.empty(1 + len(self.middle), dtype=object)
-        p[0] = Sum({FREE: time}, most)
-        for j, (value, scale) in enumerate(zip(middle or self.middle, self.scales, strict=True)):
-            p[1 + j] = Sum({FREE: nothing + value, **({(j,): nothing + scale} if scale else {})}, most)
-        with np.errstate(all="ignore"):
-            whole = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
-        found, bent = {FREE: np.zeros(whole.shape, dtype=object)}, np.zeros(whole.shape, dtype=bool)
+    def depends(self, entry: object) -> tuple[np.ndarray, np.ndarray]:
+        """Which entries of a matrix may be other numbers than 0, ``(rows, columns)``, and which every parameter has a
+        part in, ``(nu, rows, columns)``, at any time; raises `Unchecked` where one is no affine function of them."""
+        movable = [frozenset([j]) if scale else frozenset[int]() for j, scale in enumerate(self.scales)]
+        whole = _called(entry, [Affine(), *map(Affine, movable)])
+        there, moves = np.zeros(whole.shape, dtype=bool), np.zeros((len(movable), *whole.shape), dtype=bool)
         for place, value in np.ndenumerate(whole):
-            one = value if isinstance(value, Sum) else Sum({FREE: value}, most)
-            bent[place] = one.bent
-            for key, part in one.parts.items():
-                found.setdefault(key, np.zeros(whole.shape, dtype=object))[place] = part
-        return found, bent
+            there[place] = isinstance(value, Affine) or float(value) != 0.0
+            if isinstance(value, Affine):
+                if value.bent:
+                    raise Unchecked(NO_PLANE)
+                moves[(list(value.parameters), *place)] = True
+        return there, moves
 
     def tables(self, entry: object, time: object) -> list[np.ndarray]:
-        """``f_0, f_1, ..., f_nu`` of a matrix at a time; raises `Unchecked` where it is no such sum."""
-        parts, bent = self.coefficients(entry, time)
-        if bent.any() or any(len(key) > 1 and any(map(_may_be, table.ravel())) for key, table in parts.items()):
-            raise Unchecked("the checker knows parameters beside the time that the state depends on affinely")
-        none = np.zeros(parts[FREE].shape, dtype=object)
-        return [parts[FREE], *(parts.get((j,), none) for j in range(len(self.middle)))]
+        """``f_0, f_1, ..., f_nu`` of a matrix at a time: what it is in the middle, and by how much more where one
+        parameter deviates by its `scales`."""
+        nothing: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
+        middle, moves = [nothing + value for value in self.middle], self.depends(entry)[1]
+        found = [_called(entry, [time, *middle])]
+        for j, (scale, mine) in enumerate(zip(self.scales, moves, strict=True)):
+            added = np.zeros(mine.shape, dtype=object)
+            if mine.any():
+                far = _called(entry, [time, *middle[:j], middle[j] + scale, *middle[j + 1 :]])
+                for place in zip(*np.nonzero(mine), strict=True):
+                    added[place] = far[place] - found[0][place]
+            found.append(added)
+        return found
 
     @cached_property
     def is_affine(self) -> bool:
@@ -317,19 +148,17 @@ class Parts:
                 entry = phase.entry(name)
                 if entry is None:
                     continue
-                first, *others = (
-                    [[_may_be(v) for v in row] for row in part] for part in self.tables(entry, Something())
-                )
+                there, others = self.depends(entry)
                 if name == "A":
-                    steady |= np.array(first)
-                    own |= np.array(others)
-                driven |= np.array(others).any(axis=2)
+                    steady |= there
+                    own |= others
+                driven |= others.any(axis=2)
         onward = np.minimum(np.eye(d) + steady, 1.0)
         for _ in range(d.bit_length()):  # where a state may go in 1, 2, 4, ... steps
             onward = np.minimum(onward @ onward, 1.0)
         found = [np.flatnonzero(onward @ start > 0.0).tolist() for start in driven.astype(float)]
         if any(own[:, :, places].any() for places in found):
-            raise Unchecked("the checker knows parameters beside the time that the state depends on affinely")
+            raise Unchecked(NO_PLANE)
         return found
 
     @property
@@ -423,8 +252,12 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     )
 
 
-def _may_be(value: object) -> bool:
-    return isinstance(value, Something) or float(value) != 0.0  # type: ignore[arg-type]  # a number then
+def _called(entry: object, arguments: list[Any]) -> np.ndarray:
+    """A matrix at the time and the parameters, numbers of any kind."""
+    p = np.empty(len(arguments), dtype=object)
+    p[:] = arguments
+    with np.errstate(all="ignore"):
+        return np.asarray(entry(p) if callable(entry) else entry, dtype=object)
 
 
 def _above(exact: Fraction) -> float:

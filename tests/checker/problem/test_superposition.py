@@ -144,6 +144,11 @@ def test_rows_are_those_of_every_corner_and_what_begins_is_certain_of_the_new_co
         "1 + p * q",
         "p - sin(q)",
         "cos(p * q)",
+        "p ^ t",
+        "sqrt(t + p)",
+        "0 * p * q",
+        "(p - p) * q",
+        "1 - t * (2 + t * sin(p))",
     ],
 )
 def test_entries_that_are_not_affine_are_refused(entry: str) -> None:
@@ -206,6 +211,8 @@ def test_all_that_is_downstream_of_an_entry_with_a_parameter_depends_on_it(name:
         ("sqrt(t) + 2 ^ t * p", np.sqrt(1.5), 2**1.5),
         ("t ^ 3 - (1 - p)", 1.5**3 - 1, 1.0),
         ("+kepler(t, 0)", 1.5, 0.0),
+        ("p ^ 1 * 3 - p ^ 0", -1.0, 3.0),
+        ("(p + r) / t + r ^ 3 * t ^ 2 - exp(r)", 2.0 / 1.5 + 8.0 * 2.25 - np.exp(2.0), 1 / 1.5),
     ],
 )
 def test_entries_are_split_into_what_is_steady_and_what_a_parameter_multiplies(
