@@ -16,7 +16,7 @@ from sparserob_core.checker.claims import case, cells, constraints
 from sparserob_core.checker.claims.answers import _chords, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost import effort
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.problem.lasting import Lasting, on_one_grid
@@ -143,12 +143,12 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "the numbers of the system are not exact",
     ),
     "a time before the system begins": (
-        lambda: Flow(Plant.of(ROOT, 1.0), 1.0).step(-0.5, 0.0),
+        lambda: VerifiedFlow(Plant.of(ROOT, 1.0), 1.0).step(-0.5, 0.0),
         Unchecked,
         "not known from -0.5 to 0",
     ),
     "from one polynomial to the next": (
-        lambda: Flow(Plant.of(ROOT, 1.0), 1.0).step(0.0, 1.0),
+        lambda: VerifiedFlow(Plant.of(ROOT, 1.0), 1.0).step(0.0, 1.0),
         Unchecked,
         "no polynomial from 0.0 to 1.0",
     ),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.duality import Row
+from sparserob_core.checker.claims.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.curved import NormBall
@@ -27,7 +27,7 @@ ROUNDED = 1e-12  # of the terms of which a value of the control is a sum: that m
 EQUAL = 1e-12  # counts that differ by no more are equal
 NEARLY = 1e-6  # of one count, by which a whole number of them may be missed
 
-Rows = list[tuple[float, Row]]
+Rows = list[tuple[float, ConstraintRow]]
 
 
 def acted(case: Case) -> float:

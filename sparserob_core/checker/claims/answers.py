@@ -16,12 +16,12 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls, below, rational
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers
-from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
+from sparserob_core.checker.claims.duality import EFFORT, ConstraintRow, before, steps
 from sparserob_core.checker.cost.effort import at_most
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly
 from sparserob_core.checker.reach.measurable import MeasurableLoop
-from sparserob_core.checker.reach.preimages import Pushed, Seen
+from sparserob_core.checker.reach.preimages import Pushed, SeenDeviations
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import NEAR, along
 from sparserob_core.control.problem.system import SwitchedSystem
@@ -35,7 +35,7 @@ PEAK, WORST = "peak", "worst"
 
 
 @final
-class Answers:
+class VerifiedFeedback:
     """The answers of the control of a case, from its ``gains (K, K, m, p)``."""
 
     def __init__(self, case: Case) -> None:
@@ -82,11 +82,11 @@ class Answers:
         return found
 
     @cached_property
-    def loop(self) -> ClosedLoop:
+    def loop(self) -> VerifiedLoop:
         """The system under the nominal control and the gains."""
         return self._loop(self.case.pieces, self.gains)
 
-    def _loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> ClosedLoop:
+    def _loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> VerifiedLoop:
         """The loop; where ``changes`` are given, under disturbances that jump there only."""
         case = self.case
         system = case.problem.system
@@ -99,7 +99,7 @@ class Answers:
         held, measured = (changes if case.measurable else case.changes) or [], case.problem.measurements
         if measured is not None and case.measurable:
             raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
-        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(
+        return (MeasurableLoop if case.measurable and changes is None else VerifiedLoop)(
             system,
             [float(v) for v in np.asarray(case.problem.initial_state)],
             nominal,
@@ -211,7 +211,7 @@ class Answers:
         ]
         at_most(a, A, loop.support, np.array(reach), limit, case.clock)
 
-    def least(self, rows: Sequence[tuple[float, Row]], priced: bool) -> arb:
+    def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
         """At most what gains, and peaks or an effort that are charged, add to the sum of ``rows`` times their
         multipliers; 0 where nothing is answered.
 
@@ -233,7 +233,7 @@ class Answers:
             total = total + (left * most).min(arb(0))
         return total - self._of_gains(rows)
 
-    def _of_gains(self, rows: Sequence[tuple[float, Row]]) -> arb:
+    def _of_gains(self, rows: Sequence[tuple[float, ConstraintRow]]) -> arb:
         """How much the gains can lower the sum of rows times their multipliers, at most."""
         from flint import arb
 
@@ -263,7 +263,7 @@ class Answers:
                 total = total + width[i] * _largest(sizes)
         return total
 
-    def _clusters(self, loop: ClosedLoop, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
+    def _clusters(self, loop: VerifiedLoop, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
         """The breakpoints that the control on a piece answers, those that see a block in common together; for each what
         gives, from a combination of the states seen there, a combination of the blocks, ``(q, J d)``."""
         groups: list[tuple[list[int], set[int]]] = []
@@ -280,7 +280,7 @@ class Answers:
             groups = [*rest, mine]
         return [(sorted(members), *self._inverse(loop, tuple(sorted(members)))) for members, _ in groups]
 
-    def _inverse(self, loop: ClosedLoop, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
+    def _inverse(self, loop: VerifiedLoop, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
         """What gives, of any combination of the states seen at these breakpoints, one of the blocks that is seen so."""
         if members not in self._inverses:
             blocks = sorted({block for j in members for block in loop.seen[j] if self._segments[block]})
@@ -303,14 +303,14 @@ class Answers:
             ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
             columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
             reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
-            self._inverses[members] = Seen(stacked(table), pattern, rows, columns, reach).inverse(), blocks
+            self._inverses[members] = SeenDeviations(stacked(table), pattern, rows, columns, reach).inverse(), blocks
         return self._inverses[members]
 
     def _none_of(self, block: int) -> list[arb]:
         """Nothing of any of the segments of a block."""
         return [balls([0.0])[0]] * len(self._segments[block])
 
-    def _pushed(self, loop: ClosedLoop, block: int) -> Pushed:
+    def _pushed(self, loop: VerifiedLoop, block: int) -> Pushed:
         """Who can see the deviations of a block; of the initial state everyone sees its own."""
         vectors = [vector for vector, _ in self._segments[block]]
         if loop.measured is not None:  # outputs see what the observer makes of everything: as many as there are
@@ -335,7 +335,7 @@ class Answers:
         return [found[id(shape)] for shape, _ in loop.sets]
 
     @cached_property
-    def loop_at_rest(self) -> ClosedLoop:
+    def loop_at_rest(self) -> VerifiedLoop:
         """The same system without any control; of measurable disturbances under some of them, that jump often enough to
         push the state wherever any do."""
         case = self.case
@@ -345,7 +345,7 @@ class Answers:
         ends = zip(case.grid[:-1], case.grid[1:], strict=True)
         return self._resting([float(t) for a, b in ends for t in a + parts * (b - a)])
 
-    def _resting(self, changes: list[float] | None) -> ClosedLoop:
+    def _resting(self, changes: list[float] | None) -> VerifiedLoop:
         return self._loop(self._still, self._none, changes)
 
     @property
@@ -354,7 +354,7 @@ class Answers:
         none = stacked([balls([0.0])] * self.case.problem.system.controls)
         return [none] * self.case.control.pieces
 
-    def named(self, entry: Mapping[str, Any], name: str) -> Named:
+    def named(self, entry: Mapping[str, Any], name: str) -> NamedDeviations:
         """The deviations that an entry of a certificate names, under measurable disturbances of one that jumps where it
         says."""
         loop = self.loop_at_rest
@@ -365,16 +365,16 @@ class Answers:
             if changes[-1] >= self.case.grid[-1]:
                 raise Broken(f"{name}: the disturbance changes at {float(changes[-1]):.6g}, after the end")
             loop = self._resting([float(t) for t in changes])
-        return Named(self.case, loop, _deviations(self.case, loop, entry, name))
+        return NamedDeviations(self.case, loop, _deviations(self.case, loop, entry, name))
 
-    def following(self, named: Named, entry: Mapping[str, Any], name: str) -> Named:
+    def following(self, named: NamedDeviations, entry: Mapping[str, Any], name: str) -> NamedDeviations:
         """The deviations across the seam of a plan that repeats: no disturbance yet, and the initial state of the next
         period that an entry names, which must be in its set; none where there is one initial state."""
         from flint import arb
 
         calm = named.loop.rests[: named.loop.begun]
         if self.case.problem.initial_set is None:
-            return Named(self.case, named.loop, calm)
+            return NamedDeviations(self.case, named.loop, calm)
         point = numbers(entry.get("following"), f"{name}: following")
         held = known(self.case.problem.initial_set)
         found = held.member(point) if point.shape == (self.case.problem.system.states,) else None
@@ -382,7 +382,7 @@ class Answers:
             raise Broken(f"{name}: the next deviation {point.tolist()} is not shown to be in its set")
         about = self.loop_at_rest.sets[-1][1]
         begun = [v - arb(float(c)) for v, c in zip(found, about, strict=True)]
-        return Named(self.case, named.loop, [*calm, begun])
+        return NamedDeviations(self.case, named.loop, [*calm, begun])
 
     @cached_property
     def _inverses(self) -> dict[tuple[int, ...], tuple[arb_mat, list[int]]]:
@@ -397,18 +397,18 @@ def commanded(case: Case, name: str) -> ConvexSet | None:
 
 
 @lru_cache(maxsize=2)
-def answers_of(case: Case) -> Answers:
+def answers_of(case: Case) -> VerifiedFeedback:
     """What the control of a case answers, made once."""
-    return Answers(case)
+    return VerifiedFeedback(case)
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Named:
+class NamedDeviations:
     """Deviations ``z`` from their middles, block by block, under which the system of ``loop`` is at rest."""
 
     case: Case
-    loop: ClosedLoop
+    loop: VerifiedLoop
     z: list[list[arb]]
 
     def of(self, rows: Sequence[list[arb]]) -> list[arb]:
@@ -455,7 +455,7 @@ class Named:
         )
 
 
-def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
+def _deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
     """The deviations, block by block, of the ``disturbance (mw, blocks)``, of the ``noise (K, p)`` and of the initial
     state, ``deviation (d,)`` from its centre, that an entry names, which must be in their sets."""
     from flint import arb

@@ -14,25 +14,25 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.claims.duality import Duality, Row, before
-from sparserob_core.checker.claims.units import RowUnits
-from sparserob_core.checker.claims.window import Beside, Window
+from sparserob_core.checker.claims.duality import ConstraintRow, Duality, before
+from sparserob_core.checker.claims.units import WindowUnits
+from sparserob_core.checker.claims.window import Beside, ConstraintWindow
 from sparserob_core.checker.cost.price import Price
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.flows import Flows
-from sparserob_core.checker.flow.law import Box as ParameterBox
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.flows import VerifiedFlows
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
-from sparserob_core.checker.problem.integrals import Running, integrating, spelt
+from sparserob_core.checker.problem.integrals import RunningIntegrals, integrating, spelt
 from sparserob_core.checker.problem.lasting import Lasting, on_one_grid
 from sparserob_core.checker.problem.superposition import parted
 from sparserob_core.checker.problem.turns import in_turns
-from sparserob_core.checker.reach.adjoint import Adjoint, Motion
+from sparserob_core.checker.reach.adjoint import AdjointFlow, AdjointRow
 from sparserob_core.checker.reach.closed_loop import middle
-from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.kernels import Missed, MissedHere
+from sparserob_core.checker.reach.execution import FollowedExecution
+from sparserob_core.checker.reach.kernels import BoundedInput, BoundedInputHere
 from sparserob_core.checker.reach.measurable import Side, Together
-from sparserob_core.checker.reach.missed import MissedAt, MissedOver
+from sparserob_core.checker.reach.missed import BoundedInputAt, BoundedInputOver
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.sets.known import known
@@ -125,13 +125,13 @@ class Case:
         return "nominal" if self.policy is None else self.policy.charge.cost
 
     @cached_property
-    def windows(self) -> list[Window]:
+    def windows(self) -> list[ConstraintWindow]:
         """The state constraints, under the names that the certificate uses."""
         path = [entry for entry in self.problem.windows if not isinstance(entry, Return)]
         d, own = self.problem.system.states, sum(not isinstance(entry, Accumulated) for entry in path)
         ends = self.problem.terminal_sets
         found = [
-            Window(
+            ConstraintWindow(
                 entry.name or (f"path[{i}]" if own > 1 else "path"),
                 entry.set,
                 entry.start,
@@ -143,7 +143,7 @@ class Case:
         ]
         found += self.returned
         return found + [
-            Window(
+            ConstraintWindow(
                 f"terminal[{i}]" if len(ends) > 1 else "terminal", end, self.problem.horizon, self.problem.horizon, d
             )
             for i, end in enumerate(ends)
@@ -168,11 +168,11 @@ class Case:
         return replace(problem, path=[*path, back])
 
     @cached_property
-    def returned(self) -> list[Window]:
+    def returned(self) -> list[ConstraintWindow]:
         """Of a plan that repeats, that every final state is one of the initial states, where there is more than one of
         a coordinate; for every corner of parameters beside the time where these states are in a curved set."""
         return [
-            Window(
+            ConstraintWindow(
                 entry.name or RETURN,
                 entry.set,
                 entry.start,
@@ -199,7 +199,7 @@ class Case:
         """The states that are fixed at the end, and at what."""
         return [(int(i), float(end.values[i])) for end in self.problem.terminal_equalities for i in end.fixed]
 
-    def window(self, name: str) -> Window:
+    def window(self, name: str) -> ConstraintWindow:
         """The constraint of that name."""
         found = [window for window in self.windows if window.name == name]
         if not found:
@@ -276,9 +276,9 @@ class Case:
         return min(bisect_right(self.grid, time) - 1, len(self.grid) - 2)
 
     @cached_property
-    def flows(self) -> Flows:
+    def flows(self) -> VerifiedFlows:
         """The flows of the system, over boxes of its parameters and at single ones."""
-        return Flows.of(self.problem.system, self.until)
+        return VerifiedFlows.of(self.problem.system, self.until)
 
     @cached_property
     def marks(self) -> list[float]:
@@ -295,7 +295,7 @@ class Case:
         return self._states[flow]
 
     @cached_property
-    def _states(self) -> dict[Flow, States]:
+    def _states(self) -> dict[VerifiedFlow, States]:
         return {}
 
     @property
@@ -370,7 +370,7 @@ class Case:
         )
 
     def beside(
-        self, window: Window, basis: Array, gains: Array, parameter: Sequence[float] | None = None
+        self, window: ConstraintWindow, basis: Array, gains: Array, parameter: Sequence[float] | None = None
     ) -> Beside | None:
         """What stands beside the state in the rows of a constraint, at one parameter where it is given; ``None``:
         nothing."""
@@ -410,7 +410,7 @@ class Case:
         return bound.parts
 
     @cached_property
-    def strayed(self) -> Missed | None:
+    def strayed(self) -> BoundedInput | None:
         """What measurable disturbances do beside the middle of their box, where nothing answers them: a command
         of 1 through the columns of ``E`` that is missed by half the widths; of a polytope all of it at once, counted
         from its middle. ``None`` where there are none."""
@@ -430,18 +430,18 @@ class Case:
         off = np.nextafter(np.maximum(most - half, half - least), np.inf)
         return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off)
 
-    def _missing(self, *errors: Any, **more: Any) -> Missed:
+    def _missing(self, *errors: Any, **more: Any) -> BoundedInput:
         """What is missed at every parameter of the system."""
         if self.flows.box.middle:
-            return MissedOver(self.flows, *errors, **more)
-        return MissedAt(self.flows.at(()), *errors, **more)
+            return BoundedInputOver(self.flows, *errors, **more)
+        return BoundedInputAt(self.flows.at(()), *errors, **more)
 
-    def strayed_at(self, parameter: Sequence[float]) -> MissedHere | None:
+    def strayed_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
         """`strayed` at one parameter."""
         return None if self.strayed is None else self.strayed.at(parameter)
 
     @cached_property
-    def execution(self) -> Missed | None:
+    def execution(self) -> BoundedInput | None:
         """How exactly the control is delivered, ``None`` where that is as it is commanded; of no control where the
         certificate has none."""
         shares = self.problem.execution
@@ -452,7 +452,7 @@ class Case:
             raise Unchecked("the checker knows errors of execution without feedback")
         pieces = [] if self.certificate.get("decision") is None else self.pieces
         if self.still is not None:
-            return Execution(self.problem, shares, self.control.breakpoints, pieces, self.clock)
+            return FollowedExecution(self.problem, shares, self.control.breakpoints, pieces, self.clock)
         acts = self.control.breakpoints
         if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
             begins = acts[:-1] + system.delay
@@ -460,7 +460,7 @@ class Case:
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][: acts.size - 1 if pieces else 0]
         return self._missing(shares, acts, pieces, numb=self.problem.commanded)
 
-    def delivered_at(self, parameter: Sequence[float]) -> MissedHere | None:
+    def delivered_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
         """`execution` at one parameter."""
         return None if self.execution is None else self.execution.at(parameter)
 
@@ -490,10 +490,10 @@ class Case:
             return ""
         return unit_of_row(direction, self.problem.names, 0 if name in held else self.problem.system.states)
 
-    def units(self, window: Window) -> RowUnits:
+    def units(self, window: ConstraintWindow) -> WindowUnits:
         """What violations of a constraint are judged by."""
         if window not in self._units:
-            self._units[window] = RowUnits(
+            self._units[window] = WindowUnits(
                 self.problem,
                 self.flows,
                 self.scene,
@@ -538,7 +538,7 @@ class Case:
         return np.asarray(np.abs(self.control.control(self.theta)).max(axis=1))
 
     @cached_property
-    def _units(self) -> dict[Window, RowUnits]:
+    def _units(self) -> dict[ConstraintWindow, WindowUnits]:
         return {}
 
     @cached_property
@@ -546,12 +546,12 @@ class Case:
         return Price(self.problem, self.control, self.flows.at(self.nominal_parameter), self.clock)
 
     @cached_property
-    def running(self) -> Running | None:
+    def running(self) -> RunningIntegrals | None:
         """What is integrated, where nothing else changes with time."""
         system = self.problem.system
         if not isinstance(system, SwitchedSystem):
             return None
-        found, d = Running.of(spelt(self.stated)), self.stated.system.states
+        found, d = RunningIntegrals.of(spelt(self.stated)), self.stated.system.states
         return found if found is not None and all(found.is_beside(mode, d) for mode in system.modes) else None
 
     @property
@@ -562,22 +562,22 @@ class Case:
         return self.problem.system if isinstance(self.problem.system, LinearSystem) else None
 
     @cached_property
-    def motion(self) -> Motion:
+    def motion(self) -> AdjointFlow:
         """What rows of a known system have in common, the inputs of the control before those of the disturbance."""
         assert self.still is not None
         (parts,) = modes_at(self.still, [])
         A, B, E = (parts[name] for name in ("A", "B", "E"))
         if self.problem.disturbance is not None:
             B = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)])
-        return Motion.of(A, B, self.grid[-1], self.clock)
+        return AdjointFlow.of(A, B, self.grid[-1], self.clock)
 
     @cached_property
-    def adjoints(self) -> dict[bytes, Adjoint]:
+    def adjoints(self) -> dict[bytes, AdjointRow]:
         """Rows that were followed before."""
         return {}
 
     @cached_property
-    def rows(self) -> dict[tuple[object, ...], Row]:
+    def rows(self) -> dict[tuple[object, ...], ConstraintRow]:
         """Constraints that were derived before."""
         return {}
 

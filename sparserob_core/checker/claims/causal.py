@@ -21,7 +21,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
-from sparserob_core.checker.claims.duality import Row
+from sparserob_core.checker.claims.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import arb_of, middle
 from sparserob_core.checker.sets.known import known
@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 MOST = 100_000  # multipliers
 PEAK, WORST = "peak", "worst"
-Pushed: TypeAlias = "tuple[Row, list[list[arb]], list[arb]]"  # a row, what disturbance and initial state give to it
+Pushed: TypeAlias = (
+    "tuple[ConstraintRow, list[list[arb]], list[arb]]"  # a row, what disturbance and initial state give to it
+)
 Rows: TypeAlias = dict[tuple[str, float, bytes], Pushed]
 SHARE = 1.0 - 2.0**-40  # of a price, that is shared: so that rounding does not share more than there is
 

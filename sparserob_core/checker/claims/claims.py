@@ -15,10 +15,10 @@ from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case, listed, number, numbers, written_policy
 from sparserob_core.checker.claims.cells import Work, prove
 from sparserob_core.checker.claims.constraints import bounded, equalities
-from sparserob_core.checker.claims.duality import Row, steps
+from sparserob_core.checker.claims.duality import ConstraintRow, steps
 from sparserob_core.checker.claims.multipliers import multiplied, weighted
 from sparserob_core.checker.claims.replay import excused, witnessed
-from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.loop_tube import Still
@@ -241,7 +241,7 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
     return f"{back}, so that all constraints hold in every period"
 
 
-def _strictly(case: Case, window: Window) -> None:
+def _strictly(case: Case, window: ConstraintWindow) -> None:
     """That what the proof of the return allows is still in the set of initial states."""
     from flint import arb
 
@@ -413,7 +413,7 @@ def _tree(case: Case) -> float:
         raise Unchecked("the control has fewer functions than pieces, which is not followed")
     known = listed(data, "constraints")
 
-    def of_leaf(leaf: Mapping[str, Any]) -> list[tuple[float, Row]]:
+    def of_leaf(leaf: Mapping[str, Any]) -> list[tuple[float, ConstraintRow]]:
         constraints = []
         for pair in listed(leaf, "multipliers"):
             if not (isinstance(pair, list) and len(pair) == 2 and type(pair[0]) is int and 0 <= pair[0] < len(known)):

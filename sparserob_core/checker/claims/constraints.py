@@ -18,16 +18,16 @@ from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.claims.answers import answers_of
 from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.cells import Interval, Proven, Reached, Work, prove
-from sparserob_core.checker.claims.units import RowUnits
-from sparserob_core.checker.claims.window import Window
-from sparserob_core.checker.flow.law import Box as ParameterBox
+from sparserob_core.checker.claims.units import WindowUnits
+from sparserob_core.checker.claims.window import ConstraintWindow
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.adjoint import Adjoint, Stopped, Worst
-from sparserob_core.checker.reach.execution import Execution
+from sparserob_core.checker.reach.adjoint import AdjointRow, Stopped, Worst
+from sparserob_core.checker.reach.execution import FollowedExecution
 from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.tube import Rows, Tube
+from sparserob_core.checker.reach.tube import ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, Enclosed
@@ -54,7 +54,7 @@ HALVINGS = 16  # rounds of cuts: cells are then rounding
 WIDER = 1e-12  # by which the boxes of a parameter set that is none are widened, relative to the whole
 
 
-def bounded(case: Case, window: Window) -> str:
+def bounded(case: Case, window: ConstraintWindow) -> str:
     """Show that a constraint is kept at every time, disturbance and parameter; a sentence with the figures."""
     data = case.certificate.get("proof", {})
     entry = data.get(window.name) if isinstance(data, Mapping) else None
@@ -87,7 +87,7 @@ def bounded(case: Case, window: Window) -> str:
     return f"kept to {found.bound:.1e}{_unit(case, window)}{_excused(case, window, normals)} ({size})"
 
 
-def _excused(case: Case, window: Window, normals: Array) -> str:
+def _excused(case: Case, window: ConstraintWindow, normals: Array) -> str:
     """In words, the largest violation that counts as none; of a curved set the largest along its normals."""
     if window.seen.facets is None:
         curved = Curved(window.seen, normals, case.units(window).least)
@@ -96,7 +96,7 @@ def _excused(case: Case, window: Window, normals: Array) -> str:
     return f", where {TOLERANCE * float(case.units(window).rows.max(initial=0.0)):.1e}{_unit(case, window)} is excused"
 
 
-def is_followed(case: Case, window: Window) -> bool:
+def is_followed(case: Case, window: ConstraintWindow) -> bool:
     """Whether a constraint is proven along the adjoints of its rows, on cells of the checker's own."""
     return follows(case) and window.seen.facets is not None
 
@@ -111,7 +111,7 @@ def follows(case: Case) -> bool:
     return known_system and (case.measurable or system.states >= FOLLOWED)
 
 
-def _along_rows(case: Case, window: Window) -> Proven:
+def _along_rows(case: Case, window: ConstraintWindow) -> Proven:
     """Show that no row of a flat set is exceeded by more than what counts as none, along their adjoints."""
     flat, units = window.seen.facets, case.units(window).rows.tolist()
     assert flat is not None
@@ -147,7 +147,7 @@ def followed(case: Case, c: Array, driven: bool = True) -> Worst:
     )
 
 
-def _adjoint(case: Case, c: Array) -> Adjoint | Stopped:
+def _adjoint(case: Case, c: Array) -> AdjointRow | Stopped:
     """That of a row ``c (d,)``, of what is integrated in a window as of two that stop."""
     if case.running is not None:
         parts = case.running.parts(c)
@@ -160,15 +160,15 @@ def _adjoint(case: Case, c: Array) -> Adjoint | Stopped:
     return _kept(case, c)
 
 
-def _kept(case: Case, c: Array) -> Adjoint:
+def _kept(case: Case, c: Array) -> AdjointRow:
     made, c = case.adjoints, c + 0.0  # no -0, of which the bytes of an opposite row would be others
     if c.tobytes() not in made:
         opposite = made.get((0.0 - c).tobytes())
-        made[c.tobytes()] = Adjoint.of(case.motion, c) if opposite is None else opposite.reversed()
+        made[c.tobytes()] = AdjointRow.of(case.motion, c) if opposite is None else opposite.reversed()
     return made[c.tobytes()]
 
 
-def along(case: Case, window: Window, direction: Array, worst: Worst, limit: float) -> tuple[int, float]:
+def along(case: Case, window: ConstraintWindow, direction: Array, worst: Worst, limit: float) -> tuple[int, float]:
     """Show that a row is nowhere in its window above ``limit``; the number of cells that this took, and what it is at
     most."""
     breaks = case.control.breakpoints.tolist()
@@ -193,7 +193,7 @@ def along(case: Case, window: Window, direction: Array, worst: Worst, limit: flo
     raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
 
 
-def beside(case: Case, window: Window, direction: Array, time: float, inside: float) -> tuple[float, float]:
+def beside(case: Case, window: ConstraintWindow, direction: Array, time: float, inside: float) -> tuple[float, float]:
     """What stands beside the state in the row at a time, with the control of the piece that holds ``inside``, between
     bounds."""
     state, gains = window.split(direction)
@@ -207,7 +207,7 @@ def beside(case: Case, window: Window, direction: Array, time: float, inside: fl
     return below(total), above(total)
 
 
-def _added(case: Case, window: Window, direction: Array, start: Array, stop: Array) -> Array:
+def _added(case: Case, window: ConstraintWindow, direction: Array, start: Array, stop: Array) -> Array:
     """What stands beside the state at both ends of cells, and what errors of execution add there, ``(2, k)``, at most;
     with how far these may be above their chord."""
     found, delivered = np.zeros((2, start.size)), _delivered(case)
@@ -222,10 +222,10 @@ def _added(case: Case, window: Window, direction: Array, start: Array, stop: Arr
     return found
 
 
-def _delivered(case: Case) -> Execution | None:
+def _delivered(case: Case) -> FollowedExecution | None:
     """How exactly the control is delivered, of a system whose rows are followed."""
     found = case.execution
-    assert found is None or isinstance(found, Execution)  # they are followed by age there
+    assert found is None or isinstance(found, FollowedExecution)  # they are followed by age there
     return found
 
 
@@ -237,7 +237,7 @@ def erring_at(case: Case, c: Array, times: Array) -> tuple[Array, Array]:
 
 
 def _refute(
-    case: Case, window: Window, direction: Array, worst: Worst, start: Array, stop: Array, limit: float
+    case: Case, window: ConstraintWindow, direction: Array, worst: Worst, start: Array, stop: Array, limit: float
 ) -> None:
     """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell, with sets whose support
     functions are sharp."""
@@ -266,14 +266,14 @@ def _parts(start: Array, stop: Array) -> tuple[Array, Array]:
     return ends[:, :-1].ravel(), ends[:, 1:].ravel()
 
 
-def _unit(case: Case, window: Window) -> str:
+def _unit(case: Case, window: ConstraintWindow) -> str:
     """The units of the rows of a window; of a curved set, whose excess is in multiples of its gauge, none."""
     sides = window.shape.halfspaces()
     rows = () if sides is None else sides[0]
     return joined(unit_of_row(row, case.problem.names, window.states).strip() for row in rows)
 
 
-def normals_of(window: Window, data: object) -> Array:
+def normals_of(window: ConstraintWindow, data: object) -> Array:
     """The coordinates of a curved set's directions, ``(b, d)``: they must be able to name every direction in which it
     is bounded. Those of the state where the certificate has none."""
     shape, b, d = window.seen, window.seen.spanned, window.shape.dimension
@@ -295,7 +295,7 @@ def parameters_of(case: Case) -> Parameters:
     return Parameters(None if bound is None else known(bound))
 
 
-def covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
+def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> None:
     """The cells must fill the times and parameters, and for a curved set every face of the cube of directions too."""
     nu = case.problem.system.parameter_count
     b = 0 if window.seen.facets is not None else window.seen.spanned
@@ -314,7 +314,7 @@ def covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
             fill(lower[mine], upper[mine], *ends, case.clock)
 
 
-def _extent(case: Case, window: Window, lower: Array, upper: Array) -> tuple[Array, Array]:
+def _extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> tuple[Array, Array]:
     nu, bound = case.problem.system.parameter_count, case.problem.system.parameters
     if bound is None:
         return np.array([window.start]), np.array([window.stop])
@@ -332,7 +332,9 @@ def _extent(case: Case, window: Window, lower: Array, upper: Array) -> tuple[Arr
     return np.append(window.start, low), np.append(window.stop, high)
 
 
-def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array) -> tuple[Array, Array, list[Work]]:
+def _work(
+    case: Case, window: ConstraintWindow, normals: Array, lower: Array, upper: Array
+) -> tuple[Array, Array, list[Work]]:
     """What directions are combinations of, ``(b, d)``, with their parts on the control, ``(b, m)``, and the cells,
     those with the same parameters and directions together, their times cut wherever anything turns or jumps."""
     nu, units = case.problem.system.parameter_count, case.units(window)
@@ -352,7 +354,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
 
 
 def divided(
-    case: Case, window: Window, box: Corners, times: Sequence[tuple[float, float]]
+    case: Case, window: ConstraintWindow, box: Corners, times: Sequence[tuple[float, float]]
 ) -> list[tuple[Corners, list[Interval]]]:
     """A box of parameters in the parts over which the state is followed, and for each the ``times``, cut wherever
     anything turns or jumps."""
@@ -362,7 +364,7 @@ def divided(
     return [(box, [one for several in parts for one in several])]
 
 
-def _facets(window: Window, units: RowUnits) -> tuple[Array, Array, Sides | None]:
+def _facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array, Sides | None]:
     """The normals of a flat set's facets up to the sign, on the state and on the control, and its rows; no rows for a
     curved one."""
     found, flat = window.seen.basis, window.seen.facets
@@ -391,15 +393,15 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
     nu = case.problem.system.parameter_count
     widened = nu and not parameters_of(case).is_box
     extra = WIDER * (upper[:, 1 : 1 + nu].max(axis=0) - lower[:, 1 : 1 + nu].min(axis=0)) if widened else np.zeros(nu)
-    seen = dict[int, Rows]()
+    seen = dict[int, ProjectedStates]()
 
     @lru_cache(maxsize=TUBES_KEPT)
-    def tube(corners: Corners) -> Tube:
+    def tube(corners: Corners) -> VerifiedTube:
         box = ParameterBox.between(corners[0], corners[1]).wider(extra)
         states = case.states(box)
         if len(seen) >= TUBES_KEPT and id(states) not in seen:
             seen.clear()
-        return Tube(seen.setdefault(id(states), Rows(states, basis)), box)
+        return VerifiedTube(seen.setdefault(id(states), ProjectedStates(states, basis)), box)
 
     return tube
 
@@ -425,7 +427,7 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     initial state and control do, and where deviations are answered also of these, with and without the control."""
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
-    sums = RowUnits(case.problem, case.flows, scene, everything, horizon, horizon).sums
+    sums = WindowUnits(case.problem, case.flows, scene, everything, horizon, horizon).sums
     answers, found = answers_of(case), []
     last = answers.loop.nodes[-1].tolist() if case.answering else _unreached(case, scene)
     for state, value in case.equalities:

@@ -18,7 +18,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.cost.price import Price, Tangent
-from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.problem.lasting import Lasting, summed
 from sparserob_core.checker.sets.flat import Boxed
@@ -36,7 +36,7 @@ EFFORT = "effort"
 
 @final
 @dataclass(frozen=True, eq=False)
-class Row:
+class ConstraintRow:
     """``constant + sum_k slope_k u_k + sizes_k |u_k| <= charged`` for every feasible control; ``slope`` is a list of
     ``m`` balls per piece of the control, ``sizes (K, m)`` are numbers that are not negative, or there are none.
 
@@ -62,7 +62,7 @@ class Duality:
     problem: OptimalControlProblem
     control: Dictionary
     changes: list[float] | None
-    flows: Flows
+    flows: VerifiedFlows
     held: ConvexSet | None = None
     lasting: Lasting | None = None
 
@@ -76,14 +76,14 @@ class Duality:
         place = int(np.searchsorted(self.control.breakpoints, time, side="right")) - 1
         return min(max(place, 0), self.control.pieces - 1)
 
-    def control_row(self, direction: Array, time: float) -> Row:
+    def control_row(self, direction: Array, time: float) -> ConstraintRow:
         """``c'u(t) <= h(c)`` for the set of controls."""
         piece = self.control_piece(time)
         slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
         slope[piece] = [_exact(c) for c in direction]
-        return Row(-known(self.problem.control).limit(direction), slope)
+        return ConstraintRow(-known(self.problem.control).limit(direction), slope)
 
-    def step_row(self, direction: Array, time: float) -> Row:
+    def step_row(self, direction: Array, time: float) -> ConstraintRow:
         """``c'(u_k - u_{k-1}) <= h(c)`` for the step at a breakpoint, ``u_{-1}`` the control before time 0."""
         if self.problem.control_step is None:
             raise Broken("the problem has no constraint 'control_step'")
@@ -101,9 +101,11 @@ class Duality:
             constant -= sum(
                 (_exact(c) * u for c, u in zip(direction, map(_exact, before(self.problem)), strict=True)), _exact(0.0)
             )
-        return Row(constant, slope)
+        return ConstraintRow(constant, slope)
 
-    def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
+    def row(
+        self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True
+    ) -> ConstraintRow:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
         it."""
         m, problem = self.problem.system.controls, self.problem
@@ -131,7 +133,7 @@ class Duality:
         if disturbed and self.held is not None:
             for one in summed(self.lasting, pushes):
                 constant = constant + known(self.held).support(one)
-        return Row(constant, slope)
+        return ConstraintRow(constant, slope)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:
         """What every block of the disturbance gives to ``c'x(t)`` of a known system, ``(mw,)`` each; the blocks begin
@@ -152,7 +154,7 @@ class Duality:
 
     def bound(
         self,
-        rows: Sequence[tuple[float, Row]],
+        rows: Sequence[tuple[float, ConstraintRow]],
         pieces: Sequence[Sequence[float]] | None,
         price: Price | None,
         touched: Sequence[arb_mat] | None = None,
@@ -219,7 +221,7 @@ class Duality:
 
     def summed(
         self,
-        rows: Sequence[tuple[float, Row]],
+        rows: Sequence[tuple[float, ConstraintRow]],
         pieces: Sequence[Sequence[float]] | None,
         tangent: Tangent | None = None,
     ) -> tuple[arb, list[list[arb]]]:
@@ -244,7 +246,7 @@ class Duality:
             constant = constant - slip
         return constant, slopes
 
-    def charged(self, rows: Sequence[tuple[float, Row]], costs: list[list[arb]]) -> list[list[arb]]:
+    def charged(self, rows: Sequence[tuple[float, ConstraintRow]], costs: list[list[arb]]) -> list[list[arb]]:
         """What absolute values cost on every piece, ``m`` balls each, with what ``rows`` times their multipliers say of
         them."""
         found = costs

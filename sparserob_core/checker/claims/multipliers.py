@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.claims.answers import PEAK, WORST, Named, answers_of
+from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, answers_of
 from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
 from sparserob_core.checker.claims.constraints import followed, follows, pushed_by_middle
-from sparserob_core.checker.claims.duality import EFFORT, Row, before
-from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.claims.duality import EFFORT, ConstraintRow, before
+from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
@@ -35,7 +35,7 @@ def multiplied(case: Case, priced: bool) -> arb:
     return case.duality.bound(rows, pieces, price, touched, lengths, norms) + answers_of(case).least(rows, priced)
 
 
-def weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
+def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]], Any]:
     """Multipliers with their constraints, and those of the control's pieces."""
     from flint import arb
 
@@ -91,7 +91,7 @@ def norms_of(case: Case, data: object) -> Array | None:
     return offered
 
 
-def rows_of(case: Case, entry: object) -> list[tuple[float, Row]]:
+def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     """A multiplier with its constraint, which must be one of the problem's; a step across the seam of a plan that
     answers is the sum of two, of the last control and of the first one, which answer what they see of two periods."""
     case.clock.check()
@@ -124,11 +124,13 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, Row]]:
     zero = [[none] * direction.size] * (case.control.pieces - 1)
     return [
         (y, replace(seen, slope=[*zero, balls(-direction)])),
-        (y, Row(none, [balls(direction), *zero], None, begun.innovations)),
+        (y, ConstraintRow(none, [balls(direction), *zero], None, begun.innovations)),
     ]
 
 
-def _of_state(case: Case, entry: Mapping[str, Any], said: tuple[str, Array, float, Array], named: Named | None) -> Row:
+def _of_state(
+    case: Case, entry: Mapping[str, Any], said: tuple[str, Array, float, Array], named: NamedDeviations | None
+) -> ConstraintRow:
     """The constraint on the state, and on the control on a piece of it, that an entry names."""
     name, direction, time, parameter = said
     window = None if name == EQUALS and case.equalities else case.window(name)
@@ -146,8 +148,8 @@ def _of_state(case: Case, entry: Mapping[str, Any], said: tuple[str, Array, floa
 
 
 def _undisturbed(
-    case: Case, window: Window | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
-) -> Row:
+    case: Case, window: ConstraintWindow | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
+) -> ConstraintRow:
     """The same for the worst deviations, or without any where the control answers them."""
     _, direction, time, parameter = said
     c, gain = np.split(direction, [case.problem.system.states])
@@ -167,7 +169,7 @@ def _undisturbed(
     return row
 
 
-def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> Row:
+def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> ConstraintRow:
     """``c'x(t) <= limit`` of a system whose rows are followed, for the worst deviations or without any: no matrix is
     made for a duration, which of hundreds of states takes a minute each."""
     from flint import arb
@@ -186,10 +188,10 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
         constant = constant + known(problem.initial_set).support(state)
     if disturbed and problem.disturbance is not None:
         constant = constant + worst.pushed_by(time)
-    return Row(constant, [every[:m] for every in slope])
+    return ConstraintRow(constant, [every[:m] for every in slope])
 
 
-def _of_control(case: Case, name: str, direction: Array, time: float, named: Named | None) -> Row:
+def _of_control(case: Case, name: str, direction: Array, time: float, named: NamedDeviations | None) -> ConstraintRow:
     """The constraint on the control on one piece, or on its peak."""
     row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
     if named is not None:
@@ -202,7 +204,7 @@ def _of_control(case: Case, name: str, direction: Array, time: float, named: Nam
     return replace(row, constant=case.duality.nothing, charged=(piece, int(np.abs(direction).argmax())))
 
 
-def _of_effort(case: Case, shares: Array, named: Named | None) -> Row:
+def _of_effort(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:
     """The control at deviations, each entry of it times a share of ``[-1, 1]``, is at most the effort."""
     from flint import arb
 
@@ -213,7 +215,7 @@ def _of_effort(case: Case, shares: Array, named: Named | None) -> Row:
         [price * arb(float(shares[i * K + k])) for i, price in enumerate(costs)]
         for k, costs in enumerate(case.price.costs)
     ]
-    return Row(arb(0), slope, None, () if named is None else named.innovations, EFFORT)
+    return ConstraintRow(arb(0), slope, None, () if named is None else named.innovations, EFFORT)
 
 
 def fixed_limit(case: Case, direction: Array, time: float) -> arb:
@@ -227,7 +229,7 @@ def fixed_limit(case: Case, direction: Array, time: float) -> arb:
     return arb(float(direction[states[0]])) * arb(values[states[0]])
 
 
-def piece_of(case: Case, window: Window, entry: Mapping[str, Any], time: float) -> int:
+def piece_of(case: Case, window: ConstraintWindow, entry: Mapping[str, Any], time: float) -> int:
     """The piece of the control that a mixed constraint speaks of."""
     piece = entry.get("piece")
     if type(piece) is not int:
@@ -236,14 +238,14 @@ def piece_of(case: Case, window: Window, entry: Mapping[str, Any], time: float) 
     return piece
 
 
-def admissible(case: Case, window: Window, time: float, parameter: Array) -> None:
+def admissible(case: Case, window: ConstraintWindow, time: float, parameter: Array) -> None:
     """Raise `Broken` unless a constraint asks something at a time, and a parameter is shown to be in its set."""
     asked(case, window, time, parameter)
     if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
         raise Broken(f"{window.name}: the parameter {parameter.tolist()} is not shown to be in its set")
 
 
-def asked(case: Case, window: Window, time: float, parameter: Array) -> None:
+def asked(case: Case, window: ConstraintWindow, time: float, parameter: Array) -> None:
     """Raise `Broken` unless a constraint asks something at a time, and the parameter has as many numbers as there
     are."""
     sized(parameter, case.problem.system.parameter_count, f"{window.name}: parameter")

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.claims.answers import Named, answers_of, commanded
+from sparserob_core.checker.claims.answers import NamedDeviations, answers_of, commanded
 from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
 from sparserob_core.checker.claims.cells import Reached
 from sparserob_core.checker.claims.constraints import beside, erring_at, followed, follows, missed
@@ -20,7 +20,7 @@ from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecke
 from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube
+from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along
 from sparserob_core.sip.convex_set import Array
@@ -28,7 +28,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-    from sparserob_core.checker.claims.window import Window
+    from sparserob_core.checker.claims.window import ConstraintWindow
 
 # Of its row's unit, for every state, by how much the violation that a run tells may be off where rows are followed:
 # sums of so many terms are rounded. Of 348 states, whose modes are conditioned by 5e3, a run rounds 1.6e-9, for which
@@ -132,7 +132,7 @@ def _farthest(
     return total + sum((a * u for a, u in zip(balls(gain), case.pieces[piece].entries(), strict=True)), none)
 
 
-def _along(direction: Array, named: Named | None, rows: Sequence[list[arb]]) -> arb:
+def _along(direction: Array, named: NamedDeviations | None, rows: Sequence[list[arb]]) -> arb:
     """The value of ``c'x`` of what is nominal and has responses, ``(1 + Q,)`` each, under deviations that are named."""
     return along(direction, [row[0] for row in rows] if named is None else named.of(rows))
 
@@ -178,7 +178,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
 
 
 def _along_rows(
-    case: Case, window: Window, time: float, begun: Array | None, pieces: Sequence[tuple[int, int]]
+    case: Case, window: ConstraintWindow, time: float, begun: Array | None, pieces: Sequence[tuple[int, int]]
 ) -> tuple[list[float], float]:
     """By how much the worst disturbance exceeds each row of a flat set at a time, by the adjoints of the rows, and how
     closely that is known."""
@@ -214,7 +214,7 @@ def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains
         return LoopTube(answers_of(case).loop, basis, gains)
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
     flow = case.flows.at(parameter.tolist())
-    return Tube(Rows(States(flow, scene), basis), flow.box)
+    return VerifiedTube(ProjectedStates(States(flow, scene), basis), flow.box)
 
 
 def _begun(case: Case, data: object) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.checker.claims.duality import before
-from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import RESOLVED, THIN, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.sets.known import known
@@ -37,7 +37,7 @@ MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 
 @final
 @dataclass(frozen=True, eq=False)
-class RowUnits:
+class WindowUnits:
     """The units of the constraint ``x(t) - r(t)`` in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in one
     of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``;
     ``acting (m,)``: how far the control of a decision goes; ``flows``: those of the system; ``nominal``: the largest
@@ -53,7 +53,7 @@ class RowUnits:
     """
 
     problem: OptimalControlProblem
-    flows: Flows
+    flows: VerifiedFlows
     scene: Scene
     shape: ConvexSet
     start: float

@@ -13,7 +13,7 @@ from sparserob_core.checker.arithmetic.balls import above
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.kernels import Missed
+from sparserob_core.checker.reach.kernels import BoundedInput
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
@@ -33,7 +33,7 @@ DIRECTIONS_KEPT = 4096  # of cells of directions, which are asked for at every t
 
 @final
 @dataclass(frozen=True, eq=False)
-class Window:
+class ConstraintWindow:
     """``x(t) - r(t)`` in ``shape`` for all ``t`` from ``start`` to ``stop``; of more coordinates than the ``states``:
     ``(x(t), u(t))``, with ``u`` of every piece of the control that meets the window in positive length.
 
@@ -101,13 +101,13 @@ class Beside:
     """What stands beside ``c'x(t)`` in the rows of a window: ``g'u - c'r(t)``, for ``c = z'basis``, ``g = z'gains``,
     ``basis (b, d)``, ``gains (b, m)``. ``breakpoints`` and ``pieces`` are the commanded control's."""
 
-    window: Window
+    window: ConstraintWindow
     basis: Array
     gains: Array
     scene: Scene
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
-    delivered: Sequence[Missed] = ()
+    delivered: Sequence[BoundedInput] = ()
     _directions: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     def added(
@@ -164,7 +164,7 @@ class Beside:
     @staticmethod
     def _erring(
         poly: Polynomial,
-        one: Missed,
+        one: BoundedInput,
         c: Array,
         off: Array,
         times: Sequence[float],

@@ -15,8 +15,8 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, rational
 from sparserob_core.checker.arithmetic.series import around, identity, stacked, zeros
-from sparserob_core.checker.flow.flow import Flow, Part
-from sparserob_core.checker.flow.segment import Segment
+from sparserob_core.checker.flow.flow import FlowPart, VerifiedFlow
+from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -39,7 +39,7 @@ class Walk:
     terms: float
 
 
-def walked(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> Walk:
+def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> Walk:
     """``z = (x, 1, u)`` along the nominal trajectory, and back with the costates of what it costs; a control acts on
     the state as late as the system says, and costs when it is given."""
     from flint import arb, arb_mat
@@ -76,7 +76,7 @@ def walked(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> 
     return Walk(value, slope, blurred, terms)
 
 
-def nominal_states(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
+def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
     """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and at the end.
 
     Every uncertainty is at its nominal point; ``u = 0`` before the first piece acts, and at the end.
@@ -111,15 +111,15 @@ def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[f
 
 @final
 @dataclass(frozen=True, eq=False)
-class Nominal:
+class NominalMotion:
     """The motion of ``z = (x, 1, u)`` with every uncertainty at its nominal point, of which ``flow`` is the flow there,
     and the cost of the states. A control stays the same; before the first piece acts it is ``before (m, 1)``."""
 
     problem: OptimalControlProblem
-    flow: Flow
+    flow: VerifiedFlow
     _steps: dict[tuple[object, ...], arb_mat] = field(default_factory=dict, repr=False)
     _weights: dict[tuple[object, ...], arb_mat] = field(default_factory=dict, repr=False)
-    _tables: dict[Segment, tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
+    _tables: dict[VerifiedSegment, tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def begin(self) -> arb_mat:
@@ -177,7 +177,7 @@ class Nominal:
             self._weights[key] = whole
         return self._weights[key]
 
-    def _integrate(self, part: Part) -> tuple[arb_mat, arb_mat]:
+    def _integrate(self, part: FlowPart) -> tuple[arb_mat, arb_mat]:
         """Return what a share of a segment makes of ``z``, and what that costs.
 
         Up to the share the flow is ``sum_n X_n x^n``, and what this leaves out is in a ball at every ``x``. With ``M``
@@ -195,7 +195,7 @@ class Nominal:
         every, pushed = (arb_mat(count * size, size, table.entries()) for table in (terms, pushed))
         return step + off, every.transpose() * pushed + missed * part.length
 
-    def _tabulate(self, segment: Segment) -> tuple[arb_mat, arb_mat, arb_mat]:
+    def _tabulate(self, segment: VerifiedSegment) -> tuple[arb_mat, arb_mat, arb_mat]:
         """Return the terms of a segment's flow on ``z`` and their products with the cost per time, a row for each; and
         what they leave out."""
         from flint import arb_mat

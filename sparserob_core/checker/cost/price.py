@@ -15,8 +15,8 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, rational
 from sparserob_core.checker.arithmetic.series import norm, stacked
-from sparserob_core.checker.cost.nominal import Nominal, Walk, nominal_states, walked
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.cost.nominal import NominalMotion, Walk, nominal_states, walked
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic
@@ -48,10 +48,10 @@ class Price:
 
     problem: OptimalControlProblem
     control: Dictionary
-    flow: Flow
+    flow: VerifiedFlow
     clock: Clock = NO_LIMIT
     _latest: deque[tuple[Sequence[arb_mat], int, Walk]] = field(default_factory=lambda: deque(maxlen=KEPT))
-    _nominals: dict[int, Nominal] = field(default_factory=dict)
+    _nominals: dict[int, NominalMotion] = field(default_factory=dict)
 
     @cached_property
     def _lengths(self) -> list[Fraction]:
@@ -184,13 +184,13 @@ class Price:
         return self.problem.cost.terms
 
     @property
-    def _nominal(self) -> Nominal:
+    def _nominal(self) -> NominalMotion:
         """The nominal motion, in numbers of as many bits as are used now, or more."""
         from flint import ctx
 
         if not any(bits >= ctx.prec for bits in self._nominals):
             flow = self.flow.sharper(2.0**-ctx.prec) if self._nominals else self.flow
-            self._nominals[int(ctx.prec)] = Nominal(self.problem, flow)
+            self._nominals[int(ctx.prec)] = NominalMotion(self.problem, flow)
         return next(nominal for bits, nominal in self._nominals.items() if bits >= ctx.prec)
 
     def nominal_states(self, pieces: Sequence[arb_mat]) -> list[arb_mat]:

@@ -16,9 +16,9 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, middles, products, zeros
-from sparserob_core.checker.flow.law import Box, Law, Stretch
+from sparserob_core.checker.flow.law import Law, ParameterBox, Stretch
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.segment import LONGER, ROUGH, SHARP, Segment, solve
+from sparserob_core.checker.flow.segment import LONGER, ROUGH, SHARP, VerifiedSegment, solve
 from sparserob_core.checker.flow.still import held_about
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
@@ -38,7 +38,7 @@ ENOUGH = 2.0**-64  # of a kernel, which goes on as numbers of 53 bits, what its 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Weights:
+class StateWeights:
     """What a state at a time is made of: ``free`` times the state at 0, and ``control`` and ``disturbance`` times the
     inputs on every piece of a grid."""
 
@@ -49,11 +49,11 @@ class Weights:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Part:
+class FlowPart:
     """A ``share`` of a ``segment``, which takes a time of this ``length``, so many ``doublings`` of it: the flow of two
     times is that of one twice."""
 
-    segment: Segment
+    segment: VerifiedSegment
     share: arb
     length: arb
     doublings: int = 0
@@ -61,26 +61,26 @@ class Part:
 
 @final
 @dataclass(eq=False)
-class Flow:
+class VerifiedFlow:
     """The system ``x' = A x + B u + E w`` from 0 to ``until``, at every parameter of a ``box``; a drift is one more
     column of ``B``, whose input is always 1. To a ``degree`` in the parameters, of which there may be none; between
     the marks of a ``timing`` where there is one. ``sharp``: of the states, what a guess may leave out."""
 
     plant: Plant
     until: float
-    box: Box = Box()  # noqa: RUF009  immutable
+    box: ParameterBox = ParameterBox()  # noqa: RUF009  immutable
     degree: int = 0
     timing: Law | None = None
     sharp: float = SHARP
-    _segments: dict[tuple[float, float], Segment] = field(default_factory=dict, repr=False)
+    _segments: dict[tuple[float, float], VerifiedSegment] = field(default_factory=dict, repr=False)
     _longest: dict[float, float] = field(default_factory=dict, repr=False)
     _over: dict[tuple[object, ...], tuple[Series, Series]] = field(default_factory=dict, repr=False)
     _ends: dict[tuple[int, tuple[float, float]], Series] = field(default_factory=dict, repr=False)
     _about: dict[tuple[int, float], tuple[Array, Array]] = field(default_factory=dict, repr=False)
-    _points: dict[tuple[float, ...], Flow] = field(default_factory=dict, repr=False)
-    _weights: dict[tuple[float, ...], Weights] = field(default_factory=dict, repr=False)
+    _points: dict[tuple[float, ...], VerifiedFlow] = field(default_factory=dict, repr=False)
+    _weights: dict[tuple[float, ...], StateWeights] = field(default_factory=dict, repr=False)
 
-    def at(self, parameter: Sequence[float]) -> Flow:
+    def at(self, parameter: Sequence[float]) -> VerifiedFlow:
         """The flow at one parameter."""
         point = tuple(map(float, parameter))
         if point == self.box.middle and not self.degree:
@@ -88,12 +88,12 @@ class Flow:
         if point not in self._points:
             if len(self._points) >= POINTS_KEPT:
                 self._points.clear()
-            self._points[point] = Flow(self.plant, self.until, Box(point, (0.0,) * len(point)))
+            self._points[point] = VerifiedFlow(self.plant, self.until, ParameterBox(point, (0.0,) * len(point)))
         return self._points[point]
 
-    def sharper(self, sharp: float) -> Flow:
+    def sharper(self, sharp: float) -> VerifiedFlow:
         """The flow anew, of whose states a guess leaves out less."""
-        return Flow(self.plant, self.until, self.box, self.degree, self.timing, min(self.sharp, sharp))
+        return VerifiedFlow(self.plant, self.until, self.box, self.degree, self.timing, min(self.sharp, sharp))
 
     @cached_property
     def law(self) -> Law:
@@ -141,7 +141,7 @@ class Flow:
                 found += [float(t) for t in np.linspace(a, b, max(1, ceil(count)) + 1)[1:-1]] + [b]
         return found
 
-    def segment(self, start: float, stop: float) -> tuple[Segment, arb]:
+    def segment(self, start: float, stop: float) -> tuple[VerifiedSegment, arb]:
         """The flow from ``start`` on, and which share of it has passed at ``stop``."""
         from flint import arb
 
@@ -216,21 +216,21 @@ class Flow:
                 found[:, d:] += pushed
         return found[:, :d], found[:, d : d + self.driven], found[:, d + self.driven :]
 
-    def parts(self, start: float, stop: float) -> Iterator[Part]:
+    def parts(self, start: float, stop: float) -> Iterator[FlowPart]:
         """Yield the parts of an interval, one after another."""
         from flint import arb
 
         for a, b in pairwise([start, *(one for one in self._begins if start < one < stop), stop]):
             stretch, doublings, length = self.law.stretches[self._place(a, b)], 0, arb(b) - arb(a)
             if not stretch.is_still:
-                yield Part(*self.segment(a, b), length)
+                yield FlowPart(*self.segment(a, b), length)
                 continue
             share = length / stretch.stride
             while not share <= 1:
                 share, length, doublings = share / 2, length / 2, doublings + 1
-            yield Part(self._still(stretch), share, length, doublings)
+            yield FlowPart(self._still(stretch), share, length, doublings)
 
-    def _still(self, stretch: Stretch) -> Segment:
+    def _still(self, stretch: Stretch) -> VerifiedSegment:
         """The flow of a stretch on which nothing changes with time."""
         key = (-1.0, stretch.start)
         if key not in self._segments:
@@ -298,7 +298,7 @@ class Flow:
         stretch = self.law.stretches[self._place(start, stop)]
         return *stretch.sizes, stretch.units
 
-    def weights(self, grid: Sequence[float]) -> Weights:
+    def weights(self, grid: Sequence[float]) -> StateWeights:
         """What the state at the end of a grid, which begins at 0, is made of, where the parameters are known."""
         key = tuple(grid)
         if key not in self._weights:
@@ -309,5 +309,5 @@ class Flow:
             control, disturbance = (
                 [(Z * part[i]).matrix for Z, part in zip(after[1:], parts, strict=True)] for i in (1, 2)
             )
-            self._weights[key] = Weights(after[0].matrix, control, disturbance)
+            self._weights[key] = StateWeights(after[0].matrix, control, disturbance)
         return self._weights[key]

@@ -16,7 +16,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked
-from sparserob_core.checker.flow.plant import Phase, Plant
+from sparserob_core.checker.flow.plant import Plant, PlantPhase
 from sparserob_core.checker.flow.segment import SHARP
 from sparserob_core.checker.flow.units import balanced, pace
 from sparserob_core.checker.outcome import Unchecked
@@ -34,41 +34,43 @@ SHORTEST = 2.0**-30  # of the horizon: a shorter stretch holds a pole
 
 @final
 @dataclass(frozen=True)
-class Box:
+class ParameterBox:
     """A box of parameters: its ``middle (nu,)``, exact numbers, and ``halves (nu,)`` of its widths, or more."""
 
     middle: tuple[float, ...] = ()
     halves: tuple[float, ...] = ()
 
     @staticmethod
-    def between(low: Sequence[float], high: Sequence[float]) -> Box:
+    def between(low: Sequence[float], high: Sequence[float]) -> ParameterBox:
         """That between two corners."""
         ends = [(a, b, (a + b) / 2) for a, b in zip(map(float, low), map(float, high), strict=True)]
         halves = [0.0 if a == b else float(np.nextafter(max(b - m, m - a), np.inf)) for a, b, m in ends]
-        return Box(tuple(m for _, _, m in ends), tuple(halves))
+        return ParameterBox(tuple(m for _, _, m in ends), tuple(halves))
 
-    def wider(self, extra: Sequence[float] | Array) -> Box:
+    def wider(self, extra: Sequence[float] | Array) -> ParameterBox:
         """The box with so much more at either side."""
         more = [h + float(x) for h, x in zip(self.halves, extra, strict=True)]
         return (
-            Box(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more)) if any(extra) else self
+            ParameterBox(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more))
+            if any(extra)
+            else self
         )
 
-    def holds(self, other: Box) -> bool:
+    def holds(self, other: ParameterBox) -> bool:
         """Whether another box is in this one; exactly, where sums of two floats are rounded."""
         for m, h, n, k in zip(self.middle, self.halves, other.middle, other.halves, strict=True):
             if abs(Fraction(n) - Fraction(m)) + Fraction(k) > Fraction(h):
                 return False
         return True
 
-    def halved(self, axis: int) -> list[Box]:
+    def halved(self, axis: int) -> list[ParameterBox]:
         """Both halves across a parameter, each a little larger than half."""
         found = []
         for sign in (-0.5, 0.5):
             middle, halves = list(self.middle), list(self.halves)
             middle[axis] += sign * halves[axis]
             halves[axis] *= 0.5 * (1.0 + 1e-9)
-            found.append(Box(tuple(middle), tuple(halves)))
+            found.append(ParameterBox(tuple(middle), tuple(halves)))
         return found
 
 
@@ -149,7 +151,7 @@ class Law:
 
     plant: Plant
     until: float
-    box: Box
+    box: ParameterBox
     degree: int = 0
     timing: Law | None = None
 
@@ -206,7 +208,7 @@ class Law:
         frame, table = self._table(other.start, other.stop, phase, self.monomials)
         return replace(other, frame=frame, table=table, stride=min(other.stride, _power(other.stop - other.start)))
 
-    def _on(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
+    def _on(self, begin: float, until: float, phase: PlantPhase) -> list[Stretch]:
         whole = self._still(begin, until, phase)
         if whole is not None:
             return [whole]
@@ -224,7 +226,7 @@ class Law:
             todo += [(middle, stop), (start, middle)]
         return found
 
-    def _still(self, begin: float, until: float, phase: Phase) -> Stretch | None:
+    def _still(self, begin: float, until: float, phase: PlantPhase) -> Stretch | None:
         """All of a law that does not change with time; ``None`` of another one."""
         try:
             found = Stretch(begin, until, *self._table(begin, until, phase, self.monomials), self.units)
@@ -237,7 +239,7 @@ class Law:
             raise Unchecked("the system is too fast for its horizon to be followed")
         return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / rate))) if rate > 0.0 else longest)
 
-    def _hides(self, found: Stretch, phase: Phase) -> bool:
+    def _hides(self, found: Stretch, phase: PlantPhase) -> bool:
         """Whether the balls of a law hold what changes with the time: those of one time are less wide."""
         time = (found.start + found.stop) / 2
         _, table = self._table(time, time, phase, self.monomials)
@@ -248,7 +250,7 @@ class Law:
             for a, b in zip(row, beside, strict=True)
         )
 
-    def _stretch(self, start: float, stop: float, phase: Phase) -> Stretch | None:
+    def _stretch(self, start: float, stop: float, phase: PlantPhase) -> Stretch | None:
         """The law from ``start`` to ``stop``; ``None`` where that is too long: by what it is in the middle of the
         box."""
         try:
@@ -269,7 +271,7 @@ class Law:
         return Stretch(start, stop, Frame(self.monomials, ORDER), table, u * ratios)
 
     def _table(
-        self, start: float, stop: float, phase: Phase, monomials: Monomials
+        self, start: float, stop: float, phase: PlantPhase, monomials: Monomials
     ) -> tuple[Frame, list[list[list[arb_poly]]]]:
         """Every entry of the law from ``start`` to ``stop``, monomial by monomial."""
         from flint import arb, arb_poly

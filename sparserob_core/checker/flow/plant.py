@@ -19,7 +19,7 @@ LOOKS = 17  # times of a phase at which its numbers are looked at, by which noth
 
 @final
 @dataclass(frozen=True, eq=False)
-class Phase:
+class PlantPhase:
     """``A``, ``B`` with the drift beside it, and ``E`` of a ``law`` from ``begin`` to ``until``: functions of the
     parameters, which may come after the time (``timed``)."""
 
@@ -41,7 +41,7 @@ class Plant:
     """The ``phases`` of a system with ``states``, and with so many inputs that are ``driven``, controls and a drift,
     before the disturbances, and all ``inputs``."""
 
-    phases: tuple[Phase, ...]
+    phases: tuple[PlantPhase, ...]
     states: int
     driven: int
     inputs: int
@@ -55,7 +55,7 @@ class Plant:
             laws = list(zip((0.0, *system.switches), system.modes, strict=True))
         ends = [*(begin for begin, _ in laws[1:]), horizon]
         timed = isinstance(system, VaryingSystem)
-        phases = [Phase(begin, until, law, timed) for (begin, law), until in zip(laws, ends, strict=True)]
+        phases = [PlantPhase(begin, until, law, timed) for (begin, law), until in zip(laws, ends, strict=True)]
         driven = int(system.controls + (system.c is not None))
         return Plant(tuple(phases), int(system.states), driven, driven + int(system.disturbances))
 

@@ -74,7 +74,7 @@ class Powers:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Segment:
+class VerifiedSegment:
     """``[Phi Gamma]``, what a share ``x`` of the time makes of the states at its beginning and of inputs that stay the
     same: ``sum_n terms_n x^n``, off by at most ``off (d, d + w)`` at every share up to `LONGER` and every parameter."""
 
@@ -134,12 +134,12 @@ def _binomials(count: int) -> Array:
     return np.array([[float(comb(n, j)) for n in range(count)] for j in range(count)])
 
 
-def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float = SHARP) -> Segment:
+def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float = SHARP) -> VerifiedSegment:
     """The flow of ``sum_k A_k x^k`` and ``sum_k F_k x^k`` for ``x`` from 0 to 1; ``units (d,)`` are those of the
     states, in which the system is small. ``sharp``: of the states, what the guess may leave out."""
     equation = Equation(A, F)
     terms = guess(equation, units, max(sharp, ROUGH) if A[0].monomials.degree else sharp)
-    return Segment(terms, verify(equation, terms, units))
+    return VerifiedSegment(terms, verify(equation, terms, units))
 
 
 def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series]:

@@ -10,7 +10,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import NONE
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.flow.plant import Phase
+from sparserob_core.checker.flow.plant import PlantPhase
 from sparserob_core.control.problem.system import System
 from sparserob_core.sip.convex_set import Array
 
@@ -31,7 +31,7 @@ def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_m
     for mode in system.modes:
         table = [
             [value.constant if isinstance(value, Model) else arb(float(value)) for value in row]
-            for row in Phase(0.0, 0.0, mode, timed=False).called(p)
+            for row in PlantPhase(0.0, 0.0, mode, timed=False).called(p)
         ]
         d, m = mode.states, mode.controls + (mode.c is not None)
         cuts = {"A": slice(0, d), "B": slice(d, d + m), "E": slice(d + m, None)}

@@ -146,7 +146,7 @@ def _coordinates(
 
 @final
 @dataclass(frozen=True, eq=False)
-class Running:
+class RunningIntegrals:
     """What a problem with integrals is of where nothing changes with time but what is integrated: the ``system`` whose
     coordinates are integrated all along. What is integrated from ``begins (k,)`` to ``ends (k,)`` is what has been
     until the end, less what had been at the beginning."""
@@ -156,7 +156,7 @@ class Running:
     ends: Array
 
     @staticmethod
-    def of(problem: OptimalControlProblem) -> Running | None:
+    def of(problem: OptimalControlProblem) -> RunningIntegrals | None:
         """That of a problem as it is stated, of which one known system acts; ``None`` for others."""
         system = problem.system
         if not problem.integral or not isinstance(system, LinearSystem) or system.parameters is not None:
@@ -164,7 +164,7 @@ class Running:
         coordinates, _ = _coordinates(problem)
         whole = _with(system, [(one.h, one.g) for one in coordinates])
         ends = np.array([[one.begin, one.end] for one in coordinates])
-        return Running(replace(whole, delay=system.delay), *ends.T)
+        return RunningIntegrals(replace(whole, delay=system.delay), *ends.T)
 
     def is_beside(self, mode: LinearSystem, d: int) -> bool:
         """Whether a mode is the same of the first ``d`` states, whatever is integrated beside them."""

@@ -251,7 +251,7 @@ def _mixed(
 
 @final
 @dataclass(frozen=True, eq=False)
-class Parts:
+class ParameterExpansion:
     """The system of a problem about the ``middle (nu,)`` of its parameters."""
 
     system: VaryingSystem
@@ -358,7 +358,7 @@ class Parts:
 class Larger:
     """One of the matrices of the system of all coordinates."""
 
-    parts: Parts
+    parts: ParameterExpansion
     name: str
     entry: object
 
@@ -382,7 +382,7 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     system = problem.system
     if not isinstance(system, VaryingSystem) or system.parameters is None:
         return problem
-    parts = Parts(system, tuple(system.parameters.interior_point().tolist()))
+    parts = ParameterExpansion(system, tuple(system.parameters.interior_point().tolist()))
     if not parts.is_affine:  # then it is expanded, box by box by the flow
         return problem
     d, more = system.states, parts.size - system.states
@@ -433,7 +433,7 @@ def _above(exact: Fraction) -> float:
     return nextafter(found, inf) if Fraction(found) < exact else found
 
 
-def _law(parts: Parts, law: LinearSystem, begin: float, until: float) -> LinearSystem:
+def _law(parts: ParameterExpansion, law: LinearSystem, begin: float, until: float) -> LinearSystem:
     made = {name: Larger(parts, name, law.entry(name)) for name in NAMES if law.entry(name) is not None}
     return LinearSystem(made["A"], made["B"], made["E"], Box([begin], [until]), ("t",), made.get("c"))
 

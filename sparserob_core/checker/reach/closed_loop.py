@@ -22,7 +22,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import around, identity, stacked
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Unchecked
@@ -57,7 +57,7 @@ def middle(shape: ConvexSet) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedLoop:
+class VerifiedLoop:
     """A known system from ``initial_state`` under the ``nominal`` control, ``(m, 1)`` on each of its ``K`` pieces, and
     ``gains (K, K, m, d)``; ``grid``: every breakpoint; ``breakpoints``: those of the control; ``changes``: where the
     disturbance may jump; ``initial``: the set of deviations of the initial state; ``before (m,)``: what acts until a
@@ -76,13 +76,13 @@ class ClosedLoop:
     before: tuple[float, ...] = ()
     measured: Measurements | None = None
     observer: Array | None = None
-    law: Flow | None = None
+    law: VerifiedFlow | None = None
 
     @cached_property
-    def flow(self) -> Flow:
+    def flow(self) -> VerifiedFlow:
         """The flow of the system, its ``law`` where that is given."""
         until = self.grid[-1]
-        return Flow(Plant.of(self.system, until), until) if self.law is None else self.law
+        return VerifiedFlow(Plant.of(self.system, until), until) if self.law is None else self.law
 
     @cached_property
     def acting(self) -> list[float]:

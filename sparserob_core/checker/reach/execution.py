@@ -17,8 +17,8 @@ import numpy as np
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Clock
-from sparserob_core.checker.reach.adjoint import Adjoint, Motion, SupportIntegrals, subtract_times
-from sparserob_core.checker.reach.kernels import MissedHere
+from sparserob_core.checker.reach.adjoint import AdjointFlow, AdjointRow, SupportIntegrals, subtract_times
+from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Execution(MissedHere):
+class FollowedExecution(BoundedInputHere):
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for."""
 
@@ -42,12 +42,12 @@ class Execution(MissedHere):
     _known: dict[bytes, SupportIntegrals] = field(default_factory=dict, repr=False)
 
     @cached_property
-    def motion(self) -> Motion:
+    def motion(self) -> AdjointFlow:
         """What the rows share, with ``B`` as far as errors enter by it."""
         (mode,) = modes_at(self.problem.system, [])
         A, B, m = mode["A"], mode["B"], self.shares.size
         B = stacked([[x * (i not in self.problem.commanded) for x in row[:m]] for i, row in enumerate(B.tolist())])
-        return Motion.of(A, B, float(self.breakpoints[-1]), self.clock)
+        return AdjointFlow.of(A, B, float(self.breakpoints[-1]), self.clock)
 
     def absolute(self, c: Array) -> SupportIntegrals:
         """The integrals of ``|c'e^{A s} B_j|`` of a direction ``c (d,)``, which is exact; its opposite has the same."""
@@ -56,7 +56,7 @@ class Execution(MissedHere):
         if key not in self._known:
             ends = np.eye(self.shares.size)
             sides = [Side(np.stack([one, -one]), 0.0 * ends[:2]) for one in ends]
-            self._known[key] = SupportIntegrals(Adjoint.of(self.motion, exact), slice(None), sides)
+            self._known[key] = SupportIntegrals(AdjointRow.of(self.motion, exact), slice(None), sides)
         return self._known[key]
 
     def integrals(self, c: Array, times: Array, points: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""The worst case of ``c'x(t)`` over everything that a control answers, on cells of time, of a known system: what `Tube`
+"""The worst case of ``c'x(t)`` over everything that a control answers, on cells of time, of a known system: what `VerifiedTube`
 is where nothing is answered. Between the ends of a cell by a chord and the second derivatives."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly
 from sparserob_core.checker.reach.tube import Around, Polynomial
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
@@ -25,14 +25,14 @@ class LoopTube:
     """The reachable states of a closed ``loop``, seen along combinations of the rows of ``basis (b, d)``, and of
     ``gains (b, m)`` on the answers of the control beside them, its nominal part left out."""
 
-    loop: ClosedLoop
+    loop: VerifiedLoop
     basis: Array
     gains: Array
     flow: Around = Around()  # noqa: RUF009  immutable
     _heights: dict[tuple[int, float, bytes], Enclosed] = field(default_factory=dict, repr=False)
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
-        """As `Tube.cells`, with the chord as polynomial; of its error `expansion` is due to the length of the cell. The
+        """As `VerifiedTube.cells`, with the chord as polynomial; of its error `expansion` is due to the length of the cell. The
         truth may be far below it between the ends."""
         begin, end = self._height(piece, start, z), self._height(piece, stop, z)
         bent = np.zeros(z.shape[0])
@@ -67,7 +67,7 @@ class Still:
     flow: Around = Around()  # noqa: RUF009  immutable
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
-        """As `Tube.cells`, at one place."""
+        """As `VerifiedTube.cells`, at one place."""
         found = _of_column(self.heights(piece, exactly(_combined(z, self.basis))))
         return [
             Polynomial(np.array([[height]]), float(error), 0.0, 0.0)

@@ -18,9 +18,9 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly, middle
 from sparserob_core.checker.reach.kernels import above_chord, pushes
-from sparserob_core.checker.sets.along import Curve
+from sparserob_core.checker.sets.along import CurvedSide
 from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product, rounding
@@ -45,7 +45,7 @@ class Side:
     rad: Array
 
     @staticmethod
-    def of(shape: ConvexSet) -> list[Side | Curve]:
+    def of(shape: ConvexSet) -> list[Side | CurvedSide]:
         """Those of a set, counted from its middle: of a box one for every channel, of a zonotope one for every segment,
         a curved one as it is."""
         from flint import arb, fmpq
@@ -66,7 +66,7 @@ class Side:
             exact = [[arb(fmpq(x.numerator, x.denominator)) for x in corner] for corner in seen.corners]
             found = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
         else:
-            curved = Curve(seen, middle(shape))
+            curved = CurvedSide(seen, middle(shape))
             _ = curved.far  # of a set that is not known it is `Unchecked`
             return [curved]
         return [Side(one.mid, one.rad) for one in (Enclosed.of(stacked(rows)) for rows in found)]
@@ -95,7 +95,7 @@ class Side:
 class Together:
     """The sum of several ``sides``, of which there is at least one: its support function is the sum of theirs."""
 
-    sides: Sequence[Side | Curve]
+    sides: Sequence[Side | CurvedSide]
 
     @property
     def dimension(self) -> int:
@@ -117,7 +117,7 @@ class Together:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Kernel:
+class VerifiedKernel:
     """``Phi(end, s) E(s)`` for the time ``r`` that is left of an interval at ``s``, on parts one after another, as
     polynomials of ``u`` from -1 to 1 across each, times its length: coefficients ``(S, p + 1, d, mw)``, all together
     off by at most ``off (S, d, mw)``."""
@@ -139,7 +139,7 @@ class Kernel:
         off = (off + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
         return plain, off
 
-    def most(self, a: Enclosed, sides: Sequence[Side | Curve]) -> Enclosed:
+    def most(self, a: Enclosed, sides: Sequence[Side | CurvedSide]) -> Enclosed:
         """The integral of the support function of ``K(r)'a`` for ``a (N, d)``: between bounds, as a middle and a radius
         ``(N,)``."""
         size, count = np.abs(a.mid), self.count
@@ -229,11 +229,11 @@ def _equal(P: Array, start: Array, stop: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasurableLoop(ClosedLoop):
-    """`ClosedLoop` under measurable disturbances. Its deviations are what they make of the state by the end of every
+class MeasurableLoop(VerifiedLoop):
+    """`VerifiedLoop` under measurable disturbances. Its deviations are what they make of the state by the end of every
     piece of the grid, ``(d,)`` each, and that of the initial state."""
 
-    _ways: dict[tuple[object, ...], Kernel] = field(default_factory=dict, repr=False)
+    _ways: dict[tuple[object, ...], VerifiedKernel] = field(default_factory=dict, repr=False)
 
     @property
     def blocks(self) -> int:
@@ -250,16 +250,16 @@ class MeasurableLoop(ClosedLoop):
         return [0, *accumulate([d] * (self.blocks + (self.initial is not None)))]
 
     @cached_property
-    def sides(self) -> list[Side | Curve]:
+    def sides(self) -> list[Side | CurvedSide]:
         """The sets of the deviations, which add up."""
         assert self.shape is not None
         return Side.of(self.shape)
 
-    def kernel(self, piece: int) -> Kernel:
+    def kernel(self, piece: int) -> VerifiedKernel:
         """That of a piece."""
         return self._way(self.grid[piece], self.grid[piece + 1])
 
-    def _way(self, start: float, stop: float) -> Kernel:
+    def _way(self, start: float, stop: float) -> VerifiedKernel:
         """The kernel of an interval, whose parts are those between marks, in shares of each."""
         key = self.flow.alike(start, stop)
         if key not in self._ways:
@@ -276,7 +276,7 @@ class MeasurableLoop(ClosedLoop):
                 np.array([np.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in parts])
                 for parts in zip(*((one.mid, one.rad) for one in every), strict=True)
             )
-            self._ways[key] = Kernel(mid, rad.sum(axis=1) * OUTWARD)
+            self._ways[key] = VerifiedKernel(mid, rad.sum(axis=1) * OUTWARD)
         return self._ways[key]
 
     @cached_property
@@ -316,7 +316,7 @@ class MeasurableLoop(ClosedLoop):
         d = self.system.states
         axes = np.vstack([np.eye(d), -np.eye(d)])
         exact = Enclosed(axes, np.zeros_like(axes))
-        alike: dict[int, tuple[Kernel, Array]] = {}  # kernels are kept with their numbers
+        alike: dict[int, tuple[VerifiedKernel, Array]] = {}  # kernels are kept with their numbers
         found = []
         for piece in range(self.blocks):
             kernel = self.kernel(piece)
@@ -338,7 +338,7 @@ class MeasurableLoop(ClosedLoop):
         table = Enclosed.of(stacked(every))
         mid, rad = (part[:, : blocks * d].reshape(len(every), blocks, d) for part in (table.mid, table.rad))
         rad = np.where(rad > 1e-290, rad, 0.0)  # of exact zeros
-        alike: dict[int, tuple[Kernel, list[int]]] = {}
+        alike: dict[int, tuple[VerifiedKernel, list[int]]] = {}
         for piece in range(blocks):
             kernel = self.kernel(piece)
             alike.setdefault(id(kernel), (kernel, []))[1].append(piece)
@@ -378,7 +378,7 @@ class MeasurableLoop(ClosedLoop):
         return self._way(self.grid[piece], time).most(as_enclosed(rows), self.sides)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
-        """As of `ClosedLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
+        """As of `VerifiedLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
         axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
         begun, size = np.zeros(len(axes)), sum((side.far for side in self.sides), np.zeros(self.width))
         if start > self.grid[piece]:

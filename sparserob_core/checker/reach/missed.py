@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.series import Series, products
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.flows import Flows
-from sparserob_core.checker.flow.law import Box
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.flows import VerifiedFlows
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.kernels import Added, Missed, MissedHere, above_chord, pushes
+from sparserob_core.checker.reach.kernels import Added, BoundedInput, BoundedInputHere, above_chord, pushes
 from sparserob_core.checker.reach.measurable import Side, Together, signed, swept
 from sparserob_core.checker.reach.states import enclosed, ring
 from sparserob_core.checker.reach.tube import Around
-from sparserob_core.checker.sets.along import Curve
+from sparserob_core.checker.sets.along import CurvedSide
 from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
@@ -41,21 +41,21 @@ MEANS = 1.0 / np.arange(1.0, 257.0)  # of |u|^p from -1 to 1
 
 @final
 @dataclass(eq=False)
-class MissedAt(MissedHere):
+class BoundedInputAt(BoundedInputHere):
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for. It enters through the columns of ``[B E]`` from the ``first`` one on; the
     errors are known but for ``off (m,)``, and do not reach the ``numb`` states, which add up what is commanded.
     ``side``: what enters by all columns at once, in the place of channels of their own; there is one share of 1 then,
     and integrals are those of its support function."""
 
-    law: Flow
+    law: VerifiedFlow
     shares: Array
     breakpoints: Array
     pieces: Sequence[arb_mat]
     first: int = 0
     off: Array | None = None
     numb: Sequence[int] = ()
-    side: Side | Curve | Together | None = None
+    side: Side | CurvedSide | Together | None = None
     _kernels: dict[tuple[float, float], Enclosed] = field(default_factory=dict, repr=False)
     _onward: dict[int, Enclosed] = field(default_factory=dict, repr=False)
     _added: dict[tuple[float, bytes], tuple[Array, Array]] = field(default_factory=dict, repr=False)
@@ -91,19 +91,19 @@ class MissedAt(MissedHere):
         return self.side.far
 
     def least(self, c: Array, time: float) -> Array:
-        """`MissedHere.least`."""
+        """`BoundedInputHere.least`."""
         found = np.zeros((self.breakpoints.size - 1, self.shares.size))
         low, _, which = self._integrals(c[None], time, np.arange(len(self.marks) - 1))
         np.add.at(found, self.owner[which], np.maximum(low[:, 0], 0.0))
         return found * self.shares * (1.0 - rounding(which.size))
 
     def added(self, c: Array, time: float) -> tuple[float, float]:
-        """`MissedHere.added`."""
+        """`BoundedInputHere.added`."""
         low, high = self._summed(c[None], time)
         return float(low[0]), float(high[0])
 
     def bent(self, c: Array, start: float, stop: float) -> float:
-        """`MissedHere.bent`."""
+        """`BoundedInputHere.bent`."""
         d = c.size
         begun = self._summed(np.eye(d), start)[1]
         if self.side is not None:
@@ -170,7 +170,7 @@ class MissedAt(MissedHere):
         return value - less - ends, value + more + ends, which
 
     @staticmethod
-    def _together(side: Side | Curve | Together, plain: Array, off: Array) -> tuple[Array, Array]:
+    def _together(side: Side | CurvedSide | Together, plain: Array, off: Array) -> tuple[Array, Array]:
         """Bounds ``(q, n, 1)`` of the integrals of the support function of a set at polynomials ``(q, n, p + 1, m)``
         that are off by ``off (q, n, m)``."""
         q, n, order, m = plain.shape
@@ -207,8 +207,8 @@ class MissedAt(MissedHere):
 
 @final
 @dataclass(eq=False)
-class MissedOver(Missed):
-    """`MissedAt` of a control, or of disturbances, in a system with parameters that its state is no affine
+class BoundedInputOver(BoundedInput):
+    """`BoundedInputAt` of a control, or of disturbances, in a system with parameters that its state is no affine
     function of.
 
     At one parameter it is that of the known system there. Over a box: of one parameter alone a function ``f`` is
@@ -219,30 +219,32 @@ class MissedOver(Missed):
     support function of a ``side`` in the place of the absolute value: of a sum it is not above the sum of both.
     """
 
-    flows: Flows
+    flows: VerifiedFlows
     shares: Array
     breakpoints: Array
     pieces: Sequence[arb_mat]
     first: int = 0
     off: Array | None = None
     numb: Sequence[int] = ()
-    side: Side | Curve | Together | None = None
-    _at: dict[tuple[float, ...], MissedAt] = field(default_factory=dict, repr=False)
-    _kernels: dict[tuple[Flow, float, float], Enclosed] = field(default_factory=dict, repr=False)
-    _known: dict[tuple[Flow, float], tuple[Enclosed, Enclosed, np.ndarray]] = field(default_factory=dict, repr=False)
+    side: Side | CurvedSide | Together | None = None
+    _at: dict[tuple[float, ...], BoundedInputAt] = field(default_factory=dict, repr=False)
+    _kernels: dict[tuple[VerifiedFlow, float, float], Enclosed] = field(default_factory=dict, repr=False)
+    _known: dict[tuple[VerifiedFlow, float], tuple[Enclosed, Enclosed, np.ndarray]] = field(
+        default_factory=dict, repr=False
+    )
 
-    def at(self, parameter: Sequence[float]) -> MissedAt:
+    def at(self, parameter: Sequence[float]) -> BoundedInputAt:
         """That at one parameter."""
         point = tuple(map(float, parameter))
         if point not in self._at:
             if len(self._at) >= PLACES_KEPT:
                 self._at.clear()
             law, enters = self.flows.at(point), (self.first, self.off, self.numb, self.side)
-            self._at[point] = MissedAt(law, self.shares, self.breakpoints, self.pieces, *enters)
+            self._at[point] = BoundedInputAt(law, self.shares, self.breakpoints, self.pieces, *enters)
         return self._at[point]
 
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
-        """`Missed.over`."""
+        """`BoundedInput.over`."""
         assert within is not None
         box, flow = within
         low, high, centre, radius = map(np.array, (*box, flow.centre, flow.radius))
@@ -261,13 +263,13 @@ class MissedOver(Missed):
         inside = np.minimum(high - centre, centre - low) * (1.0 - rounding(2))
         skew = float(((radius - inside) / np.where(radius > 0.0, radius, 1.0)).sum())
         rest += 2.0 * skew * float(np.ptp(middle, axis=0).max()) + rounding(4 * len(signs) + 8) * float(found.max())
-        wide, lost, bent = self._curved(c, times, Box(flow.centre, flow.radius))
+        wide, lost, bent = self._curved(c, times, ParameterBox(flow.centre, flow.radius))
         least = np.array([self.at(centre.tolist()).added(c, time)[0] for time in times])
         over = max(0.0, float((middle.mean(axis=0) - least).max()))
         total = float(wide.sum()) * OUTWARD
         return Added(ends, (off + rest + total + 2.0 * lost + bent) * OUTWARD, over * OUTWARD, wide)
 
-    def _curved(self, c: Array, times: Sequence[float], box: Box) -> tuple[Array, float, float]:
+    def _curved(self, c: Array, times: Sequence[float], box: ParameterBox) -> tuple[Array, float, float]:
         """How far integrals may be above what is linear between the corners of a box, by each parameter, but for what
         is beyond the degree; how much that is; and in the time above a chord between ``times``."""
         flow = self.flows.holding(box)
@@ -288,7 +290,7 @@ class MissedOver(Missed):
             bent = float(above_chord(flow, (c * reached)[None], times[0], times[-1], begun, entering, self.first)[0])
         return wide * OUTWARD, lost * OUTWARD, bent * OUTWARD
 
-    def _summed(self, flow: Flow, rows: Array, time: float) -> tuple[Array, Array]:
+    def _summed(self, flow: VerifiedFlow, rows: Array, time: float) -> tuple[Array, Array]:
         """What errors add along ``rows (n, d)`` by a time, at most, and in absolute values: every coefficient in the
         parameters ``(n, M)``, and what is beyond these ``(n,)``."""
         key = flow, time
@@ -307,7 +309,7 @@ class MissedOver(Missed):
             off += np.einsum("pkjn,j->n", found.rad, entering)
         return size * OUTWARD, off * OUTWARD
 
-    def _kernel(self, flow: Flow, start: float, stop: float, width: int) -> Enclosed:
+    def _kernel(self, flow: VerifiedFlow, start: float, stop: float, width: int) -> Enclosed:
         """The kernel of an interval between marks."""
         key = flow, start, stop
         if key not in self._kernels:
@@ -316,7 +318,7 @@ class MissedOver(Missed):
             self._kernels[key] = pushes(flow, start, stop, slice(self.first, self.first + width))
         return self._kernels[key]
 
-    def _reaching(self, flow: Flow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
+    def _reaching(self, flow: VerifiedFlow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
         """The transitions from the end of every interval between marks to a time, ``(q, M, d, d)``; the kernels of
         these intervals, ``(q, p + 1, M, d, m)``; and the piece of the command that each is in."""
         ends = [t for t in self.breakpoints.tolist() if t < time]

@@ -87,7 +87,7 @@ def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenDeviations:
     """What some innovations see of some blocks: ``matrix``, and which of its entries may be other than 0, ``pattern``.
     ``rows``: of every group of rows, one for each innovation, where it ends and how many of it are independent at most;
     ``columns``: the same for each block. ``reach``: how far every column deviates, all alike unless given."""

@@ -14,8 +14,8 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import Series, identity, stacked
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.segment import Powers, Segment, shifted
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.segment import Powers, VerifiedSegment, shifted
 from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
@@ -33,7 +33,7 @@ EFFECTS_KEPT = 16  # marks, at which the effect of every piece before is remembe
 class States:
     """What a ``flow`` makes of a ``scene``."""
 
-    flow: Flow
+    flow: VerifiedFlow
     scene: Scene
     _tables: dict[int, tuple[Series, Series]] = field(default_factory=dict, repr=False)
     _floats: dict[int, Enclosed] = field(default_factory=dict, repr=False)
@@ -44,7 +44,7 @@ class States:
     _made: dict[tuple[int, ...], Series] = field(default_factory=dict, repr=False)
     _inputs: dict[int, Series] = field(default_factory=dict, repr=False)
     _paths: dict[int, Powers] = field(default_factory=dict, repr=False)
-    _rows: dict[tuple[int, bytes], tuple[Lines, Segment]] = field(default_factory=dict, repr=False)
+    _rows: dict[tuple[int, bytes], tuple[Lines, VerifiedSegment]] = field(default_factory=dict, repr=False)
     _effects: dict[int, tuple[Enclosed, Enclosed]] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -188,7 +188,7 @@ class States:
             self._paths[place] = segment.applied(self.node(place).above(control))
         return self._paths[place]
 
-    def _lines(self, segment: Segment, basis: Array) -> Lines:
+    def _lines(self, segment: VerifiedSegment, basis: Array) -> Lines:
         """Rows of a segment."""
         key = id(segment), basis.tobytes()
         if key not in self._rows:
@@ -221,7 +221,7 @@ class Lines:
     sizes: Array
 
     @staticmethod
-    def of(segment: Segment, basis: Array) -> Lines:
+    def of(segment: VerifiedSegment, basis: Array) -> Lines:
         """Those of a ``basis (b, d)``."""
         rows = stacked([balls(row) for row in basis])
         terms = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in segment.terms])

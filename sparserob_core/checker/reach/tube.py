@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.flow.law import Box
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.supports import bounded
 from sparserob_core.checker.sets.known import known
@@ -53,7 +53,7 @@ class Around(NamedTuple):
 
 @final
 @dataclass(eq=False)
-class Rows:
+class ProjectedStates:
     """The ``states`` along the rows of a ``basis (b, d)``."""
 
     states: States
@@ -74,12 +74,12 @@ class Rows:
 
 @final
 @dataclass(eq=False)
-class Tube:
+class VerifiedTube:
     """The reachable states over a ``box`` of parameters, seen along combinations of ``rows``, which are known over that
     box or one that holds it."""
 
-    rows: Rows
-    box: Box = Box()  # noqa: RUF009  immutable
+    rows: ProjectedStates
+    box: ParameterBox = ParameterBox()  # noqa: RUF009  immutable
 
     @cached_property
     def flow(self) -> Around:

@@ -15,7 +15,7 @@ from sparserob_core.checker.claims.cells import Work, prove
 from sparserob_core.checker.claims.claims import judged, precision_of
 from sparserob_core.checker.claims.constraints import along, beside, covered, divided, followed, parameters_of, tubes
 from sparserob_core.checker.claims.replay import reached
-from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.reach.adjoint import Worst
 from sparserob_core.checker.sets.known import known
@@ -35,10 +35,10 @@ OUTPUT, STATE = "output", "state"  # what rows are called that no constraint ask
 
 @final
 @dataclass(frozen=True, eq=False)
-class Asked:
+class SupremumRow:
     """A row of the problem: ``direction'(x - r, u) <= wall`` in a window."""
 
-    window: Window
+    window: ConstraintWindow
     direction: Array
     wall: arb | None
 
@@ -64,14 +64,14 @@ def check_suprema(case: Case) -> list[Finding]:
         return found
 
 
-def _sense(asked: Asked) -> str:
+def _sense(asked: SupremumRow) -> str:
     return "inf" if asked.direction[np.flatnonzero(asked.direction)[0]] < 0.0 else "sup"
 
 
-def _asked(case: Case) -> list[Asked]:
+def _asked(case: Case) -> list[SupremumRow]:
     """The rows of the problem."""
     found = [
-        Asked(window, direction, b)
+        SupremumRow(window, direction, b)
         for window in case.windows
         if window not in case.returned
         for direction, b in window.seen.facets or []
@@ -81,11 +81,11 @@ def _asked(case: Case) -> list[Asked]:
     d, measured = case.problem.system.states, case.problem.measurements
     name, every = (STATE, np.eye(d)) if measured is None else (OUTPUT, np.asarray(measured.C, dtype=float))
     free = Box(np.full(d, -np.inf), np.full(d, np.inf))
-    window = Window(name, free, 0.0, case.problem.horizon, d)
-    return [Asked(window, sign * direction, None) for direction in every for sign in (1.0, -1.0)]
+    window = ConstraintWindow(name, free, 0.0, case.problem.horizon, d)
+    return [SupremumRow(window, sign * direction, None) for direction in every for sign in (1.0, -1.0)]
 
 
-def _matched(case: Case) -> list[tuple[Asked, Mapping[str, Any]]]:
+def _matched(case: Case) -> list[tuple[SupremumRow, Mapping[str, Any]]]:
     """The rows that are written, each with the one of the problem that it is about."""
     left, found = _asked(case), []
     for entry in listed(case.certificate, "rows"):
@@ -106,7 +106,7 @@ def _matched(case: Case) -> list[tuple[Asked, Mapping[str, Any]]]:
     return found
 
 
-def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any]) -> str:
+def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
     """Both sides of one row; a sentence with the figures."""
     sense = _sense(asked)
     if entry.get("sense") != sense:
@@ -139,7 +139,7 @@ def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any]) -> str:
     return f"{reached_side:.9g} is reached, nothing is {side} {proven_side:.9g} ({count} cells)"
 
 
-def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
+def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
     """The wall must be the problem's, and what is left to it follow."""
     wall, margin = entry.get("wall"), entry.get("margin")
     if asked.wall is None:
@@ -157,7 +157,7 @@ def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | N
         raise Broken(f"a margin of {margin!r} is written, {written - high!r} follows")
 
 
-def _followed(case: Case, asked: Asked) -> Worst | None:
+def _followed(case: Case, asked: SupremumRow) -> Worst | None:
     """The row by its adjoint, where the system is known and does not change; ``None`` elsewhere."""
     system = case.problem.system
     if case.still is None or system.parameter_count or not case.alike:
@@ -165,7 +165,7 @@ def _followed(case: Case, asked: Asked) -> Worst | None:
     return followed(case, asked.window.split(asked.direction)[0])
 
 
-def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Worst | None) -> tuple[float, float]:
+def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], followed: Worst | None) -> tuple[float, float]:
     """The value of the row along its witness, which must be one of the problem's, between bounds."""
     problem, window, time = case.problem, asked.window, number(entry, "time")
     if not window.start <= time <= window.stop:
@@ -238,7 +238,7 @@ def _following(case: Case, changes: Array, signal: Array | None) -> tuple[Case, 
     return case, signal[:, np.searchsorted(changes, starts, side="right") - 1].tolist()
 
 
-def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
+def _proven_in_cells(case: Case, asked: SupremumRow, limit: float) -> int:
     """As `_proven`, over the parameters and pieces of the system, in cells of times and parameters."""
     window = asked.window
     alone = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))

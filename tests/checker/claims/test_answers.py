@@ -17,7 +17,7 @@ import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
-from sparserob_core.checker.claims.answers import Answers, _chords, _reach, _segments, _width, answers_of
+from sparserob_core.checker.claims.answers import VerifiedFeedback, _chords, _reach, _segments, _width, answers_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import exactly
@@ -440,10 +440,10 @@ def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
     delayed = replace(judged.problem.system, delay=0.5)
     free = replace(judged, problem=replace(judged.problem, system=delayed, disturbance_class="measurable"))
     with pytest.raises(Unchecked, match="undelayed"):
-        Answers(free).loop  # noqa: B018
+        VerifiedFeedback(free).loop  # noqa: B018
     one = LinearSystem(lambda p: p[0] * np.ones((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)), parameters=box(0.1))
     with pytest.raises(Unchecked, match="known systems only"):
-        Answers(replace(judged, problem=replace(judged.problem, system=one))).loop  # noqa: B018
+        VerifiedFeedback(replace(judged, problem=replace(judged.problem, system=one))).loop  # noqa: B018
 
 
 def test_how_far_and_how_wide_a_set_is_along_a_channel():

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from flint import ctx
 
-from sparserob_core.checker.claims.window import Beside, Window
-from sparserob_core.checker.reach.kernels import MissedHere
+from sparserob_core.checker.claims.window import Beside, ConstraintWindow
+from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.measurable import as_enclosed
 from sparserob_core.checker.reach.tube import Polynomial
@@ -23,7 +23,7 @@ from tests.support.undriven import undriven
 FAR = np.array([2.0, 0.5, 3.0])
 
 
-class Erring(MissedHere):
+class Erring(BoundedInputHere):
     """What is added is ``FAR'|c|`` and as much again by a time of 1, and a little more for ``c`` below 0."""
 
     def added(self, c: np.ndarray, time: float) -> tuple[float, float]:
@@ -44,7 +44,7 @@ def precision():
 
 
 def beside(basis: np.ndarray) -> Beside:
-    window = Window("path", Ellipsoid(np.zeros(3), np.eye(3)), 0.0, 1.0, 3)
+    window = ConstraintWindow("path", Ellipsoid(np.zeros(3), np.eye(3)), 0.0, 1.0, 3)
     return Beside(window, basis, np.zeros((len(basis), 0)), cast(Any, None), [0.0, 1.0], [], cast(Any, [Erring()]))
 
 

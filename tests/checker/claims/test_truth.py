@@ -14,8 +14,8 @@ from flint import arb, ctx
 import sparserob_core as sr
 from sparserob_core.checker.claims import cells, claims, constraints, multipliers, replay, units
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.duality import Duality, Row
-from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.claims.duality import ConstraintRow, Duality
+from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.control.problem.system import VaryingSystem
@@ -327,10 +327,10 @@ def test_slopes_on_pieces_may_be_moved_as_far_as_every_control_of_few_functions_
     rng, K = np.random.default_rng(7), 4
     problem = replace(kind("alone").case().problem, control=Box([-1.0, -0.25], [0.5, 0.5]))
     for values in (np.ones((1, K)), np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, -1.0, -1.0]])):
-        few, flows = sr.Dictionary(np.linspace(0.0, HORIZON, K + 1), values), Flows.of(problem.system, HORIZON)
+        few, flows = sr.Dictionary(np.linspace(0.0, HORIZON, K + 1), values), VerifiedFlows.of(problem.system, HORIZON)
         duality = Duality(problem, few, None, flows)
         slope, moved = rng.normal(size=(K, 2)), rng.normal(size=(K, 2))
-        row = Row(arb(0.25), [[arb(v) for v in piece] for piece in slope])
+        row = ConstraintRow(arb(0.25), [[arb(v) for v in piece] for piece in slope])
         constant, slopes = duality.summed([(2.0, row)], (-moved.T).tolist())
         assert np.array([[float(x.mid()) for x in piece] for piece in slopes]) == pytest.approx(moved)
         low, high = (end[:, None] for end in (problem.control.lower, problem.control.upper))
@@ -360,7 +360,7 @@ def test_a_bound_is_the_least_of_the_cost_and_of_what_rows_say_of_sizes() -> Non
         rows, constant, slope, sizes = [], 0.0, np.zeros((3, 2)), np.zeros((3, 2))
         for _ in range(count):
             y, c, g, s = rng.uniform(0.2, 1.0), rng.normal(), rng.normal(size=(3, 2)), rng.uniform(size=(3, 2))
-            rows.append((y, Row(arb(c), [[arb(v) for v in piece] for piece in g], s)))
+            rows.append((y, ConstraintRow(arb(c), [[arb(v) for v in piece] for piece in g], s)))
             constant, slope, sizes = constant + y * c, slope + y * g, sizes + y * s
         for price, costs in ((case.price, lengths * np.array([1.0, 0.25])), (None, 0.0 * lengths)):
             ends = [slope * u + (costs + sizes) * np.abs(u) for u in (low, high)]

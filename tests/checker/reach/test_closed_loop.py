@@ -15,7 +15,7 @@ from flint import arb_mat, ctx
 import sparserob_core.checker.reach.closed_loop as loops
 from sparserob_core.checker.claims.cells import prove
 from sparserob_core.checker.outcome import Broken, Clock
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly
 from sparserob_core.checker.reach.loop_tube import LoopTube, Still
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed
@@ -35,7 +35,7 @@ def made(name):
     """The loop in balls, and the one that is stepped, with its control and gains."""
     case = LOOPS[name]
     v, M = gains(np.random.default_rng(3), case)
-    kind = MeasurableLoop if case.measurable else ClosedLoop
+    kind = MeasurableLoop if case.measurable else VerifiedLoop
     loop = kind(
         case.system,
         case.start.tolist(),
@@ -300,7 +300,7 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
             ([0.0, 0.5, 1.5], [{}, {0: 0.5, 1: 0.5}, {1: 0.5, 2: 0.5}]),
             ([0.0], [{}, {0: 1.0}, {0: 1.0}]),
         ):
-            loop = ClosedLoop(
+            loop = VerifiedLoop(
                 plant,
                 [0.0],
                 [arb_mat(1, 1)] * 3,
