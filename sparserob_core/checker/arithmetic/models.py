@@ -31,6 +31,28 @@ class Frame:
     monomials: Monomials
     order: int
 
+    def number(self, value: arb) -> Model:
+        """The model of what depends on nothing."""
+        return self._of([value])
+
+    def time(self, middle: arb, half: arb) -> Model:
+        """The model of ``middle + half r``."""
+        return self._of([middle, half])
+
+    def parameter(self, place: int, middle: arb, half: arb) -> Model:
+        """The model of ``middle + half s_place``."""
+        from flint import arb_poly
+
+        found = self.number(middle)
+        if not half.is_zero():
+            found.parts[self.monomials.linear(place)] = arb_poly([half])
+        return found
+
+    def _of(self, coefficients: list[arb]) -> Model:
+        from flint import arb_poly
+
+        return Model(self, [arb_poly(coefficients), *[None] * (self.monomials.size - 1)])
+
 
 @final
 class Model:
@@ -42,30 +64,6 @@ class Model:
 
     def __init__(self, frame: Frame, parts: Sequence[Part]) -> None:
         self.frame, self.parts = frame, list(parts)
-
-    @staticmethod
-    def number(frame: Frame, value: arb) -> Model:
-        """What depends on nothing."""
-        from flint import arb_poly
-
-        return Model(frame, [arb_poly([value]), *[None] * (frame.monomials.size - 1)])
-
-    @staticmethod
-    def time(frame: Frame, middle: arb, half: arb) -> Model:
-        """``middle + half r``."""
-        from flint import arb_poly
-
-        return Model(frame, [arb_poly([middle, half]), *[None] * (frame.monomials.size - 1)])
-
-    @staticmethod
-    def parameter(frame: Frame, place: int, middle: arb, half: arb) -> Model:
-        """``middle + half s_place``."""
-        from flint import arb_poly
-
-        found = Model.number(frame, middle)
-        if not half.is_zero():
-            found.parts[frame.monomials.linear(place)] = arb_poly([half])
-        return found
 
     @property
     def constant(self) -> arb:
@@ -88,7 +86,7 @@ class Model:
         if isinstance(value, Model):
             return value
         if isinstance(value, int | float | np.integer | np.floating):
-            return Model.number(self.frame, arb(float(value)))
+            return self.frame.number(arb(float(value)))
         raise Unchecked(f"an entry of the system holds a {type(value).__name__}, expected a number")
 
     def __add__(self, other: object) -> Model:
@@ -159,7 +157,7 @@ class Model:
         from flint import arb, arb_series, ctx
 
         c = arb(self.constant.mid())
-        away = self - Model.number(self.frame, c)
+        away = self - self.frame.number(c)
         far, count = away.size.upper(), self.frame.order + self.frame.monomials.degree + 1
         before, ctx.cap = ctx.cap, count + 1
         try:
@@ -177,9 +175,9 @@ class Model:
             rests.append((abs(bound) * power).upper())
         least = min(range(count), key=lambda k: float(rests[k]))
         order = next((k for k, rest in enumerate(rests) if rest <= wanted), least)
-        found = Model.number(self.frame, coefficients[order])
+        found = self.frame.number(coefficients[order])
         for coefficient in reversed(coefficients[:order]):
-            found = found * away + Model.number(self.frame, coefficient)
+            found = found * away + self.frame.number(coefficient)
         return found._within(rests[order])
 
     def exp(self) -> Model:

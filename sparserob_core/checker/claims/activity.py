@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.duality import ConstraintRow
+from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.curved import NormBall

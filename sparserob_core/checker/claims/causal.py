@@ -20,18 +20,18 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims.answers import PEAK, WORST
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
-from sparserob_core.checker.claims.duality import ConstraintRow
+from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import arb_of, middle
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.reach.closed_loop import arb_of
+from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb
 
 MOST = 100_000  # multipliers
-PEAK, WORST = "peak", "worst"
 Pushed: TypeAlias = (
     "tuple[ConstraintRow, list[list[arb]], list[arb]]"  # a row, what disturbance and initial state give to it
 )
@@ -47,7 +47,7 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     _refuse(case)
     signals, rest = _signals(case, data), middle_of(case)
     K, m, total = case.control.pieces, case.problem.system.controls, arb(0)
-    changes = case.changes or []
+    changes = case.disturbances.changes or []
     points, measured = case.control.breakpoints, case.problem.measurements
     known_last = points[:-1] if measured is None else measured.latest(points)
     seen = [bisect_left(changes, float(t)) for t in known_last]  # blocks that began before what is known was measured
@@ -140,7 +140,7 @@ def middle_of(case: Case) -> Array:
     shape = case.problem.disturbance
     if shape is None:
         return np.zeros((0, 0))
-    return np.repeat(middle(shape)[:, None], len(case.changes or []), axis=1)
+    return np.repeat(middle(shape)[:, None], len(case.disturbances.changes or []), axis=1)
 
 
 def _until(signal: Array, blocks: int) -> bytes:
@@ -156,8 +156,9 @@ def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
             found.append(np.zeros((0, 0)))
             continue
         w = numbers(said, "causal: signal")
-        if w.shape != (shape.dimension, len(case.changes or [])):
-            raise Broken(f"causal: a signal of shape {w.shape}, expected {(shape.dimension, len(case.changes or []))}")
+        expected = shape.dimension, len(case.disturbances.changes or [])
+        if w.shape != expected:
+            raise Broken(f"causal: a signal of shape {w.shape}, expected {expected}")
         for column in np.unique(w.T, axis=0):
             if not known(shape).contains(column):
                 raise Broken(f"causal: the disturbance {column.tolist()} is not shown to be in its set")

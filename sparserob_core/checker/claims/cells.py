@@ -12,8 +12,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.claims.window import Beside
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Clock, Unchecked
-from sparserob_core.checker.reach.loop_tube import LoopTube, Still
-from sparserob_core.checker.reach.tube import Polynomial, VerifiedTube
+from sparserob_core.checker.reach.tube import LoopTube, Polynomial, Still, VerifiedTube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.sides import Bounded, Sides

@@ -5,17 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, answers_of
+from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, feedback_of
 from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
-from sparserob_core.checker.claims.constraints import followed, follows, pushed_by_middle
-from sparserob_core.checker.claims.duality import EFFORT, ConstraintRow, before
+from sparserob_core.checker.claims.constraints import pushed_by_middle
 from sparserob_core.checker.claims.window import ConstraintWindow
+from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
 
@@ -32,7 +34,7 @@ def multiplied(case: Case, priced: bool) -> arb:
     rows, pieces = weighted(case, data)
     price, touched = (case.price, touched_by(case, data)) if priced else (None, None)
     lengths, norms = case.charge not in (PEAK, WORST), norms_of(case, data) if priced else None
-    return case.duality.bound(rows, pieces, price, touched, lengths, norms) + answers_of(case).least(rows, priced)
+    return case.duality.bound(rows, pieces, price, touched, lengths, norms) + feedback_of(case).least(rows, priced)
 
 
 def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]], Any]:
@@ -54,7 +56,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
     middle = [] if bound is None else bound.interior_point().tolist()
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
-        if follows(case):
+        if case.followed.are_best:
             row = _along_adjoint(case, direction, case.problem.horizon, arb(value), disturbed=False)
         else:
             row = case.duality.row(direction, case.problem.horizon, middle, arb(value), disturbed=False)
@@ -104,7 +106,7 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
         raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
     if parameter.size:  # what is asked of the control alone is at none
         sized(parameter, case.problem.system.parameter_count, name)
-    named = answers_of(case).named(entry, name) if case.answering else None
+    named = feedback_of(case).named(entry, name) if case.answering else None
     if any(window.name == name for window in case.windows) or (case.answering and name == EQUALS and case.equalities):
         return [(y, _of_state(case, entry, (name, direction, time, parameter), named))]
     if name == EFFORT and case.charge == WORST:
@@ -120,7 +122,7 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     seen = replace(row, innovations=named.innovations)
     if time != float(case.control.breakpoints[-1]):
         return [(y, seen)]
-    begun, none = answers_of(case).following(named, entry, name), case.duality.nothing
+    begun, none = feedback_of(case).following(named, entry, name), case.duality.nothing
     zero = [[none] * direction.size] * (case.control.pieces - 1)
     return [
         (y, replace(seen, slope=[*zero, balls(-direction)])),
@@ -138,13 +140,20 @@ def _of_state(
     if window is not None:
         admissible(case, window, time, parameter)
     key = name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
-    if key not in case.rows:
-        case.rows[key] = _undisturbed(case, window, entry, said)
-    row = case.rows[key]
+    made = _rows_of(case)
+    if key not in made:
+        made[key] = _undisturbed(case, window, entry, said)
+    row = made[key]
     if named is None:
         return row
     given = named.given(direction[: case.problem.system.states], time)
     return replace(row, constant=row.constant + given, innovations=named.innovations)
+
+
+@lru_cache(maxsize=2)
+def _rows_of(case: Case) -> dict[tuple[object, ...], ConstraintRow]:
+    """Constraints that were derived before."""
+    return {}
 
 
 def _undisturbed(
@@ -154,14 +163,14 @@ def _undisturbed(
     _, direction, time, parameter = said
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
-    if follows(case):
+    if case.followed.are_best:
         row = _along_adjoint(case, c, time, limit)
     else:
         row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.answering)
-        strayed = case.strayed_at(parameter.tolist())
+        strayed = case.sources.strayed_at(parameter.tolist())
         if strayed is not None:
             row = replace(row, constant=row.constant + balls([strayed.added(c, time)[0]])[0])
-    sizes, given = case.erring(c, time, parameter.tolist())
+    sizes, given = case.sources.erring(c, time, parameter.tolist())
     row = replace(row, constant=row.constant + given, sizes=sizes)
     if window is not None and window.is_mixed:
         piece = piece_of(case, window, entry, time)
@@ -174,7 +183,7 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
     made for a duration, which of hundreds of states takes a minute each."""
     from flint import arb
 
-    worst, problem, delay = followed(case, c, driven=False), case.problem, case.problem.system.delay
+    worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
     m, begins = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
     state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
     begun = balls(np.asarray(problem.initial_state, dtype=float))

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 import numpy.typing as npt
 
-from sparserob_core.checker.claims.duality import before
+from sparserob_core.checker.claims.answers import feedback_of
+from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import RESOLVED, THIN, TOLERANCE, Unchecked
-from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.problem.timing import before
+from sparserob_core.checker.reach.states import Scene
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -257,3 +260,52 @@ class WindowUnits:
         if window.size > MOST_TIMES:
             window = window[np.unique(np.linspace(0, window.size - 1, MOST_TIMES).round().astype(int))]
         return nodes, window
+
+
+@lru_cache(maxsize=2)
+def _units_of(case: Case) -> dict[ConstraintWindow, WindowUnits]:
+    """Those that were made."""
+    return {}
+
+
+def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
+    """What violations of a constraint are judged by."""
+    made = _units_of(case)
+    if window not in made:
+        made[window] = WindowUnits(
+            case.problem,
+            case.flows,
+            case.scene,
+            window.shape,
+            window.start,
+            window.stop,
+            window.reference,
+            None if case.answering else np.abs(case.control.control(case.theta)).max(axis=1),
+            partial(nominal_sizes, case),
+        )
+    return made[window]
+
+
+@lru_cache(maxsize=2)
+def _nominal_values(case: Case) -> tuple[Array, Array]:
+    """The nominal ``(x, u)`` of the decision where every piece begins to act, and at the end, and their radii."""
+    states = case.price.nominal_states(case.pieces)
+    every = np.array([[(float(x), float(x.rad())) for x in one.entries()] for one in states])
+    seen = np.delete(every, case.problem.system.states, axis=1)  # without the 1
+    return seen[:, :, 0], seen[:, :, 1]
+
+
+def nominal_sizes(case: Case, rows: Array, gains: Array) -> Array:
+    """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``.
+
+    They are seen where every piece of the control begins to act, of ``rows (k, d)`` and ``gains (k, m)``, and never
+    too large. Under feedback, rows of the state alone count what deviations do too.
+    """
+    if case.answering and not gains.any():
+        return feedback_of(case).sizes(rows)
+    mid, rad = _nominal_values(case)
+    both = np.zeros((len(rows), mid.shape[1]))
+    d = case.problem.system.states
+    both[:, :d], both[:, d : d + gains.shape[1]] = rows, gains
+    sizes = np.abs(both @ mid.T) - np.abs(both) @ rad.T
+    return np.asarray(np.where(np.isfinite(sizes), np.maximum(sizes, 0.0), 0.0).max(axis=1, initial=0.0))

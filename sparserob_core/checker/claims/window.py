@@ -14,7 +14,6 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.kernels import BoundedInput
-from sparserob_core.checker.reach.scene import Scene
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
@@ -104,7 +103,6 @@ class Beside:
     window: ConstraintWindow
     basis: Array
     gains: Array
-    scene: Scene
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
     delivered: Sequence[BoundedInput] = ()

@@ -278,12 +278,10 @@ class Law:
 
         frame = Frame(monomials, ORDER)
         p = np.empty(1 + len(self.box.middle), dtype=object)
-        p[0] = Model.time(frame, (arb(start) + arb(stop)) / 2, (arb(stop) - arb(start)) / 2)
+        p[0] = frame.time((arb(start) + arb(stop)) / 2, (arb(stop) - arb(start)) / 2)
         for j, (middle, half) in enumerate(zip(self.box.middle, self.box.halves, strict=True)):
             wide = arb(half) if monomials.count else arb(0)
-            p[1 + j] = (
-                Model.number(frame, arb(middle)) if wide.is_zero() else Model.parameter(frame, j, arb(middle), wide)
-            )
+            p[1 + j] = frame.number(arb(middle)) if wide.is_zero() else frame.parameter(j, arb(middle), wide)
         values = phase.called(p)
         found = [[[arb_poly([])] * values.shape[1] for _ in range(values.shape[0])] for _ in range(monomials.size)]
         for (i, j), value in np.ndenumerate(values):

@@ -26,7 +26,7 @@ def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_m
     from flint import arb
 
     p = np.empty(1 + len(parameter), dtype=object)
-    p[:] = [Model.number(POINT, arb(float(value))) for value in (0.0, *parameter)]
+    p[:] = [POINT.number(arb(float(value))) for value in (0.0, *parameter)]
     found = []
     for mode in system.modes:
         table = [

@@ -16,7 +16,7 @@ from fractions import Fraction
 from functools import cached_property
 from itertools import product
 from math import inf, nextafter
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, TypeAlias, final
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from sparserob_core.control.problem.terms.windows import PathConstraint
+
+Level: TypeAlias = dict[tuple[int, ...], Any]
+"""Parts of a power series, each times the shares whose numbers are its key."""
 
 NAMES = ("A", "B", "E", "c")
 FREE: tuple[int, ...] = ()  # the key of what no parameter multiplies; others are the numbers of those that do, in order
@@ -64,7 +67,7 @@ class Sum:
 
     __slots__ = ("bent", "most", "parts")
 
-    def __init__(self, parts: dict[tuple[int, ...], Any], most: int = MOST_FACTORS, bent: bool = False) -> None:
+    def __init__(self, parts: Level, most: int = MOST_FACTORS, bent: bool = False) -> None:
         self.parts, self.most, self.bent = parts, most, bent
 
     @property
@@ -93,7 +96,7 @@ class Sum:
         return self._of(other) + -self
 
     def __mul__(self, other: object) -> Sum:
-        more, parts = self._of(other), dict[tuple[int, ...], Any]()
+        more, parts = self._of(other), Level()
         bent = self.bent or more.bent
         for one, value in self.parts.items():
             for two, factor in more.parts.items():
@@ -130,90 +133,63 @@ class Sum:
 
     __radd__, __rmul__ = __add__, __mul__
 
-    def _levels(self) -> list[dict[tuple[int, ...], Any]]:
+    @property
+    def levels(self) -> list[Level]:
         """The parts by how many factors they have, ``most + 1`` of them."""
-        found: list[dict[tuple[int, ...], Any]] = [{} for _ in range(self.most + 1)]
+        found: list[Level] = [{} for _ in range(self.most + 1)]
         for key, value in self.parts.items():
             found[len(key)][key] = value
         return found
-
-    def _joined(self, levels: list[dict[tuple[int, ...], Any]]) -> Sum:
-        return Sum({key: value for level in levels for key, value in level.items()}, self.most, True)
 
     def _through(self, function: Callable[[Any], Any]) -> Sum:
         return Sum({FREE: function(self.parts[FREE])}, self.most)
 
     def _inverse(self) -> Sum:
         """``g`` with ``f g = 1``."""
-        f, first = self._levels(), 1.0 / self.parts[FREE]
+        f, first = self.levels, 1.0 / self.parts[FREE]
         g = [{FREE: first}]
         for n in range(1, self.most + 1):
             g.append(_mixed([(-1.0, f[k], g[n - k]) for k in range(1, n + 1)], first))
-        return self._joined(g)
+        return _joined(g)
 
     def exp(self) -> Sum:
         if self.is_free:
             return self._through(np.exp)
-        f, g = self._levels(), [{FREE: np.exp(self.parts[FREE])}]
+        f, g = self.levels, [{FREE: np.exp(self.parts[FREE])}]
         for n in range(1, self.most + 1):
             g.append(_mixed([(k / n, f[k], g[n - k]) for k in range(1, n + 1)]))
-        return self._joined(g)
+        return _joined(g)
 
     def log(self) -> Sum:
         if self.is_free:
             return self._through(np.log)
-        slopes = (self._slope() * self._inverse())._levels()
-        return self._joined(
+        slopes = (_slope(self) * self._inverse()).levels
+        return _joined(
             [{FREE: np.log(self.parts[FREE])}, *(_mixed([(1.0 / n, slopes[n], ONE)]) for n in range(1, self.most + 1))]
         )
-
-    def _slope(self) -> Sum:
-        """``D f``."""
-        return Sum({key: value * float(len(key)) for key, value in self.parts.items() if key}, self.most, self.bent)
 
     def sqrt(self) -> Sum:
         """``g`` with ``g g = f``."""
         if self.is_free:
             return self._through(np.sqrt)
-        f, first = self._levels(), np.sqrt(self.parts[FREE])
+        f, first = self.levels, np.sqrt(self.parts[FREE])
         g, half = [{FREE: first}], 0.5 / first
         for n in range(1, self.most + 1):
             within = [(-1.0, g[k], g[n - k]) for k in range(1, n)]
             g.append(_mixed([(1.0, f[n], ONE), *within], half))
-        return self._joined(g)
-
-    def _circular(self) -> tuple[Sum, Sum]:
-        f, first = self._levels(), self.parts[FREE]
-        s, c = [{FREE: np.sin(first)}], [{FREE: np.cos(first)}]
-        for n in range(1, self.most + 1):
-            ahead = _mixed([(k / n, f[k], c[n - k]) for k in range(1, n + 1)])
-            c.append(_mixed([(-k / n, f[k], s[n - k]) for k in range(1, n + 1)]))
-            s.append(ahead)
-        return self._joined(s), self._joined(c)
+        return _joined(g)
 
     def sin(self) -> Sum:
-        return self._through(np.sin) if self.is_free else self._circular()[0]
+        return self._through(np.sin) if self.is_free else _circular(self.levels)[0]
 
     def cos(self) -> Sum:
-        return self._through(np.cos) if self.is_free else self._circular()[1]
+        return self._through(np.cos) if self.is_free else _circular(self.levels)[1]
 
     def tan(self) -> Sum:
-        return self._through(np.tan) if self.is_free else self._steep(np.tan, 1.0)
+        return self._through(np.tan) if self.is_free else _steep(self.levels, np.tan, 1.0)
 
     def tanh(self) -> Sum:
-        return self._through(np.tanh) if self.is_free else self._steep(np.tanh, -1.0)
-
-    def _steep(self, function: Callable[[Any], Any], sign: float) -> Sum:
-        """``g`` with ``D g = h D f`` and ``h = 1 + sign g g``, so that ``D h = 2 sign g h D f``: of sums of balls with
-        fewer that cancel."""
-        f, first = self._levels(), function(self.parts[FREE])
-        g, h = [{FREE: first}], [{FREE: 1.0 + sign * (first * first)}]
-        both = [{FREE: first * h[0][FREE]}]
-        for n in range(1, self.most + 1):
-            g.append(_mixed([(k / n, f[k], h[n - k]) for k in range(1, n + 1)]))
-            h.append(_mixed([(2.0 * sign * k / n, f[k], both[n - k]) for k in range(1, n + 1)]))
-            both.append(_mixed([(1.0, g[k], h[n - k]) for k in range(n + 1)]))
-        return self._joined(g)
+        return self._through(np.tanh) if self.is_free else _steep(self.levels, np.tanh, -1.0)
 
     def kepler(self, eccentricity: float) -> Sum:
         """``E`` with ``D E = D M + e cos E D E``."""
@@ -222,7 +198,7 @@ class Sum:
         first = kepler(self.parts[FREE], eccentricity)
         if self.is_free:
             return Sum({FREE: first}, self.most)
-        M, E, s, c = self._levels(), [{FREE: first}], [{FREE: np.sin(first)}], [{FREE: np.cos(first)}]
+        M, E, s, c = self.levels, [{FREE: first}], [{FREE: np.sin(first)}], [{FREE: np.cos(first)}]
         steep = 1.0 / (1.0 - c[0][FREE] * eccentricity)
         for n in range(1, self.most + 1):
             within = [(eccentricity * k / n, E[k], c[n - k]) for k in range(1, n)]
@@ -230,17 +206,47 @@ class Sum:
             ahead = _mixed([(k / n, E[k], c[n - k]) for k in range(1, n + 1)])
             c.append(_mixed([(-k / n, E[k], s[n - k]) for k in range(1, n + 1)]))
             s.append(ahead)
-        return self._joined(E)
+        return _joined(E)
 
 
-ONE: dict[tuple[int, ...], Any] = {FREE: 1.0}
+def _joined(levels: list[Level]) -> Sum:
+    return Sum({key: value for level in levels for key, value in level.items()}, len(levels) - 1, True)
 
 
-def _mixed(
-    terms: list[tuple[float, dict[tuple[int, ...], Any], dict[tuple[int, ...], Any]]], factor: Any = 1.0
-) -> dict[tuple[int, ...], Any]:
+def _slope(f: Sum) -> Sum:
+    """``D f``."""
+    return Sum({key: value * float(len(key)) for key, value in f.parts.items() if key}, f.most, f.bent)
+
+
+def _circular(f: list[Level]) -> tuple[Sum, Sum]:
+    """The sine and the cosine."""
+    s, c = [{FREE: np.sin(f[0][FREE])}], [{FREE: np.cos(f[0][FREE])}]
+    for n in range(1, len(f)):
+        ahead = _mixed([(k / n, f[k], c[n - k]) for k in range(1, n + 1)])
+        c.append(_mixed([(-k / n, f[k], s[n - k]) for k in range(1, n + 1)]))
+        s.append(ahead)
+    return _joined(s), _joined(c)
+
+
+def _steep(f: list[Level], function: Callable[[Any], Any], sign: float) -> Sum:
+    """``g`` with ``D g = h D f`` and ``h = 1 + sign g g``, so that ``D h = 2 sign g h D f``: of sums of balls with
+    fewer that cancel."""
+    first = function(f[0][FREE])
+    g, h = [{FREE: first}], [{FREE: 1.0 + sign * (first * first)}]
+    both = [{FREE: first * h[0][FREE]}]
+    for n in range(1, len(f)):
+        g.append(_mixed([(k / n, f[k], h[n - k]) for k in range(1, n + 1)]))
+        h.append(_mixed([(2.0 * sign * k / n, f[k], both[n - k]) for k in range(1, n + 1)]))
+        both.append(_mixed([(1.0, g[k], h[n - k]) for k in range(n + 1)]))
+    return _joined(g)
+
+
+ONE: Level = {FREE: 1.0}
+
+
+def _mixed(terms: list[tuple[float, Level, Level]], factor: Any = 1.0) -> Level:
     """A sum of products of parts, each times a number, and all of it times a ``factor``."""
-    found = dict[tuple[int, ...], Any]()
+    found = Level()
     for number, left, right in terms:
         for one, value in left.items():
             for two, other in right.items():

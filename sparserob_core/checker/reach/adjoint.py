@@ -22,10 +22,9 @@ from sparserob_core.checker.arithmetic.series import Series, middles, stacked, z
 from sparserob_core.checker.flow.segment import VerifiedSegment, solve
 from sparserob_core.checker.flow.units import balanced
 from sparserob_core.checker.outcome import Clock, Unchecked
-from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.along import CurvedSide
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 

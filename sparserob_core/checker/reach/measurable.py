@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly, middle
+from sparserob_core.checker.arithmetic.series import identity, stacked
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
+from sparserob_core.checker.reach.deviations import Deviations, of_block, rounded_radii
 from sparserob_core.checker.reach.kernels import above_chord, pushes
 from sparserob_core.checker.sets.along import CurvedSide
 from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -228,44 +230,49 @@ def _equal(P: Array, start: Array, stop: Array) -> Array:
     return np.asarray(np.where(crossing & (cut > start + least) & (cut < stop - least), cut, middle_of))
 
 
+@final
 @dataclass(frozen=True, eq=False)
-class MeasurableLoop(VerifiedLoop):
-    """`VerifiedLoop` under measurable disturbances. Its deviations are what they make of the state by the end of every
-    piece of the grid, ``(d,)`` each, and that of the initial state."""
+class MeasurableDeviations(Deviations):
+    """What measurable disturbances make of the state by the end of every piece of the ``grid``, ``(d,)`` each, through
+    a ``flow``; and the deviation of the initial state."""
 
+    flow: VerifiedFlow
+    grid: list[float]
     _ways: dict[tuple[object, ...], VerifiedKernel] = field(default_factory=dict, repr=False)
 
     @property
     def blocks(self) -> int:
         return len(self.grid) - 1
 
-    @cached_property
-    def sets(self) -> list[tuple[ConvexSet, Array]]:
-        """That of the initial state only."""
-        return [] if self.initial is None else [(self.initial, middle(self.initial))]
+    @property
+    def begun(self) -> int:
+        return self.blocks
 
     @cached_property
     def starts(self) -> list[int]:
-        d = self.system.states
-        return [0, *accumulate([d] * (self.blocks + (self.initial is not None)))]
+        return [0, *accumulate([self.flow.states] * (self.blocks + len(self.sets)))]
+
+    @cached_property
+    def sets(self) -> list[tuple[ConvexSet, Array]]:
+        return [] if self.initial is None else [(self.initial, middle(self.initial))]
 
     @cached_property
     def sides(self) -> list[Side | CurvedSide]:
-        """The sets of the deviations, which add up."""
+        """The sets of the disturbances, which add up."""
         assert self.shape is not None
         return Side.of(self.shape)
 
     def kernel(self, piece: int) -> VerifiedKernel:
         """That of a piece."""
-        return self._way(self.grid[piece], self.grid[piece + 1])
+        return self.way(self.grid[piece], self.grid[piece + 1])
 
-    def _way(self, start: float, stop: float) -> VerifiedKernel:
+    def way(self, start: float, stop: float) -> VerifiedKernel:
         """The kernel of an interval, whose parts are those between marks, in shares of each."""
         key = self.flow.alike(start, stop)
         if key not in self._ways:
             if len(self._ways) >= KEPT:
                 self._ways.clear()
-            every, onward = list[Enclosed](), self._identity
+            every, onward = list[Enclosed](), identity(self.flow.states)
             columns = slice(self.flow.driven, self.flow.driven + self.width)
             for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
                 terms = pushes(self.flow, first, last, columns)
@@ -280,61 +287,24 @@ class MeasurableLoop(VerifiedLoop):
         return self._ways[key]
 
     @cached_property
-    def seen(self) -> list[dict[int, arb_mat]]:
-        K = len(self.breakpoints) - 1
-        found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
-        if self.initial is not None:
-            found[0][self.blocks] = self._identity
-        later: tuple[int, arb_mat] = (K, self._identity)  # the piece of the control, and what is left of it
-        for piece in reversed(range(self.blocks)):
-            k = self.on(piece)
-            left = later[1] if later[0] == k else self._identity
-            if k + 1 < K:
-                found[k + 1][piece] = left
-            later = k, left * self._passed(piece)[0]
-        return found
-
-    def _entered(self, rows: list[list[arb]], block: int) -> None:
-        """Nothing: what happens within a piece counts at its end."""
-
-    def _ended(self, piece: int, state: arb_mat) -> arb_mat:
-        rows, unit = state.tolist(), self._identity
-        for i, row in enumerate(rows):
-            for j in range(len(rows)):
-                row[1 + self.starts[piece] + j] = row[1 + self.starts[piece] + j] + unit[i, j]
-        return stacked(rows)
-
-    def state(self, piece: int, time: float) -> arb_mat:
-        """The nominal state and every response at a time in a piece of the grid, before what happens in it counts."""
-        if time == self.grid[piece]:
-            return self.nodes[piece]
-        Phi, added = self._moved(piece, self.grid[piece], time)
-        return Phi * self.nodes[piece] + added
-
-    @cached_property
     def radii(self) -> Array:
-        d = self.system.states
+        d = self.flow.states
         axes = np.vstack([np.eye(d), -np.eye(d)])
         exact = Enclosed(axes, np.zeros_like(axes))
         alike: dict[int, tuple[VerifiedKernel, Array]] = {}  # kernels are kept with their numbers
-        found = []
+        found = list[Array]()
         for piece in range(self.blocks):
             kernel = self.kernel(piece)
             if id(kernel) not in alike:
                 ends = kernel.most(exact, self.sides)
                 alike[id(kernel)] = kernel, (ends.mid + ends.rad).reshape(2, d).max(axis=0)
             found.append(alike[id(kernel)][1])
-        found += [np.array(known(shape).radius) + np.abs(about) for shape, about in self.sets]
-        return np.nextafter(np.concatenate(found) * OUTWARD, np.inf)
+        return rounded_radii(found, self.sets)
 
-    def support(self, a: list[arb]) -> arb:
-        return self.supports([a])[0]
-
-    def supports(self, every: list[list[arb]]) -> list[arb]:
-        """`support` of several, ``(n, Q)``."""
+    def supports(self, every: Sequence[list[arb]]) -> list[arb]:
         from flint import arb
 
-        d, blocks = self.system.states, self.blocks
+        d, blocks = self.flow.states, self.blocks
         table = Enclosed.of(stacked(every))
         mid, rad = (part[:, : blocks * d].reshape(len(every), blocks, d) for part in (table.mid, table.rad))
         rad = np.where(rad > 1e-290, rad, 0.0)  # of exact zeros
@@ -352,17 +322,53 @@ class MeasurableLoop(VerifiedLoop):
             for place, m, r in zip((used // len(pieces)).tolist(), found.mid.tolist(), found.rad.tolist(), strict=True):
                 total[place] = total[place] + arb(m, r)
         for shape, about in self.sets:
-            for n, a in enumerate(every):
-                block = a[blocks * d :]
-                if any(not x.is_zero() for x in block):
-                    off = sum((x * arb(float(m)) for x, m in zip(block, about, strict=True)), arb(0))
-                    total[n] = total[n] + known(shape).support(block) - off
+            total = [one + of_block(shape, about, a[blocks * d :]) for one, a in zip(total, every, strict=True)]
         return total
 
-    def heights(self, state: arb_mat, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
-        product = exactly(rows) * state
-        along = (product if beside is None else product + beside).tolist()
-        return [row[0] + more for row, more in zip(along, self.supports([row[1:] for row in along]), strict=True)]
+
+@final
+@dataclass(frozen=True, eq=False)
+class MeasurableLoop(VerifiedLoop):
+    """`VerifiedLoop` under measurable disturbances."""
+
+    @cached_property
+    def deviations(self) -> MeasurableDeviations:
+        return MeasurableDeviations(self.shape, self.system.disturbances, self.initial, self.flow, self.grid)
+
+    @cached_property
+    def seen(self) -> list[dict[int, arb_mat]]:
+        K = len(self.breakpoints) - 1
+        found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
+        if self.initial is not None:
+            found[0][self.deviations.blocks] = identity(self.system.states)
+        later: tuple[int, arb_mat] = (
+            K,
+            identity(self.system.states),
+        )  # the piece of the control, and what is left of it
+        for piece in reversed(range(self.deviations.blocks)):
+            k = self.on(piece)
+            left = later[1] if later[0] == k else identity(self.system.states)
+            if k + 1 < K:
+                found[k + 1][piece] = left
+            later = k, left * self._passed(piece)[0]
+        return found
+
+    def _entered(self, rows: list[list[arb]], block: int) -> None:
+        """Nothing: what happens within a piece counts at its end."""
+
+    def _ended(self, piece: int, state: arb_mat) -> arb_mat:
+        rows, unit = state.tolist(), identity(self.system.states)
+        for i, row in enumerate(rows):
+            for j in range(len(rows)):
+                row[1 + self.deviations.starts[piece] + j] = row[1 + self.deviations.starts[piece] + j] + unit[i, j]
+        return stacked(rows)
+
+    def state(self, piece: int, time: float) -> arb_mat:
+        """The nominal state and every response at a time in a piece of the grid, before what happens in it counts."""
+        if time == self.grid[piece]:
+            return self.nodes[piece]
+        Phi, added = self._moved(piece, self.grid[piece], time)
+        return Phi * self.nodes[piece] + added
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         from flint import arb
@@ -375,12 +381,15 @@ class MeasurableLoop(VerifiedLoop):
 
     def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
         """What disturbances on a piece make of ``rows (r, d)`` at most until a time in it."""
-        return self._way(self.grid[piece], time).most(as_enclosed(rows), self.sides)
+        return self.deviations.way(self.grid[piece], time).most(as_enclosed(rows), self.deviations.sides)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """As of `VerifiedLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
         axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
-        begun, size = np.zeros(len(axes)), sum((side.far for side in self.sides), np.zeros(self.width))
+        begun, size = (
+            np.zeros(len(axes)),
+            sum((side.far for side in self.deviations.sides), np.zeros(self.deviations.width)),
+        )
         if start > self.grid[piece]:
             ends = self.under_way(piece, start, axes)
             begun = np.maximum(ends.mid + ends.rad, 0.0) * OUTWARD

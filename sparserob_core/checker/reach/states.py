@@ -15,17 +15,36 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import Series, identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.flows import VerifiedFlows
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.segment import Powers, VerifiedSegment, shifted
-from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.problem.lasting import Lasting
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
-    from flint import arb
+    from flint import arb, arb_mat
 
 PATHS_KEPT = 256  # intervals of which the states are remembered
+BOXES_KEPT = 8  # of parameters, over which states are remembered
 EFFECTS_KEPT = 16  # marks, at which the effect of every piece before is remembered; cells come one after another
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of ``x(0)`` and the set
+    of deviations from it, and the disturbance: its set and the breakpoints between which it is constant, of which some
+    components may be ``lasting`` longer."""
+
+    grid: list[float]
+    control: list[arb_mat]
+    initial_state: list[float]
+    disturbance: ConvexSet | None
+    changes: list[float]
+    initial_set: ConvexSet | None = None
+    lasting: Lasting | None = None
 
 
 @final
@@ -208,6 +227,25 @@ class States:
                 rad = self.effect(mark)[number].rad[0]
                 found += rad.reshape(*rad.shape[:1], -1, convex.dimension).sum(axis=1) @ np.array(known(convex).radius)
         return found
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StatesOverBoxes:
+    """The states that a ``scene`` reaches over boxes of parameters; those over the latest ones are remembered."""
+
+    flows: VerifiedFlows
+    scene: Scene
+    _made: dict[VerifiedFlow, States] = field(default_factory=dict, repr=False)
+
+    def over(self, box: ParameterBox) -> States:
+        """The states over a box, or over a larger one."""
+        flow = self.flows.holding(box)
+        if flow not in self._made:
+            if len(self._made) >= BOXES_KEPT:
+                self._made.pop(next(iter(self._made)))
+            self._made[flow] = States(flow, self.scene)
+        return self._made[flow]
 
 
 @final

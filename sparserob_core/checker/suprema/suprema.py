@@ -13,11 +13,11 @@ from sparserob_core.checker.arithmetic.balls import above, balls, below
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.cells import Work, prove
 from sparserob_core.checker.claims.claims import judged, precision_of
-from sparserob_core.checker.claims.constraints import along, beside, covered, divided, followed, parameters_of, tubes
+from sparserob_core.checker.claims.constraints import covered, divided, parameters_of, tubes
+from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
-from sparserob_core.checker.reach.adjoint import Worst
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.sides import Bounded, Sides
@@ -121,8 +121,8 @@ def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
     low, high = sign * reached_side, None if proven_side is None else sign * proven_side
     _margin(asked, entry, sign, high)
     case.clock.check()
-    worst = _followed(case, asked)
-    value = _witnessed(case, asked, entry, worst)
+    row = FollowedRow(case, asked.window, asked.direction)
+    value = _witnessed(case, asked, entry, row)
     if not value[1] >= low:
         raise Broken(f"{reached_side!r} is written, its witness reaches {sign * value[1]!r}")
     if not value[0] >= low:
@@ -131,10 +131,7 @@ def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
         raise Unchecked(f"{reached_side:.9g} is reached, and no bound is written on the other side")
     if value[0] > high:
         raise Broken(f"{proven_side!r} is written, its witness reaches {sign * value[0]!r}")
-    if worst is None:
-        count = _proven_in_cells(case, asked, high)
-    else:
-        count, _ = along(case, asked.window, asked.direction, worst, high)
+    count = row.prove(high)[0] if case.followed.are_possible else _proven_in_cells(case, asked, high)
     side = "above" if sense == "sup" else "below"
     return f"{reached_side:.9g} is reached, nothing is {side} {proven_side:.9g} ({count} cells)"
 
@@ -157,15 +154,7 @@ def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: flo
         raise Broken(f"a margin of {margin!r} is written, {written - high!r} follows")
 
 
-def _followed(case: Case, asked: SupremumRow) -> Worst | None:
-    """The row by its adjoint, where the system is known and does not change; ``None`` elsewhere."""
-    system = case.problem.system
-    if case.still is None or system.parameter_count or not case.alike:
-        return None
-    return followed(case, asked.window.split(asked.direction)[0])
-
-
-def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], followed: Worst | None) -> tuple[float, float]:
+def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: FollowedRow) -> tuple[float, float]:
     """The value of the row along its witness, which must be one of the problem's, between bounds."""
     problem, window, time = case.problem, asked.window, number(entry, "time")
     if not window.start <= time <= window.stop:
@@ -182,14 +171,14 @@ def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], followe
     if problem.initial_set is not None and not known(problem.initial_set).contains(deviation):
         raise Broken("the deviation of the initial state is not shown to be in its set")
     changes, signal = _signal(case, entry)
-    low, high = beside(case, window, asked.direction, time, time)
-    delivered = case.delivered_at(parameter.tolist())
+    low, high = row.beside(time, time)
+    delivered = case.sources.delivered_at(parameter.tolist())
     if delivered is not None:  # the worst errors are enclosed, whatever they are
         errors = delivered.added(window.split(asked.direction)[0], time)
         slack = 2.0 * HALF_ULP * (abs(low) + abs(high) + abs(errors[1]))
         low, high = low + errors[0] - slack, high + errors[1] + slack
-    if followed is not None:
-        value = followed.along(time, deviation, changes, signal)
+    if case.followed.are_possible:
+        value = row.worst.along(time, deviation, changes, signal)
         return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
     fine, on_grid = _following(case, changes, signal)
     state = reached(fine, time, parameter, on_grid, entry.get("deviation"))
@@ -216,7 +205,7 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
     held = ~columns_of(problem.disturbance, problem.disturbance_class, "measurable")
     jumps = (signal[:, 1:] != signal[:, :-1]) & held[:, None]
     for time, jumping in zip(changes[1:-1].tolist(), jumps.T, strict=True):
-        if (jumping & ~case.may_jump(time)).any():
+        if (jumping & ~case.disturbances.may_jump(time)).any():
             raise Broken("the disturbance jumps within a piece")
     shape, seen = known(problem.disturbance), set[tuple[float, ...]]()
     for value in case.clock.each(map(tuple, signal.T.tolist())):
@@ -234,7 +223,7 @@ def _following(case: Case, changes: Array, signal: Array | None) -> tuple[Case, 
     if case.measurable:
         problem = replace(case.problem, disturbance_class="piecewise_constant")
         case = replace(case, problem=problem, disturbance=Dictionary.indicators(changes))
-    starts = np.array(case.grid[:-1])
+    starts = np.array(case.timing.grid[:-1])
     return case, signal[:, np.searchsorted(changes, starts, side="right") - 1].tolist()
 
 

@@ -12,9 +12,8 @@ from flint import ctx
 
 from sparserob_core.checker.claims.window import Beside, ConstraintWindow
 from sparserob_core.checker.reach.kernels import BoundedInputHere
-from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.measurable import as_enclosed
-from sparserob_core.checker.reach.tube import Polynomial
+from sparserob_core.checker.reach.tube import LoopTube, Polynomial
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid
@@ -45,7 +44,7 @@ def precision():
 
 def beside(basis: np.ndarray) -> Beside:
     window = ConstraintWindow("path", Ellipsoid(np.zeros(3), np.eye(3)), 0.0, 1.0, 3)
-    return Beside(window, basis, np.zeros((len(basis), 0)), cast(Any, None), [0.0, 1.0], [], cast(Any, [Erring()]))
+    return Beside(window, basis, np.zeros((len(basis), 0)), [0.0, 1.0], [], cast(Any, [Erring()]))
 
 
 def test_a_direction_is_the_nearest_float_and_off_by_what_is_left() -> None:

@@ -14,7 +14,7 @@ from flint import ctx
 import sparserob_core as sr
 from sparserob_core.checker.claims import causal as causal_bounds
 from sparserob_core.checker.claims import claims, multipliers, replay
-from sparserob_core.checker.claims.answers import answers_of
+from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import number
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.control.policies.affine import AffinePolicy
@@ -50,10 +50,14 @@ def moved(case: Any, **change: Any) -> Any:
 
 
 REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
-    "fewer functions": (lambda: moved(case_of(), disturbance=FEWER).changes, Unchecked, "fewer functions than pieces"),
+    "fewer functions": (
+        lambda: moved(case_of(), disturbance=FEWER).disturbances.changes,
+        Unchecked,
+        "fewer functions than pieces",
+    ),
     "outputs of what is pushed at any time": (
         lambda: (
-            answers_of(
+            feedback_of(
                 case_of(
                     policy=AffinePolicy(),
                     disturbance_class="measurable",

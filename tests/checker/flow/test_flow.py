@@ -101,7 +101,7 @@ def test_a_chord_of_a_loop_is_missed_by_its_powers_and_twice_what_is_left_of_the
         ),
         state=lambda *_: stacked([[arb(1), arb(0.5)]]),
         drives=[stacked([[arb(7), arb(7)]])],
-        radii=np.array([4.0]),
+        deviations=SimpleNamespace(radii=np.array([4.0])),
     )
     with ctx.workprec(BITS):
         bound = VerifiedLoop.bent(told, 0, 0.0, 1.0, np.array([[1.0]]))

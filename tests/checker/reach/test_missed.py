@@ -21,10 +21,10 @@ import sparserob_core.checker.flow.segment as segments
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.execution import FollowedExecution
 from sparserob_core.checker.reach.measurable import Side, Together
 from sparserob_core.checker.reach.missed import BoundedInputAt
+from sparserob_core.checker.sets.known import middle
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
 

@@ -16,15 +16,14 @@ import sparserob_core as sr
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.cells import _to_blame
-from sparserob_core.checker.claims.duality import Duality
+from sparserob_core.checker.cost.duality import Duality
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import LOOKED, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.kernels import pushes
-from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.states import States
+from sparserob_core.checker.reach.states import Scene, States
 from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.expression import parse_matrix

@@ -22,8 +22,7 @@ from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.checker.problem.lasting import Lasting
-from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.states import Lines, States, _blocks, enclosed, ring
+from sparserob_core.checker.reach.states import Lines, Scene, States, _blocks, enclosed, ring
 from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.problem.system import VaryingSystem

@@ -14,8 +14,7 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.states import States
+from sparserob_core.checker.reach.states import Scene, States
 from sparserob_core.checker.reach.tube import ProjectedStates, VerifiedTube
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem

@@ -66,7 +66,7 @@ def test_a_kernel_that_is_forgotten_leaves_no_radius_to_another(monkeypatch: pyt
             loop = MeasurableLoop(
                 system, [0.0], still, none, grid.tolist(), [0.0, 1.0], [], Box([-0.1], [0.1]), law=law
             )
-            found.append(loop.radii)
+            found.append(loop.deviations.radii)
     exact = 0.1 * (np.diff(grid**2) / 2.0 + 0.001 * np.diff(grid))
     for radii in found:
         assert radii == pytest.approx(exact, rel=1e-9)

@@ -10,9 +10,8 @@ from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.sets.along import LEFT, NODES, CurvedSide, _heights, _most, rule
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope, product
 

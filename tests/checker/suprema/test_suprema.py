@@ -51,7 +51,7 @@ def witness(made: Kind, row: Array, time: float) -> dict[str, Any]:
     inwards = 1.0 - 1e-9  # a support point of an ellipsoid is on its boundary but for rounding
     middle = (made.begun.support_point(np.eye(2)) + made.begun.support_point(-np.eye(2))).mean(axis=0) / 2.0
     deviation = middle + inwards * (made.begun.support_point(w.free)[0] - middle)
-    grid = sorted({*made.case().grid, *made.motion.changes.tolist()})  # systems in pieces want all of their own
+    grid = sorted({*made.case().timing.grid, *made.motion.changes.tolist()})  # systems in pieces want all of their own
     signal = made.bound.support_point(w.blocks[0])[np.searchsorted(made.motion.changes, grid[:-1], side="right") - 1].T
     return {**said, "deviation": deviation.tolist(), "changes": grid, "disturbance": signal.tolist()}
 

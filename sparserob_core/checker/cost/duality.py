@@ -21,6 +21,7 @@ from sparserob_core.checker.cost.price import Price, Tangent
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.problem.lasting import Lasting, summed
+from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -293,12 +294,6 @@ def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
     """The pieces of a control whose beginning is a step from what was before; of a plan that repeats the end of the
     last piece too."""
     return range(0 if problem.initial_control is not None else 1, control.pieces + bool(problem.repeat))
-
-
-def before(problem: OptimalControlProblem) -> list[float]:
-    """The control that acts until the first one of a delayed system does, ``(m,)``."""
-    given = problem.initial_control
-    return [0.0] * problem.system.controls if given is None else [float(u) for u in np.asarray(given)]
 
 
 def _most(values: Sequence[arb]) -> arb:
