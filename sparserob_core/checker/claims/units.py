@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.window import ConstraintWindow
@@ -159,26 +160,21 @@ class WindowUnits:
         axes = np.vstack([np.eye(bound.dimension)[:MOST_AXES], np.ones((1, bound.dimension))])
         return [tuple(map(float, point)) for point in bound.support_point(np.vstack([axes, -axes]))]
 
+    @remembered()
     def _measured(self, parameter: tuple[float, ...], states: bool) -> tuple[Array, Array]:
         """How far the normal of every facet, or every one of the ``states``, reaches at one parameter, and the largest
         sums of absolute numbers from which these are computed, ``(k,)`` each; by one walk back through the pieces from
         every time that is looked at, as many of them together as fit."""
-        if (parameter, states) not in self._known:
-            with np.errstate(over="ignore", invalid="ignore"):
-                nodes, places = self._nodes()
-                each = len(nodes) * len(self._rows_of(states)[0])
-                each *= self.problem.system.controls + 1 + self.problem.system.disturbances
-                parts = np.array_split(places, min(places.size, -(-places.size * each // MOST_HELD)))
-                every = [self._walked(parameter, states, nodes[: part[-1] + 1], part) for part in parts]
-                found = np.max([one for one, _ in every], axis=0), np.max([sums for _, sums in every], axis=0)
-            if not all(np.isfinite(numbers).all() for numbers in found):
-                raise Unchecked("the response grows beyond what numbers can hold")
-            self._known[parameter, states] = found
-        return self._known[parameter, states]
-
-    @cached_property
-    def _known(self) -> dict[tuple[tuple[float, ...], bool], tuple[Array, Array]]:
-        return {}
+        with np.errstate(over="ignore", invalid="ignore"):
+            nodes, places = self._nodes()
+            each = len(nodes) * len(self._rows_of(states)[0])
+            each *= self.problem.system.controls + 1 + self.problem.system.disturbances
+            parts = np.array_split(places, min(places.size, -(-places.size * each // MOST_HELD)))
+            every = [self._walked(parameter, states, nodes[: part[-1] + 1], part) for part in parts]
+            found = np.max([one for one, _ in every], axis=0), np.max([sums for _, sums in every], axis=0)
+        if not all(np.isfinite(numbers).all() for numbers in found):
+            raise Unchecked("the response grows beyond what numbers can hold")
+        return found
 
     def _rows_of(self, states: bool) -> tuple[Array, Array]:
         """The normals of the facets on the state and on the control, or every state: ``(k, d)``, ``(k, m)``."""

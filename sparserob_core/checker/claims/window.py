@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.closed_loop import exactly
@@ -106,7 +107,6 @@ class Beside:
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
     delivered: Sequence[BoundedInput] = ()
-    _directions: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     def added(
         self,
@@ -144,20 +144,16 @@ class Beside:
             found = [self._erring(poly, one, c, missed, times, within) for poly, c, missed in rows]
         return list(found)
 
+    @remembered(lambda: DIRECTIONS_KEPT, lambda self, z: z.tobytes())
     def directions(self, z: Array) -> tuple[Array, Array]:
         """``c = z'basis`` as floats ``(k, d)``, and how far they are off at most: where nothing is added up, and mostly
         elsewhere, they are exact."""
-        key = z.tobytes()
-        if key not in self._directions:
-            exact = (exactly(z) * exactly(self.basis)).entries()
-            floats = [float(x) for x in exact]
-            left = [x - _exact(c) for x, c in zip(exact, floats, strict=True)]
-            off = [0.0 if x.is_zero() else above(abs(x)) for x in left]
-            if len(self._directions) >= DIRECTIONS_KEPT:
-                self._directions.clear()
-            shape = len(z), self.basis.shape[1]
-            self._directions[key] = np.reshape(floats, shape), np.reshape(off, shape)
-        return self._directions[key]
+        exact = (exactly(z) * exactly(self.basis)).entries()
+        floats = [float(x) for x in exact]
+        left = [x - _exact(c) for x, c in zip(exact, floats, strict=True)]
+        off = [0.0 if x.is_zero() else above(abs(x)) for x in left]
+        shape = len(z), self.basis.shape[1]
+        return np.reshape(floats, shape), np.reshape(off, shape)
 
     @staticmethod
     def _erring(

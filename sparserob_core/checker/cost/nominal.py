@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, rational
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import around, identity, stacked, zeros
 from sparserob_core.checker.flow.flow import FlowPart, VerifiedFlow
 from sparserob_core.checker.flow.segment import VerifiedSegment
@@ -117,9 +118,6 @@ class NominalMotion:
 
     problem: OptimalControlProblem
     flow: VerifiedFlow
-    _steps: dict[tuple[object, ...], arb_mat] = field(default_factory=dict, repr=False)
-    _weights: dict[tuple[object, ...], arb_mat] = field(default_factory=dict, repr=False)
-    _tables: dict[VerifiedSegment, tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def begin(self) -> arb_mat:
@@ -156,26 +154,23 @@ class NominalMotion:
         side, corner = (-(Q * r)).entries(), (r.transpose() * Q * r)[0, 0]
         return stacked([*([*row, b] for row, b in zip(Q.tolist(), side, strict=True)), [*side, corner]])
 
+    @remembered(key=lambda self, start, stop: self.flow.alike(start, stop))
     def step(self, start: float, stop: float) -> arb_mat:
         """Return what an interval makes of ``z``, a square matrix."""
-        key = self.flow.alike(start, stop)
-        if key not in self._steps:
-            Phi, Gamma, Delta = self.flow.over(start, stop)
-            self._steps[key] = self._lift(Phi.beside(Gamma).beside(Delta).matrix, 1)
-        return self._steps[key]
+        Phi, Gamma, Delta = self.flow.over(start, stop)
+        return self._lift(Phi.beside(Gamma).beside(Delta).matrix, 1)
 
+    @remembered(key=lambda self, start, stop: self.flow.alike(start, stop))
     def weight(self, start: float, stop: float) -> arb_mat:
         """Return what an interval costs as a quadratic form of the ``z`` at its beginning."""
-        key, size = self.flow.alike(start, stop), self.running.nrows()
-        if key not in self._weights:
-            whole, passed = zeros(size, size), identity(size)
-            for part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():
-                step, cost = self._integrate(part)
-                for _ in range(part.doublings):
-                    step, cost = step * step, cost + step.transpose() * cost * step
-                whole, passed = whole + passed.transpose() * cost * passed, step * passed
-            self._weights[key] = whole
-        return self._weights[key]
+        size = self.running.nrows()
+        whole, passed = zeros(size, size), identity(size)
+        for part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():
+            step, cost = self._integrate(part)
+            for _ in range(part.doublings):
+                step, cost = step * step, cost + step.transpose() * cost * step
+            whole, passed = whole + passed.transpose() * cost * passed, step * passed
+        return whole
 
     def _integrate(self, part: FlowPart) -> tuple[arb_mat, arb_mat]:
         """Return what a share of a segment makes of ``z``, and what that costs.
@@ -195,18 +190,15 @@ class NominalMotion:
         every, pushed = (arb_mat(count * size, size, table.entries()) for table in (terms, pushed))
         return step + off, every.transpose() * pushed + missed * part.length
 
+    @remembered(lambda: KEPT)
     def _tabulate(self, segment: VerifiedSegment) -> tuple[arb_mat, arb_mat, arb_mat]:
         """Return the terms of a segment's flow on ``z`` and their products with the cost per time, a row for each; and
         what they leave out."""
         from flint import arb_mat
 
-        if segment not in self._tables:
-            if len(self._tables) >= KEPT:
-                self._tables.clear()
-            terms = [self._lift(X.matrix, int(not n)) for n, X in enumerate(segment.terms)]
-            table, priced = ([X.entries() for X in some] for some in (terms, [self.running * X for X in terms]))
-            self._tables[segment] = arb_mat(table), arb_mat(priced), self._lift(around(segment.off), 0)
-        return self._tables[segment]
+        terms = [self._lift(X.matrix, int(not n)) for n, X in enumerate(segment.terms)]
+        table, priced = ([X.entries() for X in some] for some in (terms, [self.running * X for X in terms]))
+        return arb_mat(table), arb_mat(priced), self._lift(around(segment.off), 0)
 
     def _lift(self, term: arb_mat, one: int) -> arb_mat:
         """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square one on ``z``, of

@@ -15,6 +15,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, middles, products, zeros
 from sparserob_core.checker.flow.law import Law, ParameterBox, Stretch
 from sparserob_core.checker.flow.plant import Plant
@@ -74,22 +75,15 @@ class VerifiedFlow:
     sharp: float = SHARP
     _segments: dict[tuple[float, float], VerifiedSegment] = field(default_factory=dict, repr=False)
     _longest: dict[float, float] = field(default_factory=dict, repr=False)
-    _over: dict[tuple[object, ...], tuple[Series, Series]] = field(default_factory=dict, repr=False)
-    _ends: dict[tuple[int, tuple[float, float]], Series] = field(default_factory=dict, repr=False)
     _about: dict[tuple[int, float], tuple[Array, Array]] = field(default_factory=dict, repr=False)
-    _points: dict[tuple[float, ...], VerifiedFlow] = field(default_factory=dict, repr=False)
-    _weights: dict[tuple[float, ...], StateWeights] = field(default_factory=dict, repr=False)
 
+    @remembered(lambda: POINTS_KEPT, lambda self, parameter: tuple(map(float, parameter)))
     def at(self, parameter: Sequence[float]) -> VerifiedFlow:
         """The flow at one parameter."""
         point = tuple(map(float, parameter))
         if point == self.box.middle and not self.degree:
             return self
-        if point not in self._points:
-            if len(self._points) >= POINTS_KEPT:
-                self._points.clear()
-            self._points[point] = VerifiedFlow(self.plant, self.until, ParameterBox(point, (0.0,) * len(point)))
-        return self._points[point]
+        return VerifiedFlow(self.plant, self.until, ParameterBox(point, (0.0,) * len(point)))
 
     def sharper(self, sharp: float) -> VerifiedFlow:
         """The flow anew, of whose states a guess leaves out less."""
@@ -168,34 +162,25 @@ class VerifiedFlow:
         still = self.law.stretches[place].is_still
         return (place, difference(stop, start)) if still else (-1 - place, (start, stop))
 
+    @remembered(lambda: KEPT, lambda self, start, stop: self.kind(start, stop))
     def step(self, start: float, stop: float) -> Series:
         """``[Phi Gamma]``, what an interval from one mark to the next makes of states and of inputs."""
-        key = self.kind(start, stop)
-        if key not in self._ends:
-            if len(self._ends) >= KEPT:
-                self._ends.clear()
-            segment, share = self.segment(start, stop)
-            self._ends[key] = segment.at(share)
-        return self._ends[key]
+        segment, share = self.segment(start, stop)
+        return segment.at(share)
 
+    @remembered(lambda: KEPT, lambda self, start, stop: self.alike(start, stop))
     def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
         """What an interval makes of a state, of controls that stay the same (a drift among them), and of such
         disturbances."""
-        key = self.alike(start, stop)
-        if key not in self._over:
-            whole: tuple[Series, Series] | None = None
-            for part in self.parts(start, stop):
-                both = part.segment.at(part.share)
-                Phi, pushed = both.columns(0, self.states), both.columns(self.states, None)
-                for _ in range(part.doublings):
-                    Phi, pushed = Phi * Phi, Phi * pushed + pushed
-                whole = (Phi, pushed) if whole is None else (Phi * whole[0], Phi * whole[1] + pushed)
-            assert whole is not None
-            if len(self._over) >= KEPT:
-                self._over.clear()
-            self._over[key] = whole
-        Phi, pushed = self._over[key]
-        return Phi, pushed.columns(0, self.driven), pushed.columns(self.driven, None)
+        whole: tuple[Series, Series] | None = None
+        for part in self.parts(start, stop):
+            both = part.segment.at(part.share)
+            Phi, pushed = both.columns(0, self.states), both.columns(self.states, None)
+            for _ in range(part.doublings):
+                Phi, pushed = Phi * Phi, Phi * pushed + pushed
+            whole = (Phi, pushed) if whole is None else (Phi * whole[0], Phi * whole[1] + pushed)
+        assert whole is not None
+        return whole[0], whole[1].columns(0, self.driven), whole[1].columns(self.driven, None)
 
     def about(self, start: float, stop: float) -> tuple[Array, Array, Array]:
         """`over` in floats, off by their rounding, of which units of rows are made, and no claim."""
@@ -298,16 +283,12 @@ class VerifiedFlow:
         stretch = self.law.stretches[self._place(start, stop)]
         return *stretch.sizes, stretch.units
 
+    @remembered(lambda: WEIGHTS_KEPT, lambda self, grid: tuple(grid))
     def weights(self, grid: Sequence[float]) -> StateWeights:
         """What the state at the end of a grid, which begins at 0, is made of, where the parameters are known."""
-        key = tuple(grid)
-        if key not in self._weights:
-            if len(self._weights) >= WEIGHTS_KEPT:
-                self._weights.clear()
-            parts = [self.over(*ends) for ends in pairwise(grid)]
-            after = products([part[0] for part in parts])
-            control, disturbance = (
-                [(Z * part[i]).matrix for Z, part in zip(after[1:], parts, strict=True)] for i in (1, 2)
-            )
-            self._weights[key] = StateWeights(after[0].matrix, control, disturbance)
-        return self._weights[key]
+        parts = [self.over(*ends) for ends in pairwise(grid)]
+        after = products([part[0] for part in parts])
+        control, disturbance = (
+            [(Z * part[i]).matrix for Z, part in zip(after[1:], parts, strict=True)] for i in (1, 2)
+        )
+        return StateWeights(after[0].matrix, control, disturbance)

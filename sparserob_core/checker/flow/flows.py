@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.law import Law, ParameterBox, most
 from sparserob_core.checker.flow.plant import Plant
@@ -32,8 +33,6 @@ class VerifiedFlows:
     plant: Plant
     until: float
     box: ParameterBox = ParameterBox()  # noqa: RUF009  immutable
-    _made: dict[tuple[ParameterBox, int], VerifiedFlow] = field(default_factory=dict, repr=False)
-    _close: dict[tuple[ParameterBox, int], bool] = field(default_factory=dict, repr=False)
 
     @staticmethod
     def of(system: System, until: float) -> VerifiedFlows:
@@ -55,15 +54,10 @@ class VerifiedFlows:
         """That of expansions over boxes."""
         return DEGREES.get(len(self.box.middle), 2)
 
+    @remembered(lambda: KEPT)
     def over(self, box: ParameterBox, degree: int) -> VerifiedFlow:
         """The flow over a box, to a degree."""
-        if not degree:
-            return self.at(())
-        if (box, degree) not in self._made:
-            if len(self._made) >= KEPT:
-                self._made.pop(next(iter(self._made)))
-            self._made[box, degree] = VerifiedFlow(self.plant, self.until, box, degree, self.timing)
-        return self._made[box, degree]
+        return VerifiedFlow(self.plant, self.until, box, degree, self.timing) if degree else self.at(())
 
     @cached_property
     def timing(self) -> Law:
@@ -95,18 +89,17 @@ class VerifiedFlows:
         """Whether nothing changes with time, or nothing is uncertain: then flows are cheap."""
         return not self.box.middle or all(one.is_still for one in self.timing.stretches)
 
+    @remembered()
     def _is_close(self, box: ParameterBox, degree: int) -> bool:
         """Whether little is left out over a box, to a degree."""
-        if (box, degree) not in self._close:
-            try:
-                flow = self.over(box, degree)
-                Phi, units = flow.over(0.0, self.until)[0], flow.law.units
-                off = np.array([[float(x.rad()) for x in row] for row in Phi.parts[0].tolist()])
-                size, lost = ((one * units / units[:, None]).max() for one in (Phi.size, off))
-                self._close[box, degree] = bool(lost <= CLOSE * max(1.0, size))
-            except Unchecked:
-                self._close[box, degree] = False
-        return self._close[box, degree]
+        try:
+            flow = self.over(box, degree)
+            Phi, units = flow.over(0.0, self.until)[0], flow.law.units
+        except Unchecked:
+            return False
+        off = np.array([[float(x.rad()) for x in row] for row in Phi.parts[0].tolist()])
+        size, lost = ((one * units / units[:, None]).max() for one in (Phi.size, off))
+        return bool(lost <= CLOSE * max(1.0, size))
 
     def _axis(self, box: ParameterBox) -> int:
         """The parameter that moves the system most across a box."""

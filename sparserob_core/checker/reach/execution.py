@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Clock
@@ -39,7 +40,6 @@ class FollowedExecution(BoundedInputHere):
     breakpoints: Array
     pieces: Sequence[arb_mat]
     clock: Clock = field(default_factory=Clock)
-    _known: dict[bytes, SupportIntegrals] = field(default_factory=dict, repr=False)
 
     @cached_property
     def motion(self) -> AdjointFlow:
@@ -49,15 +49,12 @@ class FollowedExecution(BoundedInputHere):
         B = stacked([[x * (i not in self.problem.commanded) for x in row[:m]] for i, row in enumerate(B.tolist())])
         return AdjointFlow.of(A, B, float(self.breakpoints[-1]), self.clock)
 
+    @remembered(key=lambda self, c: min((c + 0.0).tobytes(), (0.0 - c).tobytes()))
     def absolute(self, c: Array) -> SupportIntegrals:
         """The integrals of ``|c'e^{A s} B_j|`` of a direction ``c (d,)``, which is exact; its opposite has the same."""
-        exact = c + 0.0
-        key = min(exact.tobytes(), (0.0 - exact).tobytes())
-        if key not in self._known:
-            ends = np.eye(self.shares.size)
-            sides = [Side(np.stack([one, -one]), 0.0 * ends[:2]) for one in ends]
-            self._known[key] = SupportIntegrals(AdjointRow.of(self.motion, exact), slice(None), sides)
-        return self._known[key]
+        ends = np.eye(self.shares.size)
+        sides = [Side(np.stack([one, -one]), 0.0 * ends[:2]) for one in ends]
+        return SupportIntegrals(AdjointRow.of(self.motion, c + 0.0), slice(None), sides)
 
     def integrals(self, c: Array, times: Array, points: Array) -> tuple[Array, Array]:
         """``F_j`` at the ages ``times (k,)`` minus ``points (q,)``, exactly, between ``(k, q, m)`` and ``(k, q, m)``; 0

@@ -9,7 +9,7 @@ is best there stands for all, and where another one could be better, by how much
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, final
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
@@ -238,7 +239,6 @@ class MeasurableDeviations(Deviations):
 
     flow: VerifiedFlow
     grid: list[float]
-    _ways: dict[tuple[object, ...], VerifiedKernel] = field(default_factory=dict, repr=False)
 
     @property
     def blocks(self) -> int:
@@ -266,25 +266,21 @@ class MeasurableDeviations(Deviations):
         """That of a piece."""
         return self.way(self.grid[piece], self.grid[piece + 1])
 
+    @remembered(lambda: KEPT, lambda self, start, stop: self.flow.alike(start, stop))
     def way(self, start: float, stop: float) -> VerifiedKernel:
         """The kernel of an interval, whose parts are those between marks, in shares of each."""
-        key = self.flow.alike(start, stop)
-        if key not in self._ways:
-            if len(self._ways) >= KEPT:
-                self._ways.clear()
-            every, onward = list[Enclosed](), identity(self.flow.states)
-            columns = slice(self.flow.driven, self.flow.driven + self.width)
-            for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
-                terms = pushes(self.flow, first, last, columns)
-                every.append(product(Enclosed.of(onward), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
-                onward = onward * self.flow.over(first, last)[0].matrix
-            most = max(len(one.mid) for one in every)
-            mid, rad = (
-                np.array([np.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in parts])
-                for parts in zip(*((one.mid, one.rad) for one in every), strict=True)
-            )
-            self._ways[key] = VerifiedKernel(mid, rad.sum(axis=1) * OUTWARD)
-        return self._ways[key]
+        every, onward = list[Enclosed](), identity(self.flow.states)
+        columns = slice(self.flow.driven, self.flow.driven + self.width)
+        for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
+            terms = pushes(self.flow, first, last, columns)
+            every.append(product(Enclosed.of(onward), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
+            onward = onward * self.flow.over(first, last)[0].matrix
+        most = max(len(one.mid) for one in every)
+        mid, rad = (
+            np.array([np.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in parts])
+            for parts in zip(*((one.mid, one.rad) for one in every), strict=True)
+        )
+        return VerifiedKernel(mid, rad.sum(axis=1) * OUTWARD)
 
     @cached_property
     def radii(self) -> Array:

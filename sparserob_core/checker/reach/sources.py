@@ -17,7 +17,7 @@ from sparserob_core.checker.problem.timing import Timing, before
 from sparserob_core.checker.reach.execution import FollowedExecution
 from sparserob_core.checker.reach.kernels import BoundedInput, BoundedInputHere
 from sparserob_core.checker.reach.measurable import Side, Together
-from sparserob_core.checker.reach.missed import BoundedInputAt, BoundedInputOver
+from sparserob_core.checker.reach.missed import BoundedInputAt, BoundedInputOver, SizedInput
 from sparserob_core.checker.sets.known import middle
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.sip.convex_set import Array
@@ -61,9 +61,10 @@ class Sources:
 
     def _missing(self, *errors: Any, **more: Any) -> BoundedInput:
         """What is missed at every parameter of the system."""
+        entering = SizedInput(*errors, **more)
         if self.flows.box.middle:
-            return BoundedInputOver(self.flows, *errors, **more)
-        return BoundedInputAt(self.flows.at(()), *errors, **more)
+            return BoundedInputOver(self.flows, entering)
+        return BoundedInputAt(self.flows.at(()), entering)
 
     def strayed_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
         """`strayed` at one parameter."""

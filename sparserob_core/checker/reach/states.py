@@ -13,6 +13,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import Series, identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
@@ -62,9 +63,6 @@ class States:
     _driven: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
     _made: dict[tuple[int, ...], Series] = field(default_factory=dict, repr=False)
     _inputs: dict[int, Series] = field(default_factory=dict, repr=False)
-    _paths: dict[int, Powers] = field(default_factory=dict, repr=False)
-    _rows: dict[tuple[int, bytes], tuple[Lines, VerifiedSegment]] = field(default_factory=dict, repr=False)
-    _effects: dict[int, tuple[Enclosed, Enclosed]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def marks(self) -> list[float]:
@@ -118,21 +116,18 @@ class States:
             self._driven[level, number] = self._made[key]
         return self._driven[level, number]
 
+    @remembered(lambda: EFFECTS_KEPT)
     def effect(self, mark: int) -> tuple[Enclosed, Enclosed]:
         """What the state at 0, ``(M, d, d)``, and the disturbance on every interval before a mark, ``(M, d, mark mw)``,
         made of the state there: by blocks of 1, 2, 4, ... intervals, each carried on by those that follow it."""
-        if mark not in self._effects:
-            d, blocks = self.flow.states, [self._block(*one) for one in _blocks(mark)]
-            monomials = self.flow.monomials
-            after, found = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
-            for block in reversed(blocks):
-                found.insert(1, ring(monomials, single(after), self._floats[block]))
-                after = after * self._tables[block][0]
-            mid, rad = (np.concatenate([getattr(one, name) for one in found], axis=2) for name in ("mid", "rad"))
-            if len(self._effects) >= EFFECTS_KEPT:
-                self._effects.clear()
-            self._effects[mark] = single(after), Enclosed(mid, rad)
-        return self._effects[mark]
+        d, blocks = self.flow.states, [self._block(*one) for one in _blocks(mark)]
+        monomials = self.flow.monomials
+        after, found = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
+        for block in reversed(blocks):
+            found.insert(1, ring(monomials, single(after), self._floats[block]))
+            after = after * self._tables[block][0]
+        mid, rad = (np.concatenate([getattr(one, name) for one in found], axis=2) for name in ("mid", "rad"))
+        return single(after), Enclosed(mid, rad)
 
     def _block(self, level: int, number: int) -> int:
         """The number of what ``2^level`` intervals in a row make of the state before them, and of the disturbances on
@@ -197,24 +192,17 @@ class States:
             found.append((scene.initial_set, Enclosed(*(np.swapaxes(p, 2, 3)[None] for p in (begun.mid, begun.rad)))))
         return Enclosed(state.mid[..., 0], state.rad[..., 0]), found
 
+    @remembered(lambda: PATHS_KEPT)
     def _path(self, place: int) -> Powers:
         """The undisturbed state from one mark to the next, ``(d, 1)``."""
-        if place not in self._paths:
-            if len(self._paths) >= PATHS_KEPT:
-                self._paths.clear()
-            segment, _ = self.flow.segment(self.marks[place], self.marks[place + 1])
-            control = self.scene.control[min(self.pieces[place], len(self.scene.control) - 1)]
-            self._paths[place] = segment.applied(self.node(place).above(control))
-        return self._paths[place]
+        segment, _ = self.flow.segment(self.marks[place], self.marks[place + 1])
+        control = self.scene.control[min(self.pieces[place], len(self.scene.control) - 1)]
+        return segment.applied(self.node(place).above(control))
 
+    @remembered(lambda: PATHS_KEPT, lambda self, segment, basis: (segment, basis.tobytes()))
     def _lines(self, segment: VerifiedSegment, basis: Array) -> Lines:
         """Rows of a segment."""
-        key = id(segment), basis.tobytes()
-        if key not in self._rows:
-            if len(self._rows) >= PATHS_KEPT:
-                self._rows.clear()
-            self._rows[key] = Lines.of(segment, basis), segment  # which is kept with its number
-        return self._rows[key][0]
+        return Lines.of(segment, basis)
 
     def blur(self, place: int) -> Array:
         """About how much of the state at a mark, ``(d,)``, is due to the size of the box of parameters and unknown."""
@@ -236,16 +224,14 @@ class StatesOverBoxes:
 
     flows: VerifiedFlows
     scene: Scene
-    _made: dict[VerifiedFlow, States] = field(default_factory=dict, repr=False)
 
     def over(self, box: ParameterBox) -> States:
         """The states over a box, or over a larger one."""
-        flow = self.flows.holding(box)
-        if flow not in self._made:
-            if len(self._made) >= BOXES_KEPT:
-                self._made.pop(next(iter(self._made)))
-            self._made[flow] = States(flow, self.scene)
-        return self._made[flow]
+        return self._of(self.flows.holding(box))
+
+    @remembered(lambda: BOXES_KEPT)
+    def _of(self, flow: VerifiedFlow) -> States:
+        return States(flow, self.scene)
 
 
 @final

@@ -13,6 +13,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly
@@ -219,7 +220,6 @@ class LoopTube:
     basis: Array
     gains: Array
     flow: Around = Around()  # noqa: RUF009  immutable
-    _heights: dict[tuple[int, float, bytes], Enclosed] = field(default_factory=dict, repr=False)
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
         """As `VerifiedTube.cells`, with the chord as polynomial; of its error `expansion` is due to the length of the
@@ -235,15 +235,13 @@ class LoopTube:
             for chord, error, length in zip(chords.T, lost, bent, strict=True)
         ]
 
+    @remembered(key=lambda self, piece, time, z: (piece, time, z.tobytes()))
     def _height(self, piece: int, time: float, z: Array) -> Enclosed:
         """The largest ``c'x`` at a time in a piece of the grid, ``(k,)``."""
-        key = piece, time, z.tobytes()
-        if key not in self._heights:
-            beside = None
-            if self.gains.shape[1]:
-                beside = exactly(_combined(z, self.gains)) * self.loop.answers(self.loop.on(piece))
-            self._heights[key] = _of_column(self.loop.highest(piece, time, _combined(z, self.basis), beside))
-        return self._heights[key]
+        beside = None
+        if self.gains.shape[1]:
+            beside = exactly(_combined(z, self.gains)) * self.loop.answers(self.loop.on(piece))
+        return _of_column(self.loop.highest(piece, time, _combined(z, self.basis), beside))
 
 
 @final

@@ -68,7 +68,7 @@ def test_what_a_direction_is_off_by_is_added_as_along_the_axes() -> None:
     one = beside(basis)
     c, off = one.directions(z)
     for off_by in (off, np.array([[1e-3, 0.0, 2e-3]])):
-        one._directions[z.tobytes()] = c, off_by
+        one.__dict__["_directions_remembered"] = {z.tobytes(): (c, off_by)}
         for stop in (0.0, 1.0):
             (found,) = one.added([none], 0.0, stop, z)
             top = found.coefficients.sum() + found.error

@@ -210,7 +210,7 @@ def test_a_cost_without_states_asks_for_no_weight() -> None:
     problem = replace(everything(False), cost=sr.Cost(control={"R": [[0.05]]}))
     nominal = nominal_of(problem, (0.05,))
     assert nominal.weight(0.0, 1.3) == nominal.running * 0
-    assert not nominal._tables
+    assert "_tabulate_remembered" not in nominal.__dict__
 
 
 def test_a_plant_that_grows_is_resolved_by_more_bits_and_by_a_sharper_guess() -> None:

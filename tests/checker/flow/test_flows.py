@@ -127,7 +127,7 @@ def test_no_more_flows_are_remembered_than_are_kept(monkeypatch: pytest.MonkeyPa
     every = moving(*SYSTEM)
     for k in range(6):
         every.over(ParameterBox((0.1 * k,), (0.01,)), 2)
-    assert len(every._made) == 3
+    assert len(every.__dict__["_over_remembered"]) == 3
 
 
 def test_entries_that_are_ever_other_than_0_or_depend_on_parameters_are_links() -> None:
