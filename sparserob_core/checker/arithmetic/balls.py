@@ -14,6 +14,13 @@ if TYPE_CHECKING:
     from flint import arb, fmpq
 
 
+def ball(value: float) -> arb:
+    """An exact number as a ball."""
+    from flint import arb
+
+    return arb(float(value))
+
+
 def balls(vector: Sequence[float] | Array) -> list[arb]:
     """Exact numbers as balls."""
     from flint import arb

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Unchecked
 
@@ -68,25 +69,19 @@ class Model:
     @property
     def constant(self) -> arb:
         """What does not depend on anything."""
-        from flint import arb
-
         first = self.parts[0]
-        return arb(0) if first is None else first[0]
+        return ball(0) if first is None else first[0]
 
     @property
     def size(self) -> arb:
         """The most that it can be."""
-        from flint import arb
-
-        return sum((_size(part) for part in self.parts if part is not None), arb(0))
+        return sum((_size(part) for part in self.parts if part is not None), ball(0))
 
     def _other(self, value: object) -> Model:
-        from flint import arb
-
         if isinstance(value, Model):
             return value
         if isinstance(value, int | float | np.integer | np.floating):
-            return self.frame.number(arb(float(value)))
+            return self.frame.number(ball(float(value)))
         raise Unchecked(f"an entry of the system holds a {type(value).__name__}, expected a number")
 
     def __add__(self, other: object) -> Model:
@@ -207,26 +202,22 @@ class Model:
 
 
 def _size(part: arb_poly) -> arb:
-    from flint import arb
-
-    return sum(map(abs, part.coeffs()), arb(0))
+    return sum(map(abs, part.coeffs()), ball(0))
 
 
 def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -> arb:
     """How large the terms of a product are whose degree in the parameters is more than is kept."""
-    from flint import arb
-
     if not monomials.degree:
-        return arb(0)
-    sizes = [[arb(0)] * (monomials.degree + 1) for _ in range(2)]
+        return ball(0)
+    sizes = [[ball(0)] * (monomials.degree + 1) for _ in range(2)]
     for side, parts in zip(sizes, (left, right), strict=True):
         for degree, part in zip(monomials.degrees, parts, strict=True):
             if part is not None:
                 side[degree] = side[degree] + _size(part)
-    total = arb(0)
+    total = ball(0)
     for i, size in enumerate(sizes[0]):
         if i and not size.is_zero():
-            total = total + size * sum(sizes[1][monomials.degree + 1 - i :], arb(0))
+            total = total + size * sum(sizes[1][monomials.degree + 1 - i :], ball(0))
     return total
 
 

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls, below
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.arithmetic.balls import ball, balls, below
+from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow, steps
 from sparserob_core.checker.cost.effort import at_most
 from sparserob_core.checker.cost.gains import GainsBound, reach
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.problem.timing import before
-from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import SwitchedSystem
@@ -172,37 +172,33 @@ class VerifiedFeedback:
     def cost(self) -> arb:
         """The cost of the control; where absolute values are charged as an effort, the written one, which is shown to
         be none too small."""
-        from flint import arb
-
-        case, total = self.case, arb(0)
+        case, total = self.case, ball(0)
         if case.charge not in (PEAK, WORST):
             return case.price.of(case.pieces)
         squares = case.price.squares(case.pieces)
         if case.charge == WORST:
-            written = arb(number(case.certificate, "cost"))
-            terms = max(case.price.added(case.pieces, arb(0)), case.price.terms(case.pieces))
-            rounded = CANCELLED * arb(terms if case.price.is_quadratic else 0.0)
+            written = ball(number(case.certificate, "cost"))
+            terms = max(case.price.added(case.pieces, ball(0)), case.price.terms(case.pieces))
+            rounded = CANCELLED * ball(terms if case.price.is_quadratic else 0.0)
             self._effort(written - squares + FIGURES * abs(written).max(rounded))
             return written.max(squares)  # an effort is never less than 0
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
-                u, row = arb(float(case.theta[i, k])), self.loop.effects[k][i]
+                u, row = ball(case.theta[i, k]), self.loop.effects[k][i]
                 height = (u + self.support(row)).max(-u + self.support([-x for x in row]))
                 total = total + price * height
         return total + squares
 
     def _effort(self, limit: arb) -> None:
         """Show that no deviation causes an effort beyond a limit."""
-        from flint import arb
-
         case, loop = self.case, self.loop
         a, A = [], []
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
-                a.append(price * arb(float(case.theta[i, k])))
+                a.append(price * ball(case.theta[i, k]))
                 A.append([price * x for x in loop.effects[k][i]])
         deviations = loop.deviations
-        axes = [[arb(int(b == axis)) for b in range(deviations.starts[-1])] for axis in range(deviations.starts[-1])]
+        axes = [[ball(int(b == axis)) for b in range(deviations.starts[-1])] for axis in range(deviations.starts[-1])]
         reach = np.array([float(x.mid()) for x in deviations.supports(axes)])
         at_most(a, A, deviations.support, reach, limit, case.clock)
 
@@ -213,19 +209,17 @@ class VerifiedFeedback:
         Of peaks and of the effort only how far the set of the control lets them go is used; of the gains that the
         control that they cause is no wider than its set, ``h(F_kl) + h(-F_kl) <= width`` summed over the blocks ``l``.
         """
-        from flint import arb
-
-        case, total, most = self.case, arb(0), arb(0)
+        case, total, most = self.case, ball(0), ball(0)
         for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
             for i, price in enumerate(costs):
                 far = reach(case.problem.control, i)
                 most = most + price * far
                 if case.charge == PEAK:
-                    left = price * int(priced) - sum((arb(y) for y, row in rows if row.charged == (k, i)), arb(0))
-                    total = total + (left * far).min(arb(0))
+                    left = price * int(priced) - sum((ball(y) for y, row in rows if row.charged == (k, i)), ball(0))
+                    total = total + (left * far).min(ball(0))
         if case.charge == WORST:
-            left = arb(int(priced)) - sum((arb(y) for y, row in rows if row.charged == EFFORT), arb(0))
-            total = total + (left * most).min(arb(0))
+            left = ball(int(priced)) - sum((ball(y) for y, row in rows if row.charged == EFFORT), ball(0))
+            total = total + (left * most).min(ball(0))
         return total - self._gains_bound.of(rows) if case.answering else total
 
     @cached_property
@@ -268,8 +262,6 @@ class VerifiedFeedback:
     def following(self, named: NamedDeviations, entry: Mapping[str, Any], name: str) -> NamedDeviations:
         """The deviations across the seam of a plan that repeats: no disturbance yet, and the initial state of the next
         period that an entry names, which must be in its set; none where there is one initial state."""
-        from flint import arb
-
         calm = named.loop.deviations.rests[: named.loop.deviations.begun]
         if self.case.problem.initial_set is None:
             return NamedDeviations(self.case, named.loop, calm)
@@ -279,7 +271,7 @@ class VerifiedFeedback:
         if found is None:
             raise Broken(f"{name}: the next deviation {point.tolist()} is not shown to be in its set")
         about = self.loop_at_rest.deviations.sets[-1][1]
-        begun = [v - arb(float(c)) for v, c in zip(found, about, strict=True)]
+        begun = [v - ball(c) for v, c in zip(found, about, strict=True)]
         return NamedDeviations(self.case, named.loop, [*calm, begun])
 
 
@@ -315,16 +307,14 @@ class NamedDeviations:
         """What is seen of them at every breakpoint, ``(K, p)``, beside what is seen of points of their sets next to the
         middles: differences of points of a set without an interior are in its span, those from a middle that was
         rounded are not. The nominal control stands for that under these points."""
-        from flint import arb
-
         pairs = zip(self.z, self.loop.deviations.rests, strict=True)
         z = [
-            [arb(0)] * len(mine) if mine is rest else [x - r for x, r in zip(mine, rest, strict=True)]
+            [ball(0)] * len(mine) if mine is rest else [x - r for x, r in zip(mine, rest, strict=True)]
             for mine, rest in pairs
         ]
         return [
             [
-                sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), arb(0))
+                sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), ball(0))
                 for s in range(self.loop.outputs)
             ]
             for seen in self.loop.seen
@@ -332,8 +322,6 @@ class NamedDeviations:
 
     def given(self, direction: Array, time: float) -> arb:
         """What the disturbance and the initial state give to ``c'x(t)`` where no control answers them."""
-        from flint import arb
-
         case, loop = self.case, self.loop
         weights = case.duality.pushed(direction, time, loop.changes)
         parts, of = [*zip(loop.deviations.sets, self.z, strict=True)], loop.deviations
@@ -341,11 +329,11 @@ class NamedDeviations:
         weights += [] if case.problem.initial_set is None else [case.duality.carried(direction, time)]
         return sum(
             (
-                weight * (arb(float(m)) + off)
+                weight * (ball(m) + off)
                 for row, ((_, about), block) in zip(weights, parts, strict=True)
                 for weight, m, off in zip(row, about, block, strict=True)
             ),
-            arb(0),
+            ball(0),
         )
 
 

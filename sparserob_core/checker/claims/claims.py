@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import below
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.arithmetic.balls import ball, below
+from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers, written_policy
@@ -22,7 +22,6 @@ from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.cost.duality import ConstraintRow, steps
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.problem.returning import single
-from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.tube import Still
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
@@ -296,10 +295,8 @@ def _effort(case: Case) -> str:
 
 def _counted(case: Case) -> str:
     """The time that the control acts, the cost J beside it, and its letters."""
-    from flint import arb
-
     acted, total = activity.acted(case), activity.largest(case)
-    _agrees("cost", number(case.certificate, "cost"), arb(acted * total), 0.0)
+    _agrees("cost", number(case.certificate, "cost"), ball(acted * total), 0.0)
     derived = case.price.of(case.pieces)
     _agrees(
         "J",
@@ -314,10 +311,8 @@ def _counted(case: Case) -> str:
 
 
 def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
-    from flint import arb
-
-    off = abs(arb(written) - derived)
-    if not off <= arb(FIGURES) * arb(scale).max(abs(derived)):
+    off = abs(ball(written) - derived)
+    if not off <= ball(FIGURES) * ball(scale).max(abs(derived)):
         raise Broken(f"{name}: {written!r} is written, {float(derived)!r} is derived")
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, feedback_of
 from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
 from sparserob_core.checker.claims.constraints import pushed_by_middle
@@ -39,8 +39,6 @@ def multiplied(case: Case, priced: bool) -> arb:
 
 def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]], Any]:
     """Multipliers with their constraints, and those of the control's pieces."""
-    from flint import arb
-
     if data is None:
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
     if not isinstance(data, Mapping):
@@ -57,9 +55,9 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
         if case.followed.are_best:
-            row = _along_adjoint(case, direction, case.problem.horizon, arb(value), disturbed=False)
+            row = _along_adjoint(case, direction, case.problem.horizon, ball(value), disturbed=False)
         else:
-            row = case.duality.row(direction, case.problem.horizon, middle, arb(value), disturbed=False)
+            row = case.duality.row(direction, case.problem.horizon, middle, ball(value), disturbed=False)
         # what is known of a disturbance that does not vary counts; where none may reach the state it is any member
         rows.append((multiplier, replace(row, constant=row.constant + pushed_by_middle(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
@@ -181,13 +179,11 @@ def _undisturbed(
 def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> ConstraintRow:
     """``c'x(t) <= limit`` of a system whose rows are followed, for the worst deviations or without any: no matrix is
     made for a duration, which of hundreds of states takes a minute each."""
-    from flint import arb
-
     worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
     m, begins = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
     state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
     begun = balls(np.asarray(problem.initial_state, dtype=float))
-    constant = sum((w * x for w, x in zip(state, begun, strict=True)), arb(0)) - limit
+    constant = sum((w * x for w, x in zip(state, begun, strict=True)), ball(0)) - limit
     if problem.system.c is not None:  # a drift is an input that is 1
         constant = constant + worst.weights(time, np.zeros(1), np.full(1, np.inf))[0][m]
     if delay > 0.0:
@@ -215,27 +211,22 @@ def _of_control(case: Case, name: str, direction: Array, time: float, named: Nam
 
 def _of_effort(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:
     """The control at deviations, each entry of it times a share of ``[-1, 1]``, is at most the effort."""
-    from flint import arb
-
     K, m = case.control.pieces, case.problem.system.controls
     if shares.shape != (m * K,) or not (np.abs(shares) <= 1.0).all():
         raise Broken(f"{EFFORT}: expected {m * K} numbers from -1 to 1")
     slope = [
-        [price * arb(float(shares[i * K + k])) for i, price in enumerate(costs)]
-        for k, costs in enumerate(case.price.costs)
+        [price * ball(shares[i * K + k]) for i, price in enumerate(costs)] for k, costs in enumerate(case.price.costs)
     ]
-    return ConstraintRow(arb(0), slope, None, () if named is None else named.innovations, EFFORT)
+    return ConstraintRow(ball(0), slope, None, () if named is None else named.innovations, EFFORT)
 
 
 def fixed_limit(case: Case, direction: Array, time: float) -> arb:
     """The value of ``c'x(T)`` for a direction of one fixed state or its opposite."""
-    from flint import arb
-
     values = dict(case.equalities)
     states = np.flatnonzero(direction).tolist()
     if len(states) != 1 or states[0] not in values or time != case.problem.horizon:
         raise Broken(f"{EQUALS}: the direction {direction.tolist()} at t = {time!r} is not that of a fixed final state")
-    return arb(float(direction[states[0]])) * arb(values[states[0]])
+    return ball(direction[states[0]]) * ball(values[states[0]])
 
 
 def piece_of(case: Case, window: ConstraintWindow, entry: Mapping[str, Any], time: float) -> int:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims.answers import NamedDeviations, commanded, feedback_of
 from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
 from sparserob_core.checker.claims.cells import Reached
@@ -19,7 +19,6 @@ from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
 from sparserob_core.checker.claims.units import units_of
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.tube import LoopTube, Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known

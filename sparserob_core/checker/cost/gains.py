@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls, rational
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.arithmetic.balls import ball, balls, rational
+from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
@@ -39,28 +39,26 @@ class GainsBound:
 
     def of(self, rows: Sequence[tuple[float, ConstraintRow]]) -> arb:
         """How much the gains can lower the sum of ``rows`` times their multipliers, at most."""
-        from flint import arb
-
-        total = arb(0)
+        total = ball(0)
         rows = [(y, row) for y, row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
         if not rows:
             return total
         K, m, d = len(self.answers), self.control.dimension, self.loop.outputs
-        left = stacked([[arb(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
+        left = stacked([[ball(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
         right = stacked([[x for part in row.innovations for x in part] for _, row in rows])
         product = (left * right).tolist()
         width = [_width(self.control, i) for i in range(m)]
         for k in range(K):
             clusters = self._clusters(k)
             for i in range(m):
-                sizes = [arb(0)]
+                sizes = [ball(0)]
                 for members, inverse, blocks in clusters:
                     z = (
                         inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])
                     ).entries()
                     shares = iter(z)
                     sizes += [
-                        sum((abs(next(shares)) / length for _, length in self._segments[block]), arb(0))
+                        sum((abs(next(shares)) / length for _, length in self._segments[block]), ball(0))
                         for block in blocks
                     ]
                 total = total + width[i] * _largest(sizes)
@@ -177,14 +175,12 @@ def _parts(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]
 def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
     """Numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: how long it is along the
     axes through its middle."""
-    from flint import arb
-
     if isinstance(shape, Product):
         return [chord for part, own in shape.split(middle) for chord in _chords(part, own)]
     if isinstance(shape, NormBall):
-        return [2 * arb(shape.radius)] * shape.dimension
+        return [2 * ball(shape.radius)] * shape.dimension
     if isinstance(shape, Ellipsoid):
-        inverse = stacked([[arb(float(v)) for v in row] for row in shape.shape]).inv()
+        inverse = exactly(shape.shape).inv()
         return [2 / inverse[b, b].sqrt() for b in range(shape.dimension)]
     flat = known(shape).facets
     if flat is None:
@@ -193,7 +189,7 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
     for axis in range(shape.dimension):
         reach = []
         for sign in (1.0, -1.0):
-            ends = [(b - along(c, balls(middle))) / arb(abs(float(c[axis]))) for c, b in flat if sign * c[axis] > 0]
+            ends = [(b - along(c, balls(middle))) / ball(abs(float(c[axis]))) for c, b in flat if sign * c[axis] > 0]
             least = ends[0]
             for end in ends[1:]:
                 least = least.min(end)
@@ -204,11 +200,9 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
 
 def _onto(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
     """What every entry is of some segments of a block, that is this of its coordinates."""
-    from flint import arb
-
     rows, columns = push.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
     return [
-        [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in one), arb(0)) for one in columns] for row in rows
+        [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in one), ball(0)) for one in columns] for row in rows
     ]
 
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls, rational
+from sparserob_core.checker.arithmetic.balls import ball, balls, rational
 from sparserob_core.checker.arithmetic.remembered import remembered
-from sparserob_core.checker.arithmetic.series import around, identity, stacked, zeros
+from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked, zeros
 from sparserob_core.checker.flow.flow import FlowPart, VerifiedFlow
 from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.control.problem.cost import nominal_point
@@ -64,7 +64,7 @@ def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat
             slope[k] = [g + 2 * entry[0] for g, entry in zip(slope[k], both[d + 1 :], strict=True)]
     R = problem.cost.terms[1]
     if R is not None:
-        matrix, ends = stacked([balls(row) for row in R.Q]), [Fraction(float(t)) for t in control.breakpoints]
+        matrix, ends = exactly(R.Q), [Fraction(float(t)) for t in control.breakpoints]
         for k, (begin, end) in enumerate(pairwise(ends)):
             push = matrix * pieces[k] * rational(end - begin)
             value = value + (pieces[k].transpose() * push)[0, 0]
@@ -150,7 +150,7 @@ class NominalMotion:
         term, d = self.problem.cost.terms[which], self.problem.system.states
         if term is None:
             return zeros(d + 1, d + 1)
-        Q, r = stacked([balls(row) for row in term.Q]), stacked([[x] for x in balls(term.reference)])
+        Q, r = exactly(term.Q), stacked([[x] for x in balls(term.reference)])
         side, corner = (-(Q * r)).entries(), (r.transpose() * Q * r)[0, 0]
         return stacked([*([*row, b] for row, b in zip(Q.tolist(), side, strict=True)), [*side, corner]])
 
@@ -203,12 +203,10 @@ class NominalMotion:
     def _lift(self, term: arb_mat, one: int) -> arb_mat:
         """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square one on ``z``, of
         which the 1 and the control are multiplied by ``one``."""
-        from flint import arb
-
         system, bound = self.problem.system, self.problem.disturbance
         d, m, mw = system.states, system.controls, system.disturbances
         w = np.zeros(mw) if bound is None else nominal_point(bound)
         given = balls([*np.ones(term.ncols() - d - m - mw), *w])  # the input of a drift is 1
-        rows = [[*row[:d], sum((e * v for e, v in zip(row[d + m :], given, strict=True)), arb(0)), *row[d : d + m]]
+        rows = [[*row[:d], sum((e * v for e, v in zip(row[d + m :], given, strict=True)), ball(0)), *row[d : d + m]]
                 for row in term.tolist()]  # fmt: skip
         return stacked(rows + (identity(d + 1 + m) * one).tolist()[d:])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import difference
+from sparserob_core.checker.arithmetic.balls import ball, difference
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, middles, products, zeros
@@ -137,11 +137,9 @@ class VerifiedFlow:
 
     def segment(self, start: float, stop: float) -> tuple[VerifiedSegment, arb]:
         """The flow from ``start`` on, and which share of it has passed at ``stop``."""
-        from flint import arb
-
         stretch = self.law.stretches[self._place(start, stop)]
         if stretch.is_still:
-            share = (arb(stop) - arb(start)) / stretch.stride
+            share = (ball(stop) - ball(start)) / stretch.stride
             if not share <= LONGER:
                 raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
             return self._still(stretch), share
@@ -153,8 +151,8 @@ class VerifiedFlow:
             self._segments[start, stop] = solve(*stretch.between(start, stop), stretch.units, self.sharp)
             longest = self._longest[start] = stop
         if longest == start:
-            return self._segments[start, longest], arb(1)
-        return self._segments[start, longest], (arb(stop) - arb(start)) / (arb(longest) - arb(start))
+            return self._segments[start, longest], ball(1)
+        return self._segments[start, longest], (ball(stop) - ball(start)) / (ball(longest) - ball(start))
 
     def kind(self, start: float, stop: float) -> tuple[int, tuple[float, float]]:
         """Intervals of one kind have one flow."""
@@ -203,10 +201,8 @@ class VerifiedFlow:
 
     def parts(self, start: float, stop: float) -> Iterator[FlowPart]:
         """Yield the parts of an interval, one after another."""
-        from flint import arb
-
         for a, b in pairwise([start, *(one for one in self._begins if start < one < stop), stop]):
-            stretch, doublings, length = self.law.stretches[self._place(a, b)], 0, arb(b) - arb(a)
+            stretch, doublings, length = self.law.stretches[self._place(a, b)], 0, ball(b) - ball(a)
             if not stretch.is_still:
                 yield FlowPart(*self.segment(a, b), length)
                 continue
@@ -226,13 +222,11 @@ class VerifiedFlow:
         """What the time from ``begin`` on makes of states and of inputs that stay the same, on ``[start, stop]`` within
         ``[begin, end]``, on which the flow is a polynomial: so many terms in the share of the interval, ``(d, d + w)``
         each, and by how much they are off at most."""
-        from flint import arb
-
         segment, share = self.segment(begin, end)
         if begin == end:
-            return segment.within(arb(0), arb(0), order)
-        length = arb(end) - arb(begin)
-        first, width = ((arb(b) - arb(a)) / length * share for a, b in ((begin, start), (start, stop)))
+            return segment.within(ball(0), ball(0), order)
+        length = ball(end) - ball(begin)
+        first, width = ((ball(b) - ball(a)) / length * share for a, b in ((begin, start), (start, stop)))
         return segment.within(first, width, order)
 
     def kernel(self, start: float, stop: float) -> tuple[list[Series], Array]:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, dot, identity, sizes_of, zeros
 from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
@@ -165,7 +166,7 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
     `Unchecked` where that is not known."""
     A, F, last, d = equation.A, equation.F, len(terms) - 1, len(units)
     longer = LONGER ** (last + max(len(A), len(F)) + 1) * OUTWARD
-    defects = [terms[n + 1].scaled(_exact(n + 1)) - equation.slope(terms, n) for n in range(last)]
+    defects = [terms[n + 1].scaled(ball(n + 1)) - equation.slope(terms, n) for n in range(last)]
     orders = np.array([1.0, *range(1, last + 1)])[:, None, None]
     missed = (sizes_of([terms[0] - equation.begin, *defects]) / orders).sum(axis=0)
     sizes, paces, drives = map(sizes_of, (terms, A, F))
@@ -213,13 +214,5 @@ class Equation:
         return known[1]
 
 
-def _exact(value: float) -> arb:
-    from flint import arb
-
-    return arb(value)
-
-
 def _inverse(value: int) -> arb:
-    from flint import arb
-
-    return 1 / arb(value)
+    return 1 / ball(value)

@@ -96,7 +96,7 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
         problem,
         system=_larger(problem.system, coordinates, problem.horizon),
         initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(size - d)]),
-        initial_set=None if begun is None else _begun(begun, size),
+        initial_set=None if begun is None else beside_zeros(begun, size),
         path=[
             *(_freed(entry, size) for entry in problem.windows),
             *(Accumulated(_summed(sums, size), time, time, name) for name, time, sums in windows),
@@ -250,8 +250,8 @@ def _free(bound: ConvexSet, size: int) -> ConvexSet:
     return Cylinder(bound, size) if flat is None else Polytope(np.pad(flat[0], ((0, 0), (0, more))), flat[1])
 
 
-def _begun(bound: ConvexSet, size: int) -> ConvexSet:
-    """The deviations of the initial state, beside integrals that begin at 0."""
+def beside_zeros(bound: ConvexSet, size: int) -> ConvexSet:
+    """A set of states beside others that are 0, so many all together."""
     zero = np.zeros(size - bound.dimension)
     if isinstance(bound, Box):
         return Box(np.append(bound.lower, zero), np.append(bound.upper, zero))

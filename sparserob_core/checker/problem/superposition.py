@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, final
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.problem.integrals import beside_zeros
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -28,7 +29,7 @@ from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint
-from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope, Product
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -203,9 +204,7 @@ class Sum:
         for n in range(1, self.most + 1):
             within = [(eccentricity * k / n, E[k], c[n - k]) for k in range(1, n)]
             E.append(_mixed([(1.0, M[n], ONE), *within], steep))
-            ahead = _mixed([(k / n, E[k], c[n - k]) for k in range(1, n + 1)])
-            c.append(_mixed([(-k / n, E[k], s[n - k]) for k in range(1, n + 1)]))
-            s.append(ahead)
+            _turn(E, s, c)
         return _joined(E)
 
 
@@ -221,11 +220,17 @@ def _slope(f: Sum) -> Sum:
 def _circular(f: list[Level]) -> tuple[Sum, Sum]:
     """The sine and the cosine."""
     s, c = [{FREE: np.sin(f[0][FREE])}], [{FREE: np.cos(f[0][FREE])}]
-    for n in range(1, len(f)):
-        ahead = _mixed([(k / n, f[k], c[n - k]) for k in range(1, n + 1)])
-        c.append(_mixed([(-k / n, f[k], s[n - k]) for k in range(1, n + 1)]))
-        s.append(ahead)
+    while len(s) < len(f):
+        _turn(f, s, c)
     return _joined(s), _joined(c)
+
+
+def _turn(f: list[Level], s: list[Level], c: list[Level]) -> None:
+    """Add one level more to the sine and the cosine."""
+    n = len(s)
+    ahead = _mixed([(k / n, f[k], c[n - k]) for k in range(1, n + 1)])
+    c.append(_mixed([(-k / n, f[k], s[n - k]) for k in range(1, n + 1)]))
+    s.append(ahead)
 
 
 def _steep(f: list[Level], function: Callable[[Any], Any], sign: float) -> Sum:
@@ -411,7 +416,7 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
         problem,
         system=VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:])),
         initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(more)]),
-        initial_set=_begun(begun, more) if begun is not None and more else begun,
+        initial_set=beside_zeros(begun, begun.dimension + more) if begun is not None and more else begun,
         path=[one for entry, name in zip(problem.path, called_as, strict=True) for one in _seen(entry, name, corners)],
         terminal=[
             one
@@ -442,13 +447,6 @@ def _above(exact: Fraction) -> float:
 def _law(parts: ParameterExpansion, law: LinearSystem, begin: float, until: float) -> LinearSystem:
     made = {name: Larger(parts, name, law.entry(name)) for name in NAMES if law.entry(name) is not None}
     return LinearSystem(made["A"], made["B"], made["E"], Box([begin], [until]), ("t",), made.get("c"))
-
-
-def _begun(bound: ConvexSet, more: int) -> ConvexSet:
-    zero = np.zeros(more)
-    if isinstance(bound, Box):
-        return Box(np.append(bound.lower, zero), np.append(bound.upper, zero))
-    return Product((bound, Box(zero, zero)))
 
 
 def _rows(blocks: list[Array]) -> Array:

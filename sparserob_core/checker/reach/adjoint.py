@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import Series, middles, stacked, zeros
 from sparserob_core.checker.flow.segment import VerifiedSegment, solve
 from sparserob_core.checker.flow.units import balanced
@@ -68,8 +68,6 @@ class AdjointFlow:
     @staticmethod
     def of(A: arb_mat, F: arb_mat, horizon: float, clock: Clock) -> AdjointFlow:
         """That of rows with inputs through ``F (d, q)`` up to the ``horizon``."""
-        from flint import arb
-
         plain, speed = middles(A), np.abs(middles(F)).sum(axis=1)
         units = balanced(plain, horizon, speed)
         step = choose_step(plain * units / units[:, None], horizon)
@@ -77,7 +75,7 @@ class AdjointFlow:
         if not (count <= MOST_STEPS and count * A.nrows() <= MOST):
             raise Unchecked("the system is too fast for its horizon to be followed")
         clock.check()
-        segment = solve([Series.known(A * arb(step))], [Series.known(zeros(A.nrows(), 0))], units)
+        segment = solve([Series.known(A * ball(step))], [Series.known(zeros(A.nrows(), 0))], units)
         return AdjointFlow(A, F, segment, step, count, clock)
 
     @property
@@ -170,9 +168,7 @@ class AdjointRow:
     @staticmethod
     def of(motion: AdjointFlow, c: Array) -> AdjointRow:
         """That of the row ``c (d,)``, an exact one."""
-        from flint import arb
-
-        return AdjointRow.of_balls(motion, [arb(float(v)) for v in c])
+        return AdjointRow.of_balls(motion, [ball(v) for v in c])
 
     @staticmethod
     def of_balls(motion: AdjointFlow, c: list[arb]) -> AdjointRow:

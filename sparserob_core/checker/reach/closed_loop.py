@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import around, identity, stacked
+from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.still import modes_at
@@ -38,13 +38,6 @@ if TYPE_CHECKING:
     from sparserob_core.control.problem.system import System
 
 ORDER = 8  # of the states in the time on a cell; what comes after counts twice, half of it takes shorter cells
-
-
-def arb_of(value: float) -> arb:
-    """The ball of an exact number."""
-    from flint import arb
-
-    return arb(float(value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +119,8 @@ class VerifiedLoop:
     def _observed(self, measured: Measurements) -> list[dict[int, arb_mat]]:
         """The innovations of the observer: its error goes on from breakpoint to breakpoint, less what it corrects."""
         assert self.observer is not None
-        C = stacked([[arb_of(v) for v in row] for row in np.asarray(measured.C)])
-        unit = stacked([[arb_of(i == j) for j in range(self.outputs)] for i in range(self.outputs)])
+        C = exactly(np.asarray(measured.C))
+        unit = identity(self.outputs)
         found: list[dict[int, arb_mat]] = []
         error: dict[int, arb_mat] = {}
         for j, entering in enumerate(self._entering):
@@ -139,7 +132,7 @@ class VerifiedLoop:
             found.append(seen)
             if j + 1 == len(self.breakpoints) - 1:
                 break
-            L, flow = stacked([[arb_of(v) for v in row] for row in self.observer[j]]), self._between[j]
+            L, flow = exactly(self.observer[j]), self._between[j]
             error = {block: flow * error[block] - L * push if block in error else -L * push
                      for block, push in seen.items()}  # fmt: skip
         return found
@@ -174,16 +167,14 @@ class VerifiedLoop:
     @cached_property
     def effects(self) -> list[list[list[arb]]]:
         """``F_k (m, Q)``: how the control on each piece depends on the deviations."""
-        from flint import arb
-
-        m, zero, starts = self.gains.shape[2], arb(0), self.deviations.starts
+        m, zero, starts = self.gains.shape[2], ball(0), self.deviations.starts
         table = []
         for k in range(self.gains.shape[0]):
             rows = [[zero] * starts[-1] for _ in range(m)]
             for j in range(k + 1):
                 if not self.gains[k, j].any():
                     continue
-                M = stacked([[arb(float(v)) for v in row] for row in self.gains[k, j]])
+                M = exactly(self.gains[k, j])
                 for block, push in self.seen[j].items():
                     for i, row in enumerate((M * push).tolist()):
                         for b, value in enumerate(row):
@@ -218,14 +209,12 @@ class VerifiedLoop:
     @cached_property
     def nodes(self) -> list[arb_mat]:
         """The nominal state and every response at the breakpoints of the grid, ``(d, 1 + Q)``."""
-        from flint import arb
-
-        begin, answers = [arb(float(v)) for v in self.initial_state], identity(self.system.states).tolist()
+        begin, answers = [ball(v) for v in self.initial_state], identity(self.system.states).tolist()
         if self.initial is None:
             answers = [[] for _ in begin]
         else:
-            begin = [v + arb(float(m)) for v, m in zip(begin, self.deviations.sets[-1][1], strict=True)]
-        zero = [arb(0)] * self.deviations.starts[self.deviations.begun]
+            begin = [v + ball(m) for v, m in zip(begin, self.deviations.sets[-1][1], strict=True)]
+        zero = [ball(0)] * self.deviations.starts[self.deviations.begun]
         found = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, ends in enumerate(pairwise(self.grid)):
             Phi, added = self._moved(piece, *ends)
@@ -243,18 +232,14 @@ class VerifiedLoop:
 
     def inputs(self, k: int) -> arb_mat:
         """The nominal control and its answers on a piece of it, ``(m, 1 + Q)``; on piece -1 the control before."""
-        from flint import arb
-
-        none = [arb(0)] * self.deviations.starts[-1]
+        none = [ball(0)] * self.deviations.starts[-1]
         if k < 0:
-            return stacked([[arb(float(v)), *none] for v in self.before])
+            return stacked([[ball(v), *none] for v in self.before])
         return stacked([[v, *row] for v, row in zip(self.nominal[k].entries(), self.effects[k], strict=True)])
 
     def answers(self, k: int) -> arb_mat:
         """The answers on a piece of the control without what is nominal, ``(m, 1 + Q)``, the first column 0."""
-        from flint import arb
-
-        return stacked([[arb(0), *row] for row in self.effects[k]])
+        return stacked([[ball(0), *row] for row in self.effects[k]])
 
     def on(self, piece: int) -> int:
         """The piece of the control that is commanded on a piece of the grid: the one that acts, where there is no
@@ -288,10 +273,3 @@ class VerifiedLoop:
         found = Enclosed.of(line * (around(off) * both))
         total += 2.0 * (np.abs(found.mid) + found.rad)
         return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)
-
-
-def exactly(rows: Array | arb_mat) -> arb_mat:
-    """Rows of floats as balls."""
-    from flint import arb
-
-    return stacked([[arb(float(v)) for v in row] for row in rows]) if isinstance(rows, np.ndarray) else rows

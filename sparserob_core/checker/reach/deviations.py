@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.polynomials import OUTWARD
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -116,10 +116,8 @@ class HeldDeviations(Deviations):
         return [self._support(a) for a in every]
 
     def _support(self, a: list[arb]) -> arb:
-        from flint import arb
-
         blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
-        return sum((of_block(*one, block) for one, block in zip(self.sets, blocks, strict=True)), arb(0))
+        return sum((of_block(*one, block) for one, block in zip(self.sets, blocks, strict=True)), ball(0))
 
 
 def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:

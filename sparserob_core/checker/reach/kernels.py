@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.series import Series
+from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.flow.flow import VerifiedFlow
-from sparserob_core.checker.reach.closed_loop import ORDER, exactly
+from sparserob_core.checker.reach.closed_loop import ORDER
 from sparserob_core.checker.reach.states import enclosed
 from sparserob_core.checker.reach.tube import Around
 from sparserob_core.checker.sets.parameters import Corners
@@ -105,7 +105,7 @@ def above_chord(
     terms, off = law.within(start, stop, start, stop, ORDER + 1)
     total = 2.0 * (far @ off[:, :d]) @ begun
     for n, term in enumerate(terms[2:], 2):
-        found = enclosed([Series(term.monomials, [lines * part for part in term.columns(0, d).parts])])
+        found = enclosed([term.columns(0, d).along(lines)])
         total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(found.mid) + found.rad).sum(axis=(0, 1)) @ begun)
     if size.any():
         most, slope, units = law.sizes(start, stop)

@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.remembered import remembered
-from sparserob_core.checker.arithmetic.series import Series, products
+from sparserob_core.checker.arithmetic.series import Series, exactly, products
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
-from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.reach.kernels import Added, BoundedInput, BoundedInputHere, above_chord, pushes
 from sparserob_core.checker.reach.measurable import Side, Together, signed, swept
 from sparserob_core.checker.reach.states import enclosed, ring

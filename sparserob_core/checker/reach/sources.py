@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Unchecked
@@ -100,10 +100,8 @@ class Sources:
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
         """What errors of execution add to ``c'x(t)`` at least, at a parameter: of a command of size 1 on every piece,
         ``(K, m)``, ``None`` where there are none; and of what was commanded before."""
-        from flint import arb
-
         delivered = self.delivered_at(parameter)
-        found, none = None if delivered is None else delivered.least(c, time), arb(0)
+        found, none = None if delivered is None else delivered.least(c, time), ball(0)
         if found is None or not self.problem.system.delay > 0.0:
             return found, none
         sizes: Array = np.zeros((self.timing.control.size - 1, found.shape[1]))

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.remembered import remembered
-from sparserob_core.checker.arithmetic.series import Series, identity, stacked
+from sparserob_core.checker.arithmetic.series import Series, exactly, identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
@@ -25,7 +25,7 @@ from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
+    from flint import arb_mat
 
 PATHS_KEPT = 256  # intervals of which the states are remembered
 BOXES_KEPT = 8  # of parameters, over which states are remembered
@@ -111,7 +111,7 @@ class States:
                 self._made[key] = (
                     self._tables[self._block(level - 1, last)][0] * parts[0] + parts[1]
                     if level
-                    else self._inputs[block].applied(u)
+                    else self._inputs[block].scaled(u)
                 )
             self._driven[level, number] = self._made[key]
         return self._driven[level, number]
@@ -165,11 +165,11 @@ class States:
         flow, scene, d, m = self.flow, self.scene, self.flow.states, self.flow.driven
         begin, end, order = self.marks[place], self.marks[place + 1], 1 if start == stop else order
         segment, share = flow.segment(begin, end)
-        first, width = ((_exact(b) - _exact(a)) / (_exact(end) - _exact(begin)) * share
+        first, width = ((ball(b) - ball(a)) / (ball(end) - ball(begin)) * share
                         for a, b in ((begin, start), (start, stop)))  # fmt: skip
         terms, off = self._path(place).within(first, width, order)
-        rows = stacked([balls(row) for row in basis])
-        state = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in terms])
+        rows = exactly(basis)
+        state = enclosed([one.along(rows) for one in terms])
         state.rad[0, 0] += np.abs(basis) @ off * OUTWARD
         lines = self._lines(segment, basis).shifted(float(first), float(width), order)
         carried, found = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
@@ -247,8 +247,8 @@ class Lines:
     @staticmethod
     def of(segment: VerifiedSegment, basis: Array) -> Lines:
         """Those of a ``basis (b, d)``."""
-        rows = stacked([balls(row) for row in basis])
-        terms = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in segment.terms])
+        rows = exactly(basis)
+        terms = enclosed([one.along(rows) for one in segment.terms])
         return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.powers.sizes * OUTWARD)
 
     def shifted(self, first: float, width: float, order: int) -> Enclosed:
@@ -260,12 +260,6 @@ class Lines:
         rad = np.tensordot(kept, self.terms.rad + rounding(20 * count) * size, axes=1)
         rad[0, 0] += self.off + np.tensordot(table[order:].sum(axis=0), self.sizes, axes=1)
         return Enclosed(mid, rad * OUTWARD)
-
-
-def _exact(value: float) -> arb:
-    from flint import arb
-
-    return arb(value)
 
 
 def _blocks(mark: int) -> list[tuple[int, int]]:

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.arithmetic.remembered import remembered
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.flow.law import ParameterBox
-from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, lengths, rounding
@@ -98,8 +99,6 @@ class VerifiedTube:
     def _recentred(self) -> Enclosed | None:
         """What makes of coefficients about the middle of the larger box those on this one, ``(M, M)``; ``None`` where
         these are the same."""
-        from flint import arb
-
         whole = self.rows.states.flow.box
         if whole == self.box:
             return None
@@ -107,14 +106,14 @@ class VerifiedTube:
         for middle, half, centre, width in zip(
             self.box.middle, self.box.halves, whole.middle, whole.halves, strict=True
         ):
-            unit = arb(width) if width else arb(1)
-            moves.append(((arb(middle) - arb(centre)) / unit, arb(half) / unit))
+            unit = ball(width) if width else ball(1)
+            moves.append(((ball(middle) - ball(centre)) / unit, ball(half) / unit))
         for e in self.flow.monomials.exponents:  # of this box
             row = []
             for f in self.flow.monomials.exponents:
-                entry = arb(1)
+                entry = ball(1)
                 for k, n, (c, r) in zip(e, f, moves, strict=True):
-                    entry = entry * comb(n, k) * c ** (n - k) * r**k if n >= k else arb(0)
+                    entry = entry * comb(n, k) * c ** (n - k) * r**k if n >= k else ball(0)
                 row.append(entry)
             table.append(row)
         return Enclosed.of(stacked(table))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls
+from sparserob_core.checker.arithmetic.balls import above, ball, balls
 from sparserob_core.checker.outcome import RESOLVED, Broken, Unchecked
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -273,9 +273,7 @@ def dot(left: Sequence[float] | Array, right: Sequence[float] | Array) -> arb:
 
 def total(terms: Iterable[arb]) -> arb:
     """The sum of balls, 0 of none."""
-    from flint import arb
-
-    return sum(terms, arb(0))
+    return sum(terms, ball(0))
 
 
 def along(point: Sequence[float] | Array, direction: Sequence[arb]) -> arb:

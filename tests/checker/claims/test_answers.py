@@ -15,13 +15,13 @@ from flint import arb, ctx, fmpq
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
 from sparserob_core.checker.claims.answers import VerifiedFeedback, feedback_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost.gains import _chords, _segments, _width, reach
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem

@@ -13,9 +13,10 @@ import pytest
 from flint import arb_mat, ctx
 
 import sparserob_core.checker.reach.closed_loop as loops
+from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.claims.cells import prove
 from sparserob_core.checker.outcome import Broken, Clock
-from sparserob_core.checker.reach.closed_loop import VerifiedLoop, exactly
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.reach.tube import LoopTube, Still
