@@ -91,7 +91,7 @@ LISTS = test_lists.case_of("on own pieces").problem
 ROOT = VaryingSystem.of([["1/(1.0000001 - t)"]], [[1]], 1.0)
 UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "Kepler's equation of no number": (lambda: kepler_root(arb("nan"), arb(0.3)), Unchecked, "Kepler's equation"),
-    "an observer of another shape": (observed, Broken, r"the observer has shape \(1, 1, 1\), expected \(2, 1, 1\)"),
+    "an observer of another shape": (observed, Broken, r"observer: shape \(1, 1, 1\), expected \(2, 1, 1\)"),
     "a flat set of initial states": (
         lambda: returning(
             forced(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +27,16 @@ def balls(vector: Sequence[float] | Array) -> list[arb]:
     from flint import arb
 
     return [arb(float(v)) for v in vector]
+
+
+def largest(values: Iterable[arb]) -> arb:
+    """The largest of some balls, at least one."""
+    return reduce(lambda one, other: one.max(other), values)
+
+
+def smallest(values: Iterable[arb]) -> arb:
+    """The smallest of some balls, at least one."""
+    return reduce(lambda one, other: one.min(other), values)
 
 
 def rational(value: Fraction) -> arb:

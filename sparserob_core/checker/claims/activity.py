@@ -8,13 +8,12 @@ that cost over the admissible controls, bounded by weak duality, is below the we
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import ball
+from sparserob_core.checker.arithmetic.balls import ball, smallest
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken
@@ -74,7 +73,7 @@ def least_of_cost(case: Case, cost: arb) -> float:
     ]
     if not factors:
         return 0.0
-    return _whole(case, cost * reduce(lambda one, other: one.min(other), factors))
+    return _whole(case, cost * smallest(factors))
 
 
 def _longest(case: Case, block: Sequence[int]) -> arb:
@@ -89,13 +88,18 @@ def _longest(case: Case, block: Sequence[int]) -> arb:
 
 
 def _whole(case: Case, total: arb) -> float:
-    """A bound of the time of action as a share of the largest, rounded up where all that counts, counts the same."""
+    """A bound of the time of action as a share of the largest."""
+    return min(1.0, _rounded(case, total) / float(_vectors(case).sum()))
+
+
+def _rounded(case: Case, total: arb) -> float:
+    """A bound of the time of action, rounded up where all that counts, counts the same."""
     table = _vectors(case)
     bound = float(np.nextafter(float(total.lower()), -np.inf))
     if np.ptp(table) <= EQUAL * table.max():
         one = float(table.mean())
-        return float(min(table.size, max(0.0, np.ceil(bound / one - NEARLY))) / table.size)
-    return max(0.0, bound / float(table.sum()))
+        bound = float(np.ceil(bound / one - NEARLY)) * one
+    return max(0.0, bound)
 
 
 def _least(
@@ -217,11 +221,7 @@ def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], row
         if not total > 0:
             raise Broken(f"tree: multipliers of a part prove {float(total.lower()):.3g}, expected a positive number")
         return float("inf")
-    table = _vectors(case)
-    bound = float(np.nextafter(float(total.lower()), -np.inf))
-    if np.ptp(table) <= EQUAL * table.max():
-        return float(max(0.0, np.ceil(bound / float(table.mean()) - NEARLY))) * float(table.mean())
-    return max(0.0, bound)
+    return _rounded(case, total)
 
 
 def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb], sizes: Sequence[arb]) -> arb:
@@ -236,7 +236,7 @@ def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: 
             if not ends:
                 return arb("inf")  # nothing is in this part
             heights = [(count if part[2] or v != 0.0 else arb(0)) + s * arb(v) + size * arb(abs(v)) for v in ends]
-            total = total + reduce(lambda one, other: one.min(other), heights)
+            total = total + smallest(heights)
         return total
     certain = sum((count for part, count in zip(parts, counts, strict=True) if part[2]), arb(0))
     priced = [arb(0) if part[2] else count for part, count in zip(parts, counts, strict=True)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, below
 from sparserob_core.checker.arithmetic.series import exactly, stacked
-from sparserob_core.checker.claims.case import STEP, Case, number, numbers
+from sparserob_core.checker.claims.case import STEP, Case, number, numbers, shaped
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow, steps
 from sparserob_core.checker.cost.effort import at_most
 from sparserob_core.checker.cost.gains import GainsBound, reach
@@ -45,9 +45,7 @@ class VerifiedFeedback:
         case = self.case
         if not case.answering:
             return self._none
-        gains = numbers(case.certificate.get("gains"), "gains")
-        if gains.shape != self._none.shape:
-            raise Broken(f"the gains have shape {gains.shape}, expected {self._none.shape}")
+        gains = shaped(case.certificate, "gains", self._none.shape)
         times, measured = case.control.breakpoints, case.problem.measurements
         told = case.problem.initial_set is not None or (measured is not None and measured.noise is not None)
         for k, j in np.argwhere(gains.any(axis=(2, 3))).tolist():
@@ -73,10 +71,7 @@ class VerifiedFeedback:
         if case.problem.measurements is None or not case.answering:
             return None
         shape = case.control.pieces, case.problem.system.states, case.problem.measurements.outputs
-        found = numbers(case.certificate.get("observer"), "observer")
-        if found.shape != shape:
-            raise Broken(f"the observer has shape {found.shape}, expected {shape}")
-        return found
+        return shaped(case.certificate, "observer", shape)
 
     @cached_property
     def loop(self) -> VerifiedLoop:
@@ -345,19 +340,11 @@ def _deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: 
     points, of = list[Array](), loop.deviations
     noises = of.begun - of.blocks
     if case.problem.disturbance is not None:
-        w = numbers(entry.get("disturbance"), f"{name}: disturbance")
-        if w.shape != (of.width, of.blocks):
-            raise Broken(f"{name}: a disturbance of shape {w.shape}, expected {(of.width, of.blocks)}")
-        points = list(w.T)
+        points = list(shaped(entry, "disturbance", (of.width, of.blocks), f"{name}: ").T)
     if noises and loop.measured is not None:
-        v = numbers(entry.get("noise"), f"{name}: noise")
-        if v.shape != (noises, loop.outputs):
-            raise Broken(f"{name}: a noise of shape {v.shape}, expected {(noises, loop.outputs)}")
-        points += list(v)
+        points += list(shaped(entry, "noise", (noises, loop.outputs), f"{name}: "))
     if case.problem.initial_set is not None:
-        points.append(numbers(entry.get("deviation"), f"{name}: deviation"))
-        if points[-1].shape != (case.problem.system.states,):
-            raise Broken(f"{name}: a deviation of the initial state of shape {points[-1].shape}")
+        points.append(shaped(entry, "deviation", (case.problem.system.states,), f"{name}: "))
     found = list[list[arb]]()
     for number_of, (point, (shape, about)) in enumerate(zip(points, of.sets, strict=True)):
         member = known(shape).member(point)

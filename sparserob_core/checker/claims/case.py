@@ -176,13 +176,7 @@ class Case:
     @cached_property
     def theta(self) -> Array:
         """The coefficients ``(m, N)`` of the decision."""
-        theta = numbers(self.certificate.get("decision"), "decision")
-        if theta.shape != (self.problem.system.controls, self.control.functions):
-            raise Broken(
-                f"the decision has shape {theta.shape}, expected"
-                f" {(self.problem.system.controls, self.control.functions)}"
-            )
-        return theta
+        return shaped(self.certificate, "decision", (self.problem.system.controls, self.control.functions))
 
     @cached_property
     def pieces(self) -> list[arb_mat]:
@@ -275,6 +269,14 @@ def numbers(data: object, name: str) -> Array:
     if not np.isfinite(array).all():
         raise Broken(f"{name}: expected finite numbers")
     return array
+
+
+def shaped(data: Mapping[str, Any], key: str, shape: tuple[int, ...], whose: str = "") -> Array:
+    """Finite numbers of one shape under a key of a certificate; ``whose``: of which entry that is, in words."""
+    found = numbers(data.get(key), f"{whose}{key}")
+    if found.shape != shape:
+        raise Broken(f"{whose}{key}: shape {found.shape}, expected {shape}")
+    return found
 
 
 def _numeric(data: object) -> bool:

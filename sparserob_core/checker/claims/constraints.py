@@ -61,13 +61,7 @@ def bounded(case: Case, window: ConstraintWindow) -> str:
         found = _along_rows(case, window)
     else:
         basis, gains, work = _work(case, window, normals, lower, upper)
-        found = prove(
-            tubes(case, basis, gains, lower, upper),
-            parameters_of(case),
-            work,
-            case.clock,
-            case.beside(window, basis, gains),
-        )
+        found = prove_on_cells(case, window, (basis, gains), work, (lower, upper))
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     if found.bound < 0:
         return f"kept, with a margin of at least {-found.bound:.1e}{_unit(case, window)} ({size})"
@@ -175,24 +169,20 @@ def _work(
     pairs = case.clock.each(zip(lower, upper, strict=True))
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in pairs]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
-    work: list[Work] = []
+    work = list[Work]()
     for (a, b), members in groupby(order, key=lambda i: keys[i]):
         case.clock.check()
         sides = Sides.cell(curved, np.array(a[nu:]), np.array(b[nu:])) if curved is not None else flat
         assert sides is not None
         times = [(float(lower[i, 0]), float(upper[i, 0])) for i in case.clock.each(members)]
-        work += [(box, sides, intervals) for box, intervals in divided(case, window, (a[:nu], b[:nu]), times)]
+        work.append(((a[:nu], b[:nu]), sides, cut_times(case, window, times)))
     return normals if curved is not None else basis, gains, work
 
 
-def divided(
-    case: Case, window: ConstraintWindow, box: Corners, times: Sequence[tuple[float, float]]
-) -> list[tuple[Corners, list[Interval]]]:
-    """A box of parameters in the parts over which the state is followed, and for each the ``times``, cut wherever
-    anything turns or jumps."""
+def cut_times(case: Case, window: ConstraintWindow, times: Sequence[tuple[float, float]]) -> list[Interval]:
+    """The ``times``, cut wherever anything turns or jumps."""
     every = np.union1d(_cuts(case), window.cuts(case.control.breakpoints.tolist()))
-    parts = (cut(np.array(case.timing.grid), every, start, stop) for start, stop in times)
-    return [(box, [one for several in parts for one in several])]
+    return [one for start, stop in times for one in cut(np.array(case.timing.grid), every, start, stop)]
 
 
 @lru_cache(maxsize=2)
@@ -220,6 +210,15 @@ def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
     parts = list(pairwise([start, *inside, stop]))
     pieces = np.searchsorted(grid, [a for a, _ in parts], side="right") - 1
     return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), parts, strict=True)]
+
+
+def prove_on_cells(
+    case: Case, window: ConstraintWindow, rows: tuple[Array, Array], work: Sequence[Work], cells: tuple[Array, Array]
+) -> Proven:
+    """`prove` of combinations of ``rows``, ``(b, d)`` on the state and ``(b, m)`` on the control, on the parts ``work``
+    of cells between lower and upper corners."""
+    beside = case.beside(window, *rows)
+    return prove(tubes(case, *rows, *cells), parameters_of(case), work, case.clock, beside)
 
 
 def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, feedback_of
-from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers, shaped
 from sparserob_core.checker.claims.constraints import pushed_by_middle
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow
@@ -62,33 +62,24 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         rows.append((multiplier, replace(row, constant=row.constant + pushed_by_middle(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
         return rows, None
-    pieces, expected = numbers(data.get("pieces"), "pieces"), (case.problem.system.controls, case.control.pieces)
-    if pieces.shape != expected:
-        raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
-    return rows, pieces
+    return rows, shaped(data, "pieces", (case.problem.system.controls, case.control.pieces))
 
 
 def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
     """The control at which the certificate replaces the cost by its tangent, on every piece."""
     if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
         return None
-    said = data.get("tangent") if isinstance(data, Mapping) else None
-    at, expected = numbers(said, "tangent"), (case.problem.system.controls, case.control.functions)
-    if at.shape != expected:
-        raise Broken(f"the tangent's control has shape {at.shape}, expected {expected}")
+    said = data if isinstance(data, Mapping) else {}
+    at = shaped(said, "tangent", (case.problem.system.controls, case.control.functions))
     case.price.convex()
     return case.on_pieces(at)
 
 
 def norms_of(case: Case, data: object) -> Array | None:
     """The vectors ``(m, K)`` that the certificate offers in the place of norms of the control, if it does."""
-    said = data.get("norms") if isinstance(data, Mapping) else None
-    if said is None:
+    if not isinstance(data, Mapping) or data.get("norms") is None:
         return None
-    offered, expected = numbers(said, "norms"), (case.problem.system.controls, case.control.pieces)
-    if offered.shape != expected:
-        raise Broken(f"the vectors for norms have shape {offered.shape}, expected {expected}")
-    return offered
+    return shaped(data, "norms", (case.problem.system.controls, case.control.pieces))
 
 
 def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:

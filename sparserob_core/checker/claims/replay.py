@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims.answers import NamedDeviations, commanded, feedback_of
-from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
+from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers, shaped
 from sparserob_core.checker.claims.cells import Reached
 from sparserob_core.checker.claims.constraints import missed
 from sparserob_core.checker.claims.followed import FollowedRow
@@ -221,9 +221,7 @@ def _begun(case: Case, data: object) -> Array:
     """The deviation of the initial state, shown to be one of the problem's."""
     bound = case.problem.initial_set
     assert bound is not None
-    deviation = numbers(data, "deviation")
-    if deviation.shape != (bound.dimension,):
-        raise Broken(f"deviation: expected {bound.dimension} numbers, got shape {deviation.shape}")
+    deviation = shaped({"deviation": data}, "deviation", (bound.dimension,))
     if not known(bound).contains(deviation):
         raise Broken(f"the deviation {deviation.tolist()} of the initial state is not shown to be in its set")
     return deviation

@@ -11,12 +11,12 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import ball
+from sparserob_core.checker.arithmetic.balls import ball, largest
 from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.cost.price import Price, Tangent
 from sparserob_core.checker.flow.flows import VerifiedFlows
@@ -211,13 +211,13 @@ class Duality:
             offers.append((left, tilted))
         shape = known(self.problem.control)
         if not isinstance(shape, Boxed):
-            return _most([shape.least(left, left, tilted) for left, tilted in offers])
+            return largest([shape.least(left, left, tilted) for left, tilted in offers])
         alone = [[c] for c in range(len(slope)) if not any(c in block for block in groups)]
         parts = [shape.shares_of_least(left, left, tilted) for left, tilted in offers]
         found = ball(0.0)
         for block in (*groups, *alone):
             values = [sum((part[c] for c in block), ball(0.0)) for part in parts]
-            found = found + _most(values)
+            found = found + largest(values)
         return found
 
     def summed(
@@ -294,11 +294,6 @@ def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
     """The pieces of a control whose beginning is a step from what was before; of a plan that repeats the end of the
     last piece too."""
     return range(0 if problem.initial_control is not None else 1, control.pieces + bool(problem.repeat))
-
-
-def _most(values: Sequence[arb]) -> arb:
-    """The largest of what is proven in several ways."""
-    return reduce(lambda one, other: one.max(other), values)
 
 
 def _shrunk(vector: Sequence[arb], sizes: Sequence[arb]) -> list[arb]:

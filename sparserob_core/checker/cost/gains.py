@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import ball, balls, rational
+from sparserob_core.checker.arithmetic.balls import ball, balls, largest, rational, smallest
 from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Unchecked
@@ -61,7 +61,7 @@ class GainsBound:
                         sum((abs(next(shares)) / length for _, length in self._segments[block]), ball(0))
                         for block in blocks
                     ]
-                total = total + width[i] * _largest(sizes)
+                total = total + width[i] * largest(sizes)
         return total
 
     def _clusters(self, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
@@ -189,11 +189,8 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
     for axis in range(shape.dimension):
         reach = []
         for sign in (1.0, -1.0):
-            ends = [(b - along(c, balls(middle))) / ball(abs(float(c[axis]))) for c, b in flat if sign * c[axis] > 0]
-            least = ends[0]
-            for end in ends[1:]:
-                least = least.min(end)
-            reach.append(least)
+            ends = [(b - along(c, balls(middle))) / ball(abs(c[axis])) for c, b in flat if sign * c[axis] > 0]
+            reach.append(smallest(ends))
         found.append(reach[0] + reach[1])
     return found
 
@@ -204,10 +201,3 @@ def _onto(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list
     return [
         [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in one), ball(0)) for one in columns] for row in rows
     ]
-
-
-def _largest(values: list[arb]) -> arb:
-    largest = values[0]
-    for value in values[1:]:
-        largest = largest.max(value)
-    return largest

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias, final
 import numpy as np
 
 from sparserob_core.control.policies.measurements import Measurements
-from sparserob_core.control.problem.cost import Cost, Quadratic
+from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
@@ -91,12 +91,10 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
         return problem
     d, (coordinates, windows) = problem.system.states, _coordinates(problem)
     size = d + len(coordinates)
-    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
     return replace(
         problem,
+        **with_zeros(problem, len(coordinates)),
         system=_larger(problem.system, coordinates, problem.horizon),
-        initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(size - d)]),
-        initial_set=None if begun is None else beside_zeros(begun, size),
         path=[
             *(_freed(entry, size) for entry in problem.windows),
             *(Accumulated(_summed(sums, size), time, time, name) for name, time, sums in windows),
@@ -108,10 +106,8 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
             for end in problem.terminal
         ],
         integral=(),
-        cost=_cost(problem.cost, size - d),
         names=_named(problem, coordinates),
         commanded=tuple(d + i for i, one in enumerate(coordinates) if one.g.any() and problem.execution is not None),
-        measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, size - d)))),
     )
 
 
@@ -250,12 +246,25 @@ def _free(bound: ConvexSet, size: int) -> ConvexSet:
     return Cylinder(bound, size) if flat is None else Polytope(np.pad(flat[0], ((0, 0), (0, more))), flat[1])
 
 
-def beside_zeros(bound: ConvexSet, size: int) -> ConvexSet:
-    """A set of states beside others that are 0, so many all together."""
-    zero = np.zeros(size - bound.dimension)
-    if isinstance(bound, Box):
-        return Box(np.append(bound.lower, zero), np.append(bound.upper, zero))
-    return Product((bound, Box(zero, zero)))
+def with_zeros(problem: OptimalControlProblem, more: int) -> dict[str, Any]:
+    """What a problem says of its initial states, its cost and its measurements, where so many states that begin at 0
+    and cost nothing are after its own."""
+    begun, zero, d = problem.initial_set, np.zeros(more), problem.system.states
+    if isinstance(begun, Box):
+        begun = Box(np.append(begun.lower, zero), np.append(begun.upper, zero))
+    elif begun is not None and more:
+        begun = Product((begun, Box(zero, zero)))
+    state, _, final = (
+        None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
+        for term in problem.cost.terms
+    )
+    measured = problem.measurements or Measurements(np.eye(d))
+    return {
+        "initial_state": np.concatenate([np.asarray(problem.initial_state), zero]),
+        "initial_set": begun,
+        "cost": replace(problem.cost, state=state, final=final),
+        "measurements": replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, more)))),
+    }
 
 
 def _summed(sums: list[tuple[list[int], float, float]], size: int) -> ConvexSet:
@@ -287,11 +296,3 @@ def _unit(names: Names, h: Array, g: Array) -> str:
         return ""
     head, slash, per = unit.rpartition("/")
     return head if slash and per == names.time else f"{unit} {names.time}"
-
-
-def _cost(cost: Cost, more: int) -> Cost:
-    state, _, final = (
-        None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
-        for term in cost.terms
-    )
-    return replace(cost, state=state, final=final)

@@ -21,9 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, final
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.problem.integrals import beside_zeros
-from sparserob_core.control.policies.measurements import Measurements
-from sparserob_core.control.problem.cost import Quadratic
+from sparserob_core.checker.problem.integrals import with_zeros
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
@@ -398,7 +396,6 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
         return problem
     d, more = system.states, parts.size - system.states
     corners = [parts.seen(shares) for shares in parts.corners()]
-    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
     reached = {place for places in parts.moved for place in places}
     if any(reached & set(end.fixed.tolist()) for end in problem.terminal_equalities):
         raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
@@ -410,13 +407,10 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
         called += [f"{called[i]} per {scale:.3g} {name}" for i in places]
         units += [units[i] for i in places] if problem.names.state_units else []
     laws = [(begin, _law(parts, law, begin, until)) for begin, until, law in system.laws]
-    costs = [None if q is None else Quadratic(np.pad(q.Q, (0, more)), np.pad(q.reference, (0, more)))
-             for q in problem.cost.terms]  # fmt: skip
     return replace(
         problem,
+        **with_zeros(problem, more),
         system=VaryingSystem(laws[0][1], system.horizon, system.delay, tuple(laws[1:])),
-        initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(more)]),
-        initial_set=beside_zeros(begun, begun.dimension + more) if begun is not None and more else begun,
         path=[one for entry, name in zip(problem.path, called_as, strict=True) for one in _seen(entry, name, corners)],
         terminal=[
             one
@@ -428,9 +422,7 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
             )
         ],
         integral=[_sums(entry, corners) for entry in problem.integral],
-        cost=replace(problem.cost, state=costs[0], final=costs[2]),
         names=replace(problem.names, states=called, state_units=units),
-        measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, more)))),
     )
 
 

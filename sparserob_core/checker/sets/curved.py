@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, ball, balls
+from sparserob_core.checker.arithmetic.balls import above, ball, balls, largest
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
 from sparserob_core.checker.sets.shape import NEAR, Shape, along, total
@@ -100,10 +100,7 @@ class Ball(Shape):
     def _dual(self, direction: Sequence[arb]) -> arb:
         p, sizes = self.source.p, [abs(c) for c in direction]
         if p == 1.0:
-            largest = sizes[0]
-            for size in sizes[1:]:
-                largest = largest.max(size)
-            return largest
+            return largest(sizes)
         if p == 2.0:
             return total(c * c for c in direction).nonnegative_part().sqrt()
         q = ball(p) / (ball(p) - 1)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, ball, balls, below, rational, spanning
+from sparserob_core.checker.arithmetic.balls import above, ball, balls, below, largest, rational, smallest, spanning
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, rounding
 from sparserob_core.checker.sets.shape import NEAR, Facet, Shape, along, dot, facet, total
@@ -135,11 +135,8 @@ class Cornered(Flat):
         """All corners of a bounded set, exactly."""
 
     def support(self, direction: Sequence[arb]) -> arb:
-        heights = [total(rational(x) * c for x, c in zip(corner, direction, strict=True)) for corner in self.corners]
-        answer = heights[0]
-        for height in heights[1:]:
-            answer = answer.max(height)
-        return answer
+        corners = ([rational(x) for x in corner] for corner in self.corners)
+        return largest(total(x * c for x, c in zip(corner, direction, strict=True)) for corner in corners)
 
     @cached_property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
@@ -441,10 +438,7 @@ def _height(up: arb, down: arb, slope: arb, value: arb) -> arb:
 def _least(values: Sequence[arb]) -> arb:
     if not values:
         raise Unchecked("the set of controls has no corners")
-    least = values[0]
-    for value in values[1:]:
-        least = least.min(value)
-    return least
+    return smallest(values)
 
 
 @lru_cache(maxsize=64)

@@ -3,17 +3,17 @@ checker's own."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, balls, below
-from sparserob_core.checker.claims.case import Case, listed, number, numbers
-from sparserob_core.checker.claims.cells import Work, prove
+from sparserob_core.checker.claims.case import Case, listed, number, numbers, shaped
+from sparserob_core.checker.claims.cells import Work
 from sparserob_core.checker.claims.claims import judged, precision_of
-from sparserob_core.checker.claims.constraints import covered, divided, parameters_of, tubes
+from sparserob_core.checker.claims.constraints import covered, cut_times, prove_on_cells
 from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import ConstraintWindow
@@ -159,13 +159,10 @@ def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: Fo
     problem, window, time = case.problem, asked.window, number(entry, "time")
     if not window.start <= time <= window.stop:
         raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
-    parameter, deviation = (numbers(entry.get(key), key) for key in ("parameter", "deviation"))
-    if parameter.shape != (problem.system.parameter_count,):
-        raise Broken(f"parameter: {parameter.size} numbers where {problem.system.parameter_count} are expected")
+    parameter = shaped(entry, "parameter", (problem.system.parameter_count,))
+    deviation = shaped(entry, "deviation", (problem.system.states,))
     if problem.system.parameters is not None and not known(problem.system.parameters).contains(parameter):
         raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
-    if deviation.shape != (problem.system.states,):
-        raise Broken(f"deviation: {deviation.size} numbers where {problem.system.states} are expected")
     if problem.initial_set is None and deviation.any():
         raise Broken("a deviation is written, there is one initial state")
     if problem.initial_set is not None and not known(problem.initial_set).contains(deviation):
@@ -199,9 +196,7 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
         if entry.get("disturbance") is not None:
             raise Broken("a disturbance is written, there is none")
         return changes, None
-    signal = numbers(entry.get("disturbance"), "disturbance")
-    if signal.shape != (problem.disturbance.dimension, changes.size - 1):
-        raise Broken(f"disturbance: expected shape {(problem.disturbance.dimension, changes.size - 1)}")
+    signal = shaped(entry, "disturbance", (problem.disturbance.dimension, changes.size - 1))
     held = ~columns_of(problem.disturbance, problem.disturbance_class, "measurable")
     jumps = (signal[:, 1:] != signal[:, :-1]) & held[:, None]
     for time, jumping in zip(changes[1:-1].tolist(), jumps.T, strict=True):
@@ -241,10 +236,6 @@ def _proven_in_cells(case: Case, asked: SupremumRow, limit: float) -> int:
     ends = ([], []) if box is None else (box.lower.tolist(), box.upper.tolist())
     lower, upper = (np.array([[t, *p]]) for t, p in zip((window.start, window.stop), ends, strict=True))
     covered(case, alone, lower, upper)
-    whole = tuple(ends[0]), tuple(ends[1])
-    parts = divided(case, window, whole, [(window.start, window.stop)])
-    work: Sequence[Work] = [(part, Sides([bounded]), times) for part, times in parts]
-    shown = prove(
-        tubes(case, basis, gains, lower, upper), parameters_of(case), work, case.clock, case.beside(alone, basis, gains)
-    )
-    return shown.cells
+    times = cut_times(case, window, [(window.start, window.stop)])
+    work: list[Work] = [((tuple(ends[0]), tuple(ends[1])), Sides([bounded]), times)]
+    return prove_on_cells(case, alone, (basis, gains), work, (lower, upper)).cells

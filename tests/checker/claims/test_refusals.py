@@ -93,7 +93,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
             moved(case_of(), control=FEWER), {"constraints": [], "equalities": [], "pieces": [[1.0]]}
         ),
         Broken,
-        r"pieces have shape \(1, 1\), expected \(1, 2\)",
+        r"pieces: shape \(1, 1\), expected \(1, 2\)",
     ),
     "no tree of all pieces": (
         lambda: claims._tree(moved(case_of(certificate={"tree": {"nodes": []}}), control=FEWER)),
@@ -122,7 +122,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "a deviation of another size": (
         lambda: replay._begun(case_of(initial_set=Box([-0.1], [0.1])), [0.0, 0.0]),
         Broken,
-        "expected 1 numbers",
+        r"deviation: shape \(2,\), expected \(1,\)",
     ),
 }
 

@@ -152,12 +152,12 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "no wall": (lambda row: row.update(wall=None), "wall: expected numbers"),
     "early": (lambda row: row.update(time=0.2), "t = 0.2 is not within"),
     "late": (lambda row: row.update(time=1.9), "t = 1.9 is not within"),
-    "a parameter": (lambda row: row.update(parameter=[0.0]), "parameter: 1 numbers where 0 are expected"),
+    "a parameter": (lambda row: row.update(parameter=[0.0]), "parameter: shape (1,), expected (0,)"),
     "a deviation outside": (
         lambda row: row.update(deviation=OUTSIDE.tolist()),
         "the deviation of the initial state is not shown",
     ),
-    "a deviation of three": (lambda row: row.update(deviation=[0.0] * 3), "deviation: 3 numbers where 2"),
+    "a deviation of three": (lambda row: row.update(deviation=[0.0] * 3), "deviation: shape (3,), expected (2,)"),
     "changes that end early": (
         lambda row: row.update(changes=[*CHANGES, HORIZON - 0.1]),
         "changes: expected times from 0 to 2",
@@ -170,12 +170,12 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         lambda row: row.update(changes=[0.0, 1.5, 1.5, HORIZON]),
         "changes: expected increasing times",
     ),
-    "changes of its own": (lambda row: row.update(changes=[0.0, 0.7, 1.5, HORIZON]), "disturbance: expected shape"),
+    "changes of its own": (lambda row: row.update(changes=[0.0, 0.7, 1.5, HORIZON]), "disturbance: shape"),
     "a disturbance outside": (
         lambda row: row.update(disturbance=(1.001 * np.array(row["disturbance"])).tolist()),
         "is not shown to be in its set",
     ),
-    "another shape": (lambda row: row.update(disturbance=row["disturbance"][:1]), "disturbance: expected shape"),
+    "another shape": (lambda row: row.update(disturbance=row["disturbance"][:1]), "disturbance: shape"),
     "a jump within a piece": (
         lambda row: row.update(
             changes=[0.0, 0.3, *row["changes"][1:]], disturbance=[[0.0, *one] for one in row["disturbance"]]
