@@ -476,6 +476,23 @@ def test_the_effort_is_looked_for_where_deviations_go(monkeypatch):
     assert [[float(x.mid()) for x in row] for row in A] == [pytest.approx([0.0, 0.0]), pytest.approx([-0.5, 0.0])]
 
 
+@pytest.mark.parametrize("kind", ["piecewise_constant", "measurable"])
+def test_an_effort_is_bounded_where_its_parts_are_not_largest_together(kind):
+    """``|z_1 + z_2| + |z_1 - z_2|`` is twice the larger of both, and half of what its parts can be each."""
+    gains = np.zeros((3, 3, 2, 1))
+    gains[2, 1], gains[2, 2] = [[1.0], [1.0]], [[1.0], [-1.0]]
+    two = {
+        "system": LinearSystem(np.zeros((1, 1)), np.ones((1, 2)), E=np.ones((1, 1))),
+        "control": Box([-9.0] * 2, [9.0] * 2),
+    }
+    said = {"decision": np.zeros((2, 3)).tolist(), "gains": gains.tolist()}
+    judged = case_of(pieces=3, gains=gains, cost="worst", certificate=said, disturbance_class=kind, **two)
+    most = (2.0 / 3.0) * 2.0 * (2.0 / 3.0) * REACH
+    feedback_of(judged)._effort(arb(most * (1.0 + 1e-9)))
+    with pytest.raises((Broken, Unchecked)):
+        feedback_of(judged)._effort(arb(most * (1.0 - 1e-6)))
+
+
 def test_innovations_of_a_flat_set_are_those_of_differences_of_its_points():
     """Its middle was rounded out of it: what no gain has a bound across is no part of what is seen."""
     line, normal = np.array([0.3, 0.7]), np.array([0.7, -0.3])
