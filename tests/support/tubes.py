@@ -13,4 +13,4 @@ from sparserob_core.checker.sets.parameters import Corners
 def tube_of(case: Case, corners: Corners) -> VerifiedTube:
     """The tube of a case over a box of its parameters, along its states."""
     box = ParameterBox.between(*corners)
-    return VerifiedTube(ProjectedStates(case.states(box), np.eye(case.problem.system.states)), box)
+    return VerifiedTube(ProjectedStates(case.states.over(box), np.eye(case.problem.system.states)), box)

@@ -54,7 +54,7 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
     total, slopes = case.duality.summed(rows, pieces)
     ranges = _ranges(case)
     counts = [[ball(c) * length for c in case.price.counts] for length in _lengths(case)]
-    none = [[case.duality.nothing] * case.problem.system.controls] * len(slopes)
+    none = [[ball(0)] * case.problem.system.controls] * len(slopes)
     charged = case.duality.charged(rows, none)
     for count, slope, sizes in zip(counts, slopes, charged, strict=True):
         case.clock.check()

@@ -111,7 +111,7 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     seen = replace(row, innovations=named.innovations)
     if time != float(case.control.breakpoints[-1]):
         return [(y, seen)]
-    begun, none = feedback_of(case).following(named, entry, name), case.duality.nothing
+    begun, none = feedback_of(case).following(named, entry, name), ball(0)
     zero = [[none] * direction.size] * (case.control.pieces - 1)
     return [
         (y, replace(seen, slope=[*zero, balls(-direction)])),
@@ -197,7 +197,7 @@ def _of_control(case: Case, name: str, direction: Array, time: float, named: Nam
         return row
     if sorted(np.abs(direction).tolist()) != [0.0] * (direction.size - 1) + [1.0]:
         raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
-    return replace(row, constant=case.duality.nothing, charged=(piece, int(np.abs(direction).argmax())))
+    return replace(row, constant=ball(0), charged=(piece, int(np.abs(direction).argmax())))
 
 
 def _of_effort(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:

@@ -68,11 +68,6 @@ class Duality:
     held: ConvexSet | None = None
     lasting: Lasting | None = None
 
-    @property
-    def nothing(self) -> arb:
-        """0."""
-        return ball(0.0)
-
     def control_piece(self, time: float) -> int:
         """The piece of the control that is commanded at a time."""
         place = int(np.searchsorted(self.control.breakpoints, time, side="right")) - 1

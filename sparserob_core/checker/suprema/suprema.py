@@ -15,6 +15,7 @@ from sparserob_core.checker.claims.cells import Work
 from sparserob_core.checker.claims.claims import judged, precision_of
 from sparserob_core.checker.claims.constraints import covered, cut_times, prove_on_cells
 from sparserob_core.checker.claims.followed import FollowedRow
+from sparserob_core.checker.claims.multipliers import admissible
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
@@ -157,12 +158,9 @@ def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: flo
 def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: FollowedRow) -> tuple[float, float]:
     """The value of the row along its witness, which must be one of the problem's, between bounds."""
     problem, window, time = case.problem, asked.window, number(entry, "time")
-    if not window.start <= time <= window.stop:
-        raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
-    parameter = shaped(entry, "parameter", (problem.system.parameter_count,))
+    parameter = numbers(entry.get("parameter"), "parameter")
     deviation = shaped(entry, "deviation", (problem.system.states,))
-    if problem.system.parameters is not None and not known(problem.system.parameters).contains(parameter):
-        raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
+    admissible(case, window, time, parameter)
     if problem.initial_set is None and deviation.any():
         raise Broken("a deviation is written, there is one initial state")
     if problem.initial_set is not None and not known(problem.initial_set).contains(deviation):

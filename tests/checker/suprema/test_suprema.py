@@ -152,7 +152,7 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "no wall": (lambda row: row.update(wall=None), "wall: expected numbers"),
     "early": (lambda row: row.update(time=0.2), "t = 0.2 is not within"),
     "late": (lambda row: row.update(time=1.9), "t = 1.9 is not within"),
-    "a parameter": (lambda row: row.update(parameter=[0.0]), "parameter: shape (1,), expected (0,)"),
+    "a parameter": (lambda row: row.update(parameter=[0.0]), "parameter: 1 numbers where 0 are expected"),
     "a deviation outside": (
         lambda row: row.update(deviation=OUTSIDE.tolist()),
         "the deviation of the initial state is not shown",
