@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.checker.claims import constraints
+from sparserob_core.checker.reach import followed as followed_rows
 from tests.checker.test_check import DECAY, SPRING, on
 from tests.support.tampering import Forgery, forged
 
@@ -36,7 +36,7 @@ KINDS: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.fixture(autouse=True)
 def few_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(constraints, "FOLLOWED", 1)
+    monkeypatch.setattr(followed_rows, "FOLLOWED", 1)
 
 
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k == "integral" else k for k in KINDS])

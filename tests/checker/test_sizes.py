@@ -11,6 +11,7 @@ from flint import ctx
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.constraints import _rests
+from sparserob_core.checker.claims.units import nominal_sizes, units_of
 from sparserob_core.checker.outcome import RESOLVED
 from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.transcription.transcribe import prepare
@@ -57,10 +58,10 @@ def test_a_size_is_never_more_than_the_state_has() -> None:
     """With few bits the balls of the trajectory are wide, and a size is what they all have at least."""
     rows, none = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [1, -3, 0, 0]]), np.zeros((3, 0))
     with ctx.workprec(400):
-        true = case_of(IDLE).nominal_sizes(rows, none)
+        true = nominal_sizes(case_of(IDLE), rows, none)
     for bits in (20, 30, 53):
         with ctx.workprec(bits):
-            found = case_of(IDLE).nominal_sizes(rows, none)
+            found = nominal_sizes(case_of(IDLE), rows, none)
         assert (found <= true * (1.0 + 1e-12)).all() and (found >= 0.0).all()
     assert found == pytest.approx(true, rel=0.05)
 
@@ -70,8 +71,8 @@ def test_what_is_resolved_of_a_curved_set_is_never_more_than_what_its_states_do(
     case = case_of(np.zeros((2, PIECES)), initial_state=[1e-9, -1e-9 / 3.0, 0.0, 0.0], terminal=[ball])
     with ctx.workprec(200):
         (window,) = case.windows
-        units = case.units(window)
-        seen = case.nominal_sizes(np.eye(4), np.zeros((4, 0)))
+        units = units_of(case, window)
+        seen = nominal_sizes(case, np.eye(4), np.zeros((4, 0)))
         assert (RESOLVED * units.sums > seen).any()  # e^24 of what a control of 1 adds up to
         floors = np.array([units.least(axis, 1.0) for axis in np.eye(4)])
         assert (floors <= seen).all()

@@ -12,15 +12,18 @@ from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.models import kepler_root
-from sparserob_core.checker.claims import case, cells, constraints
-from sparserob_core.checker.claims.answers import _chords, answers_of
+from sparserob_core.checker.claims import case, cells, constraints, followed
+from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost import effort
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.cost.gains import _chords
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+from sparserob_core.checker.problem import disturbances
 from sparserob_core.checker.problem.lasting import Lasting, on_one_grid
 from sparserob_core.checker.problem.turns import in_turns
+from sparserob_core.checker.reach import followed as followed_rows
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets import flat
 from sparserob_core.control.policies import policy
@@ -81,14 +84,14 @@ def largest_effort(a: arb, limit: float) -> Callable[[], object]:
 
 def observed() -> object:
     said = {"gains": np.zeros((2, 2, 1, 1)).tolist(), "observer": [[[1.0]]]}
-    return answers_of(case_of(policy=AffinePolicy(), measurements=sr.Measurements([[1.0]]), certificate=said)).observer
+    return feedback_of(case_of(policy=AffinePolicy(), measurements=sr.Measurements([[1.0]]), certificate=said)).observer
 
 
 LISTS = test_lists.case_of("on own pieces").problem
 ROOT = VaryingSystem.of([["1/(1.0000001 - t)"]], [[1]], 1.0)
 UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "Kepler's equation of no number": (lambda: kepler_root(arb("nan"), arb(0.3)), Unchecked, "Kepler's equation"),
-    "an observer of another shape": (observed, Broken, r"the observer has shape \(1, 1, 1\), expected \(2, 1, 1\)"),
+    "an observer of another shape": (observed, Broken, r"observer: shape \(1, 1, 1\), expected \(2, 1, 1\)"),
     "a flat set of initial states": (
         lambda: returning(
             forced(
@@ -99,18 +102,18 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         Unchecked,
         "of a flat set of initial states, the checker knows boxes only",
     ),
-    "no list": (lambda: Case._parts(Box([-1.0], [1.0])), Unchecked, "lists of sets only"),
+    "no list": (lambda: disturbances._parts(Box([-1.0], [1.0])), Unchecked, "lists of sets only"),
     "measurable in a cylinder, in time": (
         lambda: (
             forced(
                 test_lists.case_of("in time, measurable"), disturbance=Cylinder(NormBall(3.0, 0.1, dimension=1), 2)
-            ).strayed
+            ).sources.strayed
         ),
         Unchecked,
         "measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and products of",
     ),
     "errors of execution of a policy": (
-        lambda: replace(kind("alone").case(execution=np.array([0.1, 0.2])), policy=AffinePolicy()).execution,
+        lambda: replace(kind("alone").case(execution=np.array([0.1, 0.2])), policy=AffinePolicy()).sources.execution,
         Unchecked,
         "errors of execution without feedback",
     ),
@@ -143,12 +146,12 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "the numbers of the system are not exact",
     ),
     "a time before the system begins": (
-        lambda: Flow(Plant.of(ROOT, 1.0), 1.0).step(-0.5, 0.0),
+        lambda: VerifiedFlow(Plant.of(ROOT, 1.0), 1.0).step(-0.5, 0.0),
         Unchecked,
         "not known from -0.5 to 0",
     ),
     "from one polynomial to the next": (
-        lambda: Flow(Plant.of(ROOT, 1.0), 1.0).step(0.0, 1.0),
+        lambda: VerifiedFlow(Plant.of(ROOT, 1.0), 1.0).step(0.0, 1.0),
         Unchecked,
         "no polynomial from 0.0 to 1.0",
     ),
@@ -190,8 +193,8 @@ def test_budgets_end_in_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
     case = kind("turning").case(proof, path=[wall])
     with pytest.raises(Unchecked, match="neither shown nor refuted: after 6 cells a violation of more than 1e-09"):
         constraints.bounded(case, case.windows[0])
-    monkeypatch.setattr(constraints, "FOLLOWED", 2)
-    monkeypatch.setattr(constraints, "MOST_CELLS", 0)
+    monkeypatch.setattr(followed_rows, "FOLLOWED", 2)
+    monkeypatch.setattr(followed, "MOST_CELLS", 0)
     case = kind("known").case(proof, path=[wall])
     with pytest.raises(Unchecked, match=r"neither shown nor refuted: after \d+ cells more than"):
         constraints.bounded(case, case.windows[0])

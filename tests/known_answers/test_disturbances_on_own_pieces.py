@@ -17,6 +17,7 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.units import units_of
 
 A, B = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.0], [1.0]])
 HORIZON, PIECES, LIMIT = 3.0, 6, 0.4
@@ -188,7 +189,7 @@ def test_the_units_of_rows_are_those_of_what_disturbances_do_on_their_own_pieces
             terminal=[sr.Box([-1.0] * 2, [1.0] * 2)], disturbances=disturbances,
         )  # fmt: skip
         case = Case(problem, control, sr.Dictionary.indicators(np.linspace(0.0, 2.0, pieces + 1)), none)
-        found.append(case.units(case.windows[0]).rows)
+        found.append(units_of(case, case.windows[0]).rows)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-5)
     assert (found[0] < 0.99 * found[2]).all()
 

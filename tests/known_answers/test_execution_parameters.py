@@ -14,7 +14,7 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.reach.missed import MissedOver
+from sparserob_core.checker.reach.missed import BoundedInputOver
 from sparserob_core.experiment.assemble import ControlExperiment, assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -232,8 +232,8 @@ def test_errors_at_one_parameter_and_over_cells_are_those_of_the_plant_there() -
 def test_the_checker_bounds_errors_over_boxes_and_cells_of_time_from_above_and_by_little() -> None:
     experiment = of_system(TWO)
     case = Case(experiment.problem, experiment.control, experiment.disturbance, {"decision": CONTROL})
-    delivered, c, box = case.execution, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
-    assert isinstance(delivered, MissedOver)
+    delivered, c, box = case.sources.execution, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
+    assert isinstance(delivered, BoundedInputOver)
     tube = tube_of(case, box)
     start, stop = 1.52, 1.53
     found = delivered.over(c, [start, stop], (box, tube.flow))

@@ -13,6 +13,7 @@ from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.checker.claims import case as cases
+from sparserob_core.checker.problem import returning
 from sparserob_core.control.loop.remaining import remaining
 from sparserob_core.control.problem.terms.repeat import WITHIN, Return
 
@@ -409,7 +410,7 @@ def test_a_state_that_is_alone_must_be_fixed_at_the_end(tmp_path, monkeypatch) -
 
 def test_what_counts_as_no_violation_must_not_leave_the_initial_states(tmp_path, monkeypatch) -> None:
     _run(tmp_path / "run", _integrator())
-    monkeypatch.setattr(cases, "INSIDE", 1e-10)  # what counts as no violation is then outside of the initial states
+    monkeypatch.setattr(returning, "INSIDE", 1e-10)  # what counts as no violation is then outside of the initial states
     assert _verdicts(tmp_path / "run")["repeat"] == "not checked"
 
 

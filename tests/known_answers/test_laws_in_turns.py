@@ -13,7 +13,7 @@ from flint import ctx
 from scipy.optimize import linprog
 
 import sparserob_core as sr
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.response import Propagator, merge_grids
@@ -231,7 +231,7 @@ def test_transitions_across_a_turn_are_products_of_both_laws() -> None:
     flow = Expansion.of(system).flow(begun, end)
     assert abs(flow.state[0, 0, 0] - expected) <= flow.error[0] + 1e-15
     with ctx.workprec(192):
-        Phi, Gamma, _ = Flow(Plant.of(system, 2.0), 2.0).over(0.1, 1.9)
+        Phi, Gamma, _ = VerifiedFlow(Plant.of(system, 2.0), 2.0).over(0.1, 1.9)
     points, weights = np.polynomial.legendre.leggauss(30)
     times = 0.4 + 0.3 * points
     driven = 0.3 * weights @ np.exp((0.7**2 - times**2) / 2) * 1.7 / 2.9

@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.reach.missed import MissedOver
+from sparserob_core.checker.reach.missed import BoundedInputOver
 from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal
 from sparserob_core.experiment.assemble import ControlExperiment, assemble
@@ -298,8 +298,8 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
     experiment = of_problem(system=weak, disturbance=bound)
     control = np.zeros((2, 4)).tolist()
     case = Case(experiment.problem, experiment.control, experiment.disturbance, {"decision": control})
-    strayed, c, box = case.strayed, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
-    assert isinstance(strayed, MissedOver)
+    strayed, c, box = case.sources.strayed, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
+    assert isinstance(strayed, BoundedInputOver)
     tube = tube_of(case, box)
     start, stop = 1.52, 1.53
     found = strayed.over(c, [start, stop], (box, tube.flow))

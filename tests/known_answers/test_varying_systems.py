@@ -14,7 +14,7 @@ from flint import ctx
 from scipy.optimize import linprog
 
 import sparserob_core as sr
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.experiment.check.check import check
@@ -411,7 +411,7 @@ def test_random_analytic_coefficients_are_integrated_in_any_unit_of_time_and_len
     assert missed.max() <= 1e-14 * max(1.0, float((np.abs(again) / u[:, None]).max()))
     assert (off <= allowed + 2 * missed).all()
     with ctx.workprec(192):
-        Phi, Gamma, _ = Flow(Plant.of(system, horizon), horizon).over(0.0, horizon)
+        Phi, Gamma, _ = VerifiedFlow(Plant.of(system, horizon), horizon).over(0.0, horizon)
     for i, row in enumerate(Phi.beside(Gamma).matrix.tolist()):
         for j, ball in enumerate(row):
             far = abs(np.longdouble(float(ball.mid())) - again[i, j])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,11 +15,28 @@ if TYPE_CHECKING:
     from flint import arb, fmpq
 
 
+def ball(value: float) -> arb:
+    """An exact number as a ball."""
+    from flint import arb
+
+    return arb(float(value))
+
+
 def balls(vector: Sequence[float] | Array) -> list[arb]:
     """Exact numbers as balls."""
     from flint import arb
 
     return [arb(float(v)) for v in vector]
+
+
+def largest(values: Iterable[arb]) -> arb:
+    """The largest of some balls, at least one."""
+    return reduce(lambda one, other: one.max(other), values)
+
+
+def smallest(values: Iterable[arb]) -> arb:
+    """The smallest of some balls, at least one."""
+    return reduce(lambda one, other: one.min(other), values)
 
 
 def rational(value: Fraction) -> arb:

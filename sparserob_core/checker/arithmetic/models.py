@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Unchecked
 
@@ -31,6 +32,28 @@ class Frame:
     monomials: Monomials
     order: int
 
+    def number(self, value: arb) -> Model:
+        """The model of what depends on nothing."""
+        return self._of([value])
+
+    def time(self, middle: arb, half: arb) -> Model:
+        """The model of ``middle + half r``."""
+        return self._of([middle, half])
+
+    def parameter(self, place: int, middle: arb, half: arb) -> Model:
+        """The model of ``middle + half s_place``."""
+        from flint import arb_poly
+
+        found = self.number(middle)
+        if not half.is_zero():
+            found.parts[self.monomials.linear(place)] = arb_poly([half])
+        return found
+
+    def _of(self, coefficients: list[arb]) -> Model:
+        from flint import arb_poly
+
+        return Model(self, [arb_poly(coefficients), *[None] * (self.monomials.size - 1)])
+
 
 @final
 class Model:
@@ -43,52 +66,22 @@ class Model:
     def __init__(self, frame: Frame, parts: Sequence[Part]) -> None:
         self.frame, self.parts = frame, list(parts)
 
-    @staticmethod
-    def number(frame: Frame, value: arb) -> Model:
-        """What depends on nothing."""
-        from flint import arb_poly
-
-        return Model(frame, [arb_poly([value]), *[None] * (frame.monomials.size - 1)])
-
-    @staticmethod
-    def time(frame: Frame, middle: arb, half: arb) -> Model:
-        """``middle + half r``."""
-        from flint import arb_poly
-
-        return Model(frame, [arb_poly([middle, half]), *[None] * (frame.monomials.size - 1)])
-
-    @staticmethod
-    def parameter(frame: Frame, place: int, middle: arb, half: arb) -> Model:
-        """``middle + half s_place``."""
-        from flint import arb_poly
-
-        found = Model.number(frame, middle)
-        if not half.is_zero():
-            found.parts[frame.monomials.linear(place)] = arb_poly([half])
-        return found
-
     @property
     def constant(self) -> arb:
         """What does not depend on anything."""
-        from flint import arb
-
         first = self.parts[0]
-        return arb(0) if first is None else first[0]
+        return ball(0) if first is None else first[0]
 
     @property
     def size(self) -> arb:
         """The most that it can be."""
-        from flint import arb
-
-        return sum((_size(part) for part in self.parts if part is not None), arb(0))
+        return sum((_size(part) for part in self.parts if part is not None), ball(0))
 
     def _other(self, value: object) -> Model:
-        from flint import arb
-
         if isinstance(value, Model):
             return value
         if isinstance(value, int | float | np.integer | np.floating):
-            return Model.number(self.frame, arb(float(value)))
+            return self.frame.number(ball(float(value)))
         raise Unchecked(f"an entry of the system holds a {type(value).__name__}, expected a number")
 
     def __add__(self, other: object) -> Model:
@@ -159,7 +152,7 @@ class Model:
         from flint import arb, arb_series, ctx
 
         c = arb(self.constant.mid())
-        away = self - Model.number(self.frame, c)
+        away = self - self.frame.number(c)
         far, count = away.size.upper(), self.frame.order + self.frame.monomials.degree + 1
         before, ctx.cap = ctx.cap, count + 1
         try:
@@ -177,9 +170,9 @@ class Model:
             rests.append((abs(bound) * power).upper())
         least = min(range(count), key=lambda k: float(rests[k]))
         order = next((k for k, rest in enumerate(rests) if rest <= wanted), least)
-        found = Model.number(self.frame, coefficients[order])
+        found = self.frame.number(coefficients[order])
         for coefficient in reversed(coefficients[:order]):
-            found = found * away + Model.number(self.frame, coefficient)
+            found = found * away + self.frame.number(coefficient)
         return found._within(rests[order])
 
     def exp(self) -> Model:
@@ -209,26 +202,22 @@ class Model:
 
 
 def _size(part: arb_poly) -> arb:
-    from flint import arb
-
-    return sum(map(abs, part.coeffs()), arb(0))
+    return sum(map(abs, part.coeffs()), ball(0))
 
 
 def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -> arb:
     """How large the terms of a product are whose degree in the parameters is more than is kept."""
-    from flint import arb
-
     if not monomials.degree:
-        return arb(0)
-    sizes = [[arb(0)] * (monomials.degree + 1) for _ in range(2)]
+        return ball(0)
+    sizes = [[ball(0)] * (monomials.degree + 1) for _ in range(2)]
     for side, parts in zip(sizes, (left, right), strict=True):
         for degree, part in zip(monomials.degrees, parts, strict=True):
             if part is not None:
                 side[degree] = side[degree] + _size(part)
-    total = arb(0)
+    total = ball(0)
     for i, size in enumerate(sizes[0]):
         if i and not size.is_zero():
-            total = total + size * sum(sizes[1][monomials.degree + 1 - i :], arb(0))
+            total = total + size * sum(sizes[1][monomials.degree + 1 - i :], ball(0))
     return total
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
@@ -103,13 +104,13 @@ class Series:
         """All that are off from it by at most ``off (rows, columns)`` at every parameter."""
         return Series(self.monomials, [self.parts[0] + around(off), *self.parts[1:]])
 
-    def scaled(self, factor: arb) -> Series:
-        """Every coefficient times a number."""
+    def scaled(self, factor: arb | arb_mat) -> Series:
+        """Every coefficient times a number, or a matrix, that does not depend on the parameters."""
         return Series(self.monomials, [part * factor for part in self.parts])
 
-    def applied(self, columns: arb_mat) -> Series:
-        """The product with a matrix that does not depend on the parameters."""
-        return Series(self.monomials, [part * columns for part in self.parts])
+    def along(self, rows: arb_mat) -> Series:
+        """The product of a matrix that does not depend on the parameters with it."""
+        return Series(self.monomials, [rows * part for part in self.parts])
 
     def columns(self, first: int, last: int | None) -> Series:
         """Some of the columns."""
@@ -176,6 +177,11 @@ def stacked(table: Sequence[Sequence[arb]]) -> arb_mat:
     from flint import arb_mat
 
     return arb_mat([list(row) for row in table])
+
+
+def exactly(rows: Array | arb_mat) -> arb_mat:
+    """Rows of floats as balls."""
+    return stacked([balls(row) for row in rows]) if isinstance(rows, np.ndarray) else rows
 
 
 def around(off: Array) -> arb_mat:

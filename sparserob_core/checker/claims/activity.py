@@ -8,14 +8,14 @@ that cost over the admissible controls, bounded by weak duality, is below the we
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball, smallest
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.duality import Row
+from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.curved import NormBall
@@ -27,7 +27,7 @@ ROUNDED = 1e-12  # of the terms of which a value of the control is a sum: that m
 EQUAL = 1e-12  # counts that differ by no more are equal
 NEARLY = 1e-6  # of one count, by which a whole number of them may be missed
 
-Rows = list[tuple[float, Row]]
+Rows = list[tuple[float, ConstraintRow]]
 
 
 def acted(case: Case) -> float:
@@ -51,12 +51,10 @@ def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
 def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> float:
     """The share below which no admissible control acts, by these multipliers; a whole number of pieces where all count
     the same."""
-    from flint import arb
-
     total, slopes = case.duality.summed(rows, pieces)
     ranges = _ranges(case)
-    counts = [[arb(float(c)) * length for c in case.price.counts] for length in _lengths(case)]
-    none = [[case.duality.nothing] * case.problem.system.controls] * len(slopes)
+    counts = [[ball(c) * length for c in case.price.counts] for length in _lengths(case)]
+    none = [[ball(0)] * case.problem.system.controls] * len(slopes)
     charged = case.duality.charged(rows, none)
     for count, slope, sizes in zip(counts, slopes, charged, strict=True):
         case.clock.check()
@@ -67,40 +65,41 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
 def least_of_cost(case: Case, cost: arb) -> float:
     """The share below which no admissible control acts, where none costs less than ``cost``: a vector of channels that
     is not 0 costs at most its highest weight times the longest that it can be."""
-    from flint import arb
-
     counts, highest = case.price.counts, case.price.highest
     factors = [
-        arb(len(block)) * arb(float(counts[c])) / (arb(case.problem.cost.l1) * arb(float(highest[c])) * longest)
+        ball(len(block)) * ball(counts[c]) / (ball(case.problem.cost.l1) * ball(highest[c]) * longest)
         for block in case.price.blocks
         if (longest := _longest(case, block)) > 0 and highest[c := block[0]] > 0.0
     ]
     if not factors:
         return 0.0
-    return _whole(case, cost * reduce(lambda one, other: one.min(other), factors))
+    return _whole(case, cost * smallest(factors))
 
 
 def _longest(case: Case, block: Sequence[int]) -> arb:
     """At least how long the vector of some channels can be."""
-    from flint import arb
-
     bound, ranges = case.problem.control, _ranges(case)
     reach = [abs(ranges[i][0]).max(abs(ranges[i][1])) for i in block]
-    size = sum((r * r for r in reach), arb(0)).sqrt()
+    size = sum((r * r for r in reach), ball(0)).sqrt()
     if isinstance(bound, NormBall) and bound.p == 2.0:
-        middle = sum((arb(float(bound.centre[i])) ** 2 for i in block), arb(0)).sqrt()
-        size = size.min(arb(bound.radius) + middle)
+        middle = sum((ball(bound.centre[i]) ** 2 for i in block), ball(0)).sqrt()
+        size = size.min(ball(bound.radius) + middle)
     return size
 
 
 def _whole(case: Case, total: arb) -> float:
-    """A bound of the time of action as a share of the largest, rounded up where all that counts, counts the same."""
+    """A bound of the time of action as a share of the largest."""
+    return min(1.0, _rounded(case, total) / float(_vectors(case).sum()))
+
+
+def _rounded(case: Case, total: arb) -> float:
+    """A bound of the time of action, rounded up where all that counts, counts the same."""
     table = _vectors(case)
     bound = float(np.nextafter(float(total.lower()), -np.inf))
     if np.ptp(table) <= EQUAL * table.max():
         one = float(table.mean())
-        return float(min(table.size, max(0.0, np.ceil(bound / one - NEARLY))) / table.size)
-    return max(0.0, bound / float(table.sum()))
+        bound = float(np.ceil(bound / one - NEARLY)) * one
+    return max(0.0, bound)
 
 
 def _least(
@@ -113,14 +112,12 @@ def _least(
 ) -> arb:
     """At most the minimum of what one piece counts and the slopes, and ``sizes`` of absolute values, add, over the
     controls in the set that are 0 in the channels that are ``off``."""
-    from flint import arb
-
-    ups, downs, certain = [], [], arb(0)
+    ups, downs, certain = [], [], ball(0)
     for (low, high), one in zip(ranges, count, strict=True):
         always = low > 0 or high < 0
-        certain = certain + (one if always else arb(0))
-        up = arb(0) if always or not high > 0 else one / high
-        down = arb(0) if always or not low < 0 else one / -low
+        certain = certain + (one if always else ball(0))
+        up = ball(0) if always or not high > 0 else one / high
+        down = ball(0) if always or not low < 0 else one / -low
         ups.append(up if high > 0 else down)
         downs.append(down if low < 0 else up)
     for i, size in enumerate(sizes):
@@ -133,20 +130,16 @@ def _least(
 
 def _ranges(case: Case) -> list[tuple[arb, arb]]:
     """The least and the largest value of every channel."""
-    from flint import arb
-
     found, m, shape = [], case.problem.system.controls, known(case.problem.control)
     for i in range(m):
-        axis = [arb(float(i == j)) for j in range(m)]
+        axis = [ball(i == j) for j in range(m)]
         found.append((-shape.support([-a for a in axis]), shape.support(axis)))
     return found
 
 
 def _lengths(case: Case) -> list[arb]:
-    from flint import arb
-
     breaks = case.control.breakpoints
-    return [arb(float(b)) - arb(float(a)) for a, b in pairwise(breaks)]
+    return [ball(b) - ball(a) for a, b in pairwise(breaks)]
 
 
 def _counts(case: Case) -> np.ndarray:
@@ -218,23 +211,17 @@ def _divided(
 
 def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], rows: Rows) -> float:
     """The time that a control of one part acts at least."""
-    from flint import arb
-
     total, slopes = case.duality.summed(rows, None)
-    sizes = case.duality.charged(rows, [[arb(0)] * case.problem.system.controls] * len(slopes))
+    sizes = case.duality.charged(rows, [[ball(0)] * case.problem.system.controls] * len(slopes))
     for k, (length, slope, charged) in enumerate(zip(_lengths(case), slopes, sizes, strict=True)):
         here = [parts.get((c, k), ANY) for c in range(len(slope))]
-        counts = [arb(float(c)) * length if feasible else arb(0) for c in case.price.counts]
+        counts = [ball(c) * length if feasible else ball(0) for c in case.price.counts]
         total = total + _least_of_part(case, here, counts, slope, charged)
     if not feasible:
         if not total > 0:
             raise Broken(f"tree: multipliers of a part prove {float(total.lower()):.3g}, expected a positive number")
         return float("inf")
-    table = _vectors(case)
-    bound = float(np.nextafter(float(total.lower()), -np.inf))
-    if np.ptp(table) <= EQUAL * table.max():
-        return float(max(0.0, np.ceil(bound / float(table.mean()) - NEARLY))) * float(table.mean())
-    return max(0.0, bound)
+    return _rounded(case, total)
 
 
 def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb], sizes: Sequence[arb]) -> arb:
@@ -249,7 +236,7 @@ def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: 
             if not ends:
                 return arb("inf")  # nothing is in this part
             heights = [(count if part[2] or v != 0.0 else arb(0)) + s * arb(v) + size * arb(abs(v)) for v in ends]
-            total = total + reduce(lambda one, other: one.min(other), heights)
+            total = total + smallest(heights)
         return total
     certain = sum((count for part, count in zip(parts, counts, strict=True) if part[2]), arb(0))
     priced = [arb(0) if part[2] else count for part, count in zip(parts, counts, strict=True)]

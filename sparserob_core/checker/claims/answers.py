@@ -6,25 +6,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property, lru_cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls, below, rational
-from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.claims.case import STEP, Case, number, numbers
-from sparserob_core.checker.claims.duality import EFFORT, Row, before, steps
+from sparserob_core.checker.arithmetic.balls import ball, balls, below
+from sparserob_core.checker.arithmetic.series import exactly, stacked
+from sparserob_core.checker.claims.case import STEP, Case, number, numbers, shaped
+from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow, steps
 from sparserob_core.checker.cost.effort import at_most
+from sparserob_core.checker.cost.gains import GainsBound, reach
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
+from sparserob_core.checker.problem.timing import before
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.measurable import MeasurableLoop
-from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.shape import NEAR, along
-from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -34,7 +31,7 @@ PEAK, WORST = "peak", "worst"
 
 
 @final
-class Answers:
+class VerifiedFeedback:
     """The answers of the control of a case, from its ``gains (K, K, m, p)``."""
 
     def __init__(self, case: Case) -> None:
@@ -47,9 +44,7 @@ class Answers:
         case = self.case
         if not case.answering:
             return self._none
-        gains = numbers(case.certificate.get("gains"), "gains")
-        if gains.shape != self._none.shape:
-            raise Broken(f"the gains have shape {gains.shape}, expected {self._none.shape}")
+        gains = shaped(case.certificate, "gains", self._none.shape)
         times, measured = case.control.breakpoints, case.problem.measurements
         told = case.problem.initial_set is not None or (measured is not None and measured.noise is not None)
         for k, j in np.argwhere(gains.any(axis=(2, 3))).tolist():
@@ -75,17 +70,14 @@ class Answers:
         if case.problem.measurements is None or not case.answering:
             return None
         shape = case.control.pieces, case.problem.system.states, case.problem.measurements.outputs
-        found = numbers(case.certificate.get("observer"), "observer")
-        if found.shape != shape:
-            raise Broken(f"the observer has shape {found.shape}, expected {shape}")
-        return found
+        return shaped(case.certificate, "observer", shape)
 
     @cached_property
-    def loop(self) -> ClosedLoop:
+    def loop(self) -> VerifiedLoop:
         """The system under the nominal control and the gains."""
         return self._loop(self.case.pieces, self.gains)
 
-    def _loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> ClosedLoop:
+    def _loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> VerifiedLoop:
         """The loop; where ``changes`` are given, under disturbances that jump there only."""
         case = self.case
         system = case.problem.system
@@ -93,17 +85,17 @@ class Answers:
             raise Unchecked("the checker knows feedback of known systems only")
         if case.measurable and (system.switches or system.delay):
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
-        if not case.alike:
+        if not case.disturbances.alike:
             raise Unchecked("the checker knows feedback under disturbances of one class, on one dictionary")
-        held, measured = (changes if case.measurable else case.changes) or [], case.problem.measurements
+        held, measured = (changes if case.measurable else case.disturbances.changes) or [], case.problem.measurements
         if measured is not None and case.measurable:
             raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
-        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(
+        return (MeasurableLoop if case.measurable and changes is None else VerifiedLoop)(
             system,
             [float(v) for v in np.asarray(case.problem.initial_state)],
             nominal,
             gains,
-            sorted({*case.grid, *held}),
+            sorted({*case.timing.grid, *held}),
             [float(t) for t in case.control.breakpoints],
             held,
             case.problem.disturbance,
@@ -144,7 +136,7 @@ class Answers:
 
     def support(self, responses: list[arb]) -> arb:
         """How far deviations take what has these ``responses (Q,)`` to them; 0 of none."""
-        return self.loop.support(responses) if responses else balls([0.0])[0]
+        return self.loop.deviations.support(responses) if responses else balls([0.0])[0]
 
     def heights(self, parts: Sequence[arb_mat], rows: arb_mat) -> list[arb]:
         """The largest ``c'u`` for every row ``c`` of ``rows (r, m)`` of a sum of ``parts (m, 1 + Q)`` that deviate
@@ -168,183 +160,78 @@ class Answers:
         total = 0.0
         for loop in (self.loop_at_rest, self.loop):
             first, *responses = (float(abs(x).upper()) for x in loop.nodes[-1].tolist()[state])
-            total += first + float(np.array(responses) @ loop.radii)
+            total += first + float(np.array(responses) @ loop.deviations.radii)
         return total
 
     def cost(self) -> arb:
         """The cost of the control; where absolute values are charged as an effort, the written one, which is shown to
         be none too small."""
-        from flint import arb
-
-        case, total = self.case, arb(0)
+        case, total = self.case, ball(0)
         if case.charge not in (PEAK, WORST):
             return case.price.of(case.pieces)
         squares = case.price.squares(case.pieces)
         if case.charge == WORST:
-            written = arb(number(case.certificate, "cost"))
-            terms = max(case.price.added(case.pieces, arb(0)), case.price.terms(case.pieces))
-            rounded = CANCELLED * arb(terms if case.price.is_quadratic else 0.0)
+            written = ball(number(case.certificate, "cost"))
+            terms = max(case.price.added(case.pieces, ball(0)), case.price.terms(case.pieces))
+            rounded = CANCELLED * ball(terms if case.price.is_quadratic else 0.0)
             self._effort(written - squares + FIGURES * abs(written).max(rounded))
             return written.max(squares)  # an effort is never less than 0
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
-                u, row = arb(float(case.theta[i, k])), self.loop.effects[k][i]
-                height = (u + self.loop.support(row)).max(-u + self.loop.support([-x for x in row]))
+                u, row = ball(case.theta[i, k]), self.loop.effects[k][i]
+                height = (u + self.support(row)).max(-u + self.support([-x for x in row]))
                 total = total + price * height
         return total + squares
 
     def _effort(self, limit: arb) -> None:
         """Show that no deviation causes an effort beyond a limit."""
-        from flint import arb
-
         case, loop = self.case, self.loop
         a, A = [], []
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
-                a.append(price * arb(float(case.theta[i, k])))
+                a.append(price * ball(case.theta[i, k]))
                 A.append([price * x for x in loop.effects[k][i]])
-        reach = [
-            float(known(shape).support(balls([float(b == axis) for b in range(shape.dimension)])).mid()) - about[axis]
-            for shape, about in loop.sets
-            for axis in range(shape.dimension)
-        ]
-        at_most(a, A, loop.support, np.array(reach), limit, case.clock)
+        deviations = loop.deviations
+        axes = [[ball(int(b == axis)) for b in range(deviations.starts[-1])] for axis in range(deviations.starts[-1])]
+        reach = np.array([float(x.mid()) for x in deviations.supports(axes)])
+        at_most(a, A, deviations.support, reach, limit, case.clock)
 
-    def least(self, rows: Sequence[tuple[float, Row]], priced: bool) -> arb:
+    def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
         """At most what gains, and peaks or an effort that are charged, add to the sum of ``rows`` times their
         multipliers; 0 where nothing is answered.
 
         Of peaks and of the effort only how far the set of the control lets them go is used; of the gains that the
         control that they cause is no wider than its set, ``h(F_kl) + h(-F_kl) <= width`` summed over the blocks ``l``.
         """
-        from flint import arb
-
-        case, total, most = self.case, arb(0), arb(0)
+        case, total, most = self.case, ball(0), ball(0)
         for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
             for i, price in enumerate(costs):
-                reach = _reach(case.problem.control, i)
-                most = most + price * reach
+                far = reach(case.problem.control, i)
+                most = most + price * far
                 if case.charge == PEAK:
-                    left = price * int(priced) - sum((arb(y) for y, row in rows if row.charged == (k, i)), arb(0))
-                    total = total + (left * reach).min(arb(0))
+                    left = price * int(priced) - sum((ball(y) for y, row in rows if row.charged == (k, i)), ball(0))
+                    total = total + (left * far).min(ball(0))
         if case.charge == WORST:
-            left = arb(int(priced)) - sum((arb(y) for y, row in rows if row.charged == EFFORT), arb(0))
-            total = total + (left * most).min(arb(0))
-        return total - self._of_gains(rows)
-
-    def _of_gains(self, rows: Sequence[tuple[float, Row]]) -> arb:
-        """How much the gains can lower the sum of rows times their multipliers, at most."""
-        from flint import arb
-
-        case, total = self.case, arb(0)
-        rows = [(y, row) for y, row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
-        if not rows:
-            return total
-        loop = self.loop_at_rest
-        K, m, d = case.control.pieces, case.problem.system.controls, loop.outputs
-        left = stacked([[arb(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
-        right = stacked([[x for part in row.innovations for x in part] for _, row in rows])
-        product = (left * right).tolist()
-        width = [_width(case.problem.control, i) for i in range(m)]
-        for k in range(K):
-            clusters = self._clusters(loop, k)
-            for i in range(m):
-                sizes = [arb(0)]
-                for members, inverse, blocks in clusters:
-                    z = (
-                        inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])
-                    ).entries()
-                    shares = iter(z)
-                    sizes += [
-                        sum((abs(next(shares)) / length for _, length in self._segments[block]), arb(0))
-                        for block in blocks
-                    ]
-                total = total + width[i] * _largest(sizes)
-        return total
-
-    def _clusters(self, loop: ClosedLoop, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
-        """The breakpoints that the control on a piece answers, those that see a block in common together; for each what
-        gives, from a combination of the states seen there, a combination of the blocks, ``(q, J d)``."""
-        groups: list[tuple[list[int], set[int]]] = []
-        for j in np.flatnonzero(self.case.answers[k, : k + 1]).tolist():
-            seen = {block for block in loop.seen[j] if self._segments[block]}
-            if not seen:
-                continue
-            mine, rest = ([j], seen), []
-            for members, blocks in groups:
-                if blocks & mine[1]:
-                    mine = (members + mine[0], mine[1] | blocks)
-                else:
-                    rest.append((members, blocks))
-            groups = [*rest, mine]
-        return [(sorted(members), *self._inverse(loop, tuple(sorted(members)))) for members, _ in groups]
-
-    def _inverse(self, loop: ClosedLoop, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
-        """What gives, of any combination of the states seen at these breakpoints, one of the blocks that is seen so."""
-        if members not in self._inverses:
-            blocks = sorted({block for j in members for block in loop.seen[j] if self._segments[block]})
-            d = loop.outputs
-            table: list[list[arb]] = []
-            for j in members:
-                seen = loop.seen[j]
-                lists = {block: _onto(push, self._segments[block]) for block, push in seen.items() if block in blocks}
-                table += [
-                    [x for block in blocks for x in (lists[block][s] if block in lists else self._none_of(block))]
-                    for s in range(d)
-                ]
-            groups = [self._pushed(loop, block) for block in blocks]
-            pattern = np.vstack(
-                [np.hstack([g.pattern & (b in loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
-                 for j in members]
-            )  # fmt: skip
-            most = max(group.states for group in groups)
-            rows = [(d * (k + 1), most) for k in range(len(members))]
-            ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
-            columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
-            reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
-            self._inverses[members] = Seen(stacked(table), pattern, rows, columns, reach).inverse(), blocks
-        return self._inverses[members]
-
-    def _none_of(self, block: int) -> list[arb]:
-        """Nothing of any of the segments of a block."""
-        return [balls([0.0])[0]] * len(self._segments[block])
-
-    def _pushed(self, loop: ClosedLoop, block: int) -> Pushed:
-        """Who can see the deviations of a block; of the initial state everyone sees its own."""
-        vectors = [vector for vector, _ in self._segments[block]]
-        if loop.measured is not None:  # outputs see what the observer makes of everything: as many as there are
-            return Pushed(np.ones((loop.outputs, len(vectors)), dtype=bool), loop.outputs, len(vectors))
-        if self.case.problem.initial_set is not None and block == loop.begun:
-            return Pushed(np.array([[bool(v) for v in row] for row in vectors]).T, len(vectors), len(vectors))
-        key = tuple(map(tuple, vectors))
-        if key not in self._pushes:
-            self._pushes[key] = loop.pushed(vectors)
-        return self._pushes[key]
+            left = ball(int(priced)) - sum((ball(y) for y, row in rows if row.charged == EFFORT), ball(0))
+            total = total + (left * most).min(ball(0))
+        return total - self._gains_bound.of(rows) if case.answering else total
 
     @cached_property
-    def _pushes(self) -> dict[tuple[tuple[Fraction, ...], ...], Pushed]:
-        return {}
+    def _gains_bound(self) -> GainsBound:
+        return GainsBound(self.loop_at_rest, self.case.answers, self.case.problem.control)
 
     @cached_property
-    def _segments(self) -> list[list[tuple[list[Fraction], arb]]]:
-        """Of every block the directions along which its set is long, and how long; none of what cannot deviate, which
-        is never seen."""
-        loop = self.loop_at_rest
-        found = {id(shape): _segments(shape, about) for shape, about in loop.sets}
-        return [found[id(shape)] for shape, _ in loop.sets]
-
-    @cached_property
-    def loop_at_rest(self) -> ClosedLoop:
+    def loop_at_rest(self) -> VerifiedLoop:
         """The same system without any control; of measurable disturbances under some of them, that jump often enough to
         push the state wherever any do."""
         case = self.case
         if not case.measurable:
             return self._resting(None)
         parts = np.arange(case.problem.system.states) / case.problem.system.states
-        ends = zip(case.grid[:-1], case.grid[1:], strict=True)
+        ends = zip(case.timing.grid[:-1], case.timing.grid[1:], strict=True)
         return self._resting([float(t) for a, b in ends for t in a + parts * (b - a)])
 
-    def _resting(self, changes: list[float] | None) -> ClosedLoop:
+    def _resting(self, changes: list[float] | None) -> VerifiedLoop:
         return self._loop(self._still, self._none, changes)
 
     @property
@@ -353,7 +240,7 @@ class Answers:
         none = stacked([balls([0.0])] * self.case.problem.system.controls)
         return [none] * self.case.control.pieces
 
-    def named(self, entry: Mapping[str, Any], name: str) -> Named:
+    def named(self, entry: Mapping[str, Any], name: str) -> NamedDeviations:
         """The deviations that an entry of a certificate names, under measurable disturbances of one that jumps where it
         says."""
         loop = self.loop_at_rest
@@ -361,31 +248,25 @@ class Answers:
             changes = numbers(entry.get("changes"), f"{name}: changes")
             if changes.ndim != 1 or not changes.size or changes[0] != 0.0 or not (np.diff(changes) > 0.0).all():
                 raise Broken(f"{name}: the disturbance must change at increasing times from 0 on")
-            if changes[-1] >= self.case.grid[-1]:
+            if changes[-1] >= self.case.timing.grid[-1]:
                 raise Broken(f"{name}: the disturbance changes at {float(changes[-1]):.6g}, after the end")
             loop = self._resting([float(t) for t in changes])
-        return Named(self.case, loop, _deviations(self.case, loop, entry, name))
+        return NamedDeviations(self.case, loop, _deviations(self.case, loop, entry, name))
 
-    def following(self, named: Named, entry: Mapping[str, Any], name: str) -> Named:
+    def following(self, named: NamedDeviations, entry: Mapping[str, Any], name: str) -> NamedDeviations:
         """The deviations across the seam of a plan that repeats: no disturbance yet, and the initial state of the next
         period that an entry names, which must be in its set; none where there is one initial state."""
-        from flint import arb
-
-        calm = named.loop.rests[: named.loop.begun]
+        calm = named.loop.deviations.rests[: named.loop.deviations.begun]
         if self.case.problem.initial_set is None:
-            return Named(self.case, named.loop, calm)
+            return NamedDeviations(self.case, named.loop, calm)
         point = numbers(entry.get("following"), f"{name}: following")
         held = known(self.case.problem.initial_set)
         found = held.member(point) if point.shape == (self.case.problem.system.states,) else None
         if found is None:
             raise Broken(f"{name}: the next deviation {point.tolist()} is not shown to be in its set")
-        about = self.loop_at_rest.sets[-1][1]
-        begun = [v - arb(float(c)) for v, c in zip(found, about, strict=True)]
-        return Named(self.case, named.loop, [*calm, begun])
-
-    @cached_property
-    def _inverses(self) -> dict[tuple[int, ...], tuple[arb_mat, list[int]]]:
-        return {}
+        about = self.loop_at_rest.deviations.sets[-1][1]
+        begun = [v - ball(c) for v, c in zip(found, about, strict=True)]
+        return NamedDeviations(self.case, named.loop, [*calm, begun])
 
 
 def commanded(case: Case, name: str) -> ConvexSet | None:
@@ -396,18 +277,18 @@ def commanded(case: Case, name: str) -> ConvexSet | None:
 
 
 @lru_cache(maxsize=2)
-def answers_of(case: Case) -> Answers:
+def feedback_of(case: Case) -> VerifiedFeedback:
     """What the control of a case answers, made once."""
-    return Answers(case)
+    return VerifiedFeedback(case)
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Named:
+class NamedDeviations:
     """Deviations ``z`` from their middles, block by block, under which the system of ``loop`` is at rest."""
 
     case: Case
-    loop: ClosedLoop
+    loop: VerifiedLoop
     z: list[list[arb]]
 
     def of(self, rows: Sequence[list[arb]]) -> list[arb]:
@@ -420,16 +301,14 @@ class Named:
         """What is seen of them at every breakpoint, ``(K, p)``, beside what is seen of points of their sets next to the
         middles: differences of points of a set without an interior are in its span, those from a middle that was
         rounded are not. The nominal control stands for that under these points."""
-        from flint import arb
-
-        pairs = zip(self.z, self.loop.rests, strict=True)
+        pairs = zip(self.z, self.loop.deviations.rests, strict=True)
         z = [
-            [arb(0)] * len(mine) if mine is rest else [x - r for x, r in zip(mine, rest, strict=True)]
+            [ball(0)] * len(mine) if mine is rest else [x - r for x, r in zip(mine, rest, strict=True)]
             for mine, rest in pairs
         ]
         return [
             [
-                sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), arb(0))
+                sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), ball(0))
                 for s in range(self.loop.outputs)
             ]
             for seen in self.loop.seen
@@ -437,133 +316,40 @@ class Named:
 
     def given(self, direction: Array, time: float) -> arb:
         """What the disturbance and the initial state give to ``c'x(t)`` where no control answers them."""
-        from flint import arb
-
         case, loop = self.case, self.loop
         weights = case.duality.pushed(direction, time, loop.changes)
-        parts = [*zip(loop.sets, self.z, strict=True)]
-        parts = parts[: loop.blocks] + parts[loop.begun :]  # noise reaches the state through answers alone
+        parts, of = [*zip(loop.deviations.sets, self.z, strict=True)], loop.deviations
+        parts = parts[: of.blocks] + parts[of.begun :]  # noise reaches the state through answers alone
         weights += [] if case.problem.initial_set is None else [case.duality.carried(direction, time)]
         return sum(
             (
-                weight * (arb(float(m)) + off)
+                weight * (ball(m) + off)
                 for row, ((_, about), block) in zip(weights, parts, strict=True)
                 for weight, m, off in zip(row, about, block, strict=True)
             ),
-            arb(0),
+            ball(0),
         )
 
 
-def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
+def _deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
     """The deviations, block by block, of the ``disturbance (mw, blocks)``, of the ``noise (K, p)`` and of the initial
     state, ``deviation (d,)`` from its centre, that an entry names, which must be in their sets."""
     from flint import arb
 
-    points: list[Array] = []
+    points, of = list[Array](), loop.deviations
+    noises = of.begun - of.blocks
     if case.problem.disturbance is not None:
-        w = numbers(entry.get("disturbance"), f"{name}: disturbance")
-        if w.shape != (loop.width, loop.blocks):
-            raise Broken(f"{name}: a disturbance of shape {w.shape}, expected {(loop.width, loop.blocks)}")
-        points = list(w.T)
-    if loop.noises and loop.measured is not None:
-        v = numbers(entry.get("noise"), f"{name}: noise")
-        if v.shape != (loop.noises, loop.outputs):
-            raise Broken(f"{name}: a noise of shape {v.shape}, expected {(loop.noises, loop.outputs)}")
-        points += list(v)
+        points = list(shaped(entry, "disturbance", (of.width, of.blocks), f"{name}: ").T)
+    if noises and loop.measured is not None:
+        points += list(shaped(entry, "noise", (noises, loop.outputs), f"{name}: "))
     if case.problem.initial_set is not None:
-        points.append(numbers(entry.get("deviation"), f"{name}: deviation"))
-        if points[-1].shape != (case.problem.system.states,):
-            raise Broken(f"{name}: a deviation of the initial state of shape {points[-1].shape}")
+        points.append(shaped(entry, "deviation", (case.problem.system.states,), f"{name}: "))
     found = list[list[arb]]()
-    for number_of, (point, (shape, about)) in enumerate(zip(points, loop.sets, strict=True)):
+    for number_of, (point, (shape, about)) in enumerate(zip(points, of.sets, strict=True)):
         member = known(shape).member(point)
         if member is None:
             kinds = ("disturbance", "noise", "deviation of the initial state")
-            what = kinds[(number_of >= loop.blocks) + (number_of >= loop.begun)]
+            what = kinds[(number_of >= of.blocks) + (number_of >= of.begun)]
             raise Broken(f"{name}: the {what} {point.tolist()} is not shown to be in its set")
         found.append([v - arb(float(c)) for v, c in zip(member, about, strict=True)])
     return found
-
-
-def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
-    return known(shape).support(balls(sign * np.eye(shape.dimension)[channel]))
-
-
-def _width(shape: ConvexSet, channel: int) -> arb:
-    return _axis(shape, channel, 1.0) + _axis(shape, channel, -1.0)
-
-
-def _reach(shape: ConvexSet, channel: int) -> arb:
-    return _axis(shape, channel, 1.0).max(_axis(shape, channel, -1.0)).max(_axis(shape, channel, 1.0) * 0)
-
-
-def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb]]:
-    """Vectors ``v (d,)`` that span the directions along which points of a set differ, and numbers ``c > 0`` such that
-    its width along any ``a`` is at least ``c |a'v|``: along the axes, but of a set without an interior."""
-    if isinstance(shape, Product):
-        return [
-            ([*[Fraction(0)] * place.start, *vector, *[Fraction(0)] * (shape.dimension - place.stop)], length)
-            for part, own, place in _parts(shape, middle)
-            for vector, length in _segments(part, own)
-        ]
-    chords, axes = _chords(shape, middle), np.eye(shape.dimension)
-    wide = [_width(shape, channel) for channel in range(shape.dimension)]
-    if all(wide[b].is_zero() or chord > NEAR * wide[b] for b, chord in enumerate(chords)):
-        kept = [b for b, width in enumerate(wide) if not width.is_zero()]
-        return [([Fraction(float(v)) for v in axes[b]], chords[b]) for b in kept]
-    along = known(shape).segments
-    if along is None:
-        raise Unchecked(f"the checker does not know how long the {shape.kind} is along the axes")
-    return [(vector, rational(length)) for vector, length in along]
-
-
-def _parts(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]]:
-    """Every part of a product with its part of a point, and its place."""
-    ends = np.cumsum([0, *(part.dimension for part in shape.parts)]).tolist()
-    places = [slice(begin, end) for begin, end in pairwise(ends)]
-    return [(part, middle[place], place) for part, place in zip(shape.parts, places, strict=True)]
-
-
-def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
-    """Numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: how long it is along the
-    axes through its middle."""
-    from flint import arb
-
-    if isinstance(shape, Product):
-        return [chord for part, own in shape.split(middle) for chord in _chords(part, own)]
-    if isinstance(shape, NormBall):
-        return [2 * arb(shape.radius)] * shape.dimension
-    if isinstance(shape, Ellipsoid):
-        inverse = stacked([[arb(float(v)) for v in row] for row in shape.shape]).inv()
-        return [2 / inverse[b, b].sqrt() for b in range(shape.dimension)]
-    flat = known(shape).facets
-    if flat is None:
-        raise Unchecked("the checker does not know how long the disturbance's set is along the axes")
-    found = []
-    for axis in range(shape.dimension):
-        reach = []
-        for sign in (1.0, -1.0):
-            ends = [(b - along(c, balls(middle))) / arb(abs(float(c[axis]))) for c, b in flat if sign * c[axis] > 0]
-            least = ends[0]
-            for end in ends[1:]:
-                least = least.min(end)
-            reach.append(least)
-        found.append(reach[0] + reach[1])
-    return found
-
-
-def _onto(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
-    """What every entry is of some segments of a block, that is this of its coordinates."""
-    from flint import arb
-
-    rows, columns = push.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
-    return [
-        [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in one), arb(0)) for one in columns] for row in rows
-    ]
-
-
-def _largest(values: list[arb]) -> arb:
-    largest = values[0]
-    for value in values[1:]:
-        largest = largest.max(value)
-    return largest

@@ -19,20 +19,21 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.claims.answers import PEAK, WORST
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
-from sparserob_core.checker.claims.duality import Row
+from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import arb_of, middle
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb
 
 MOST = 100_000  # multipliers
-PEAK, WORST = "peak", "worst"
-Pushed: TypeAlias = "tuple[Row, list[list[arb]], list[arb]]"  # a row, what disturbance and initial state give to it
+Pushed: TypeAlias = (
+    "tuple[ConstraintRow, list[list[arb]], list[arb]]"  # a row, what disturbance and initial state give to it
+)
 Rows: TypeAlias = dict[tuple[str, float, bytes], Pushed]
 SHARE = 1.0 - 2.0**-40  # of a price, that is shared: so that rounding does not share more than there is
 
@@ -40,12 +41,10 @@ SHARE = 1.0 - 2.0**-40  # of a price, that is shared: so that rounding does not 
 def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     """What every causal policy costs at least; not ``priced``: by how much it misses the weighted sum of the
     constraints at least, which proves that there is none where it is positive."""
-    from flint import arb
-
     _refuse(case)
     signals, rest = _signals(case, data), middle_of(case)
-    K, m, total = case.control.pieces, case.problem.system.controls, arb(0)
-    changes = case.changes or []
+    K, m, total = case.control.pieces, case.problem.system.controls, ball(0)
+    changes = case.disturbances.changes or []
     points, measured = case.control.breakpoints, case.problem.measurements
     known_last = points[:-1] if measured is None else measured.latest(points)
     seen = [bisect_left(changes, float(t)) for t in known_last]  # blocks that began before what is known was measured
@@ -54,7 +53,7 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
         seen = measured.known(points).sum(axis=1).tolist()
         begun = _begun(case, data, len(signals))
         reports, rest = _outputs(case, data, signals, begun, max(seen)), np.zeros((measured.outputs, K))
-    groups: list[dict[bytes, list[arb]]] = [{_until(rest, n): [arb(0)] * m} for n in seen]
+    groups: list[dict[bytes, list[arb]]] = [{_until(rest, n): [ball(0)] * m} for n in seen]
     entries = listed(data, "multipliers")
     if len(entries) > MOST:
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
@@ -62,35 +61,33 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     for entry in entries:
         case.clock.check()
         y, which, (row, pushed, carried) = _row(case, entry, len(signals), known_rows)
-        weight, signal = arb(y), signals[which]
-        noise = [a * arb(float(w)) for block, column in zip(pushed, signal.T, strict=True)
+        weight, signal = ball(y), signals[which]
+        noise = [a * ball(w) for block, column in zip(pushed, signal.T, strict=True)
                  for a, w in zip(block, column, strict=True)]  # fmt: skip
         noise += [] if begun is None else [c * x for c, x in zip(carried, begun[which], strict=True)]
         total = total + weight * sum(noise, row.constant)
         for k in range(K):
             if any(not x.is_zero() for x in row.slope[k]):
-                group = groups[k].setdefault(_until(reports[which], seen[k]), [arb(0)] * m)
+                group = groups[k].setdefault(_until(reports[which], seen[k]), [ball(0)] * m)
                 group[:] = [a + weight * x for a, x in zip(group, row.slope[k], strict=True)]
     shared = _shares(data, len(signals)) if priced and case.charge == WORST else None
     for k in range(K):
-        prices: dict[bytes, arb] = {_until(rest, seen[k]): arb(1)} if shared is None else {}
+        prices: dict[bytes, arb] = {_until(rest, seen[k]): ball(1)} if shared is None else {}
         for report, share in zip(reports, shared or (), strict=False):
             key = _until(report, seen[k])
-            prices[key] = prices.get(key, arb(0)) + share
-            groups[k].setdefault(key, [arb(0)] * m)
+            prices[key] = prices.get(key, ball(0)) + share
+            groups[k].setdefault(key, [ball(0)] * m)
         total = total + _of_piece(case, k, groups[k], prices, priced)
     return total
 
 
 def _shares(data: Mapping[str, Any], count: int) -> list[arb]:
     """How much the effort under every signal counts: a mean of these is at most the largest."""
-    from flint import arb
-
     found = numbers(data.get("shares", []), "causal: shares")
     if found.shape != (count,) or not (found >= 0.0).all():
         raise Broken(f"causal: expected shares of {count} signals, not below 0")
     held = balls(found)
-    if not sum(held, arb(0)) <= 1:
+    if not sum(held, ball(0)) <= 1:
         raise Broken(f"causal: the shares of the signals add up to {found.sum()!r}, expected at most 1")
     return held
 
@@ -138,7 +135,7 @@ def middle_of(case: Case) -> Array:
     shape = case.problem.disturbance
     if shape is None:
         return np.zeros((0, 0))
-    return np.repeat(middle(shape)[:, None], len(case.changes or []), axis=1)
+    return np.repeat(middle(shape)[:, None], len(case.disturbances.changes or []), axis=1)
 
 
 def _until(signal: Array, blocks: int) -> bytes:
@@ -154,8 +151,9 @@ def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
             found.append(np.zeros((0, 0)))
             continue
         w = numbers(said, "causal: signal")
-        if w.shape != (shape.dimension, len(case.changes or [])):
-            raise Broken(f"causal: a signal of shape {w.shape}, expected {(shape.dimension, len(case.changes or []))}")
+        expected = shape.dimension, len(case.disturbances.changes or [])
+        if w.shape != expected:
+            raise Broken(f"causal: a signal of shape {w.shape}, expected {expected}")
         for column in np.unique(w.T, axis=0):
             if not known(shape).contains(column):
                 raise Broken(f"causal: the disturbance {column.tolist()} is not shown to be in its set")
@@ -206,7 +204,7 @@ def _outputs(
                 given = [c * x for c, x in zip(carried[a], start, strict=True)] if start else []
                 for block, column, rest in zip(pushed[a], [balls(x) for x in w.T], centre, strict=True) if j else ():
                     given += [c * (x - m) for c, x, m in zip(block, column, rest, strict=True) if not c.is_zero()]
-                noise.append(sum((-x for x in given), about[a] + arb_of(outputs[j, a])))
+                noise.append(sum((-x for x in given), about[a] + ball(outputs[j, a])))
             if not known(measured.noise).holds(noise):
                 raise Broken(f"causal: no noise is shown to make what is said to be measured at t = {time:.6g}")
     return [np.ascontiguousarray(outputs.T) for outputs in found]
@@ -215,11 +213,9 @@ def _outputs(
 def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[bytes, arb], priced: bool) -> arb:
     """The least that the controls on one piece can cost and give to the weighted sum, those of every group of signals
     together; ``counts``: how much of the price a group pays; that of a peak is shared among all."""
-    from flint import arb
-
     m, control = case.problem.system.controls, case.problem.control
-    prices = case.price.costs[k] if priced else [arb(0)] * m
-    total, zero = arb(0), [arb(0)] * m
+    prices = case.price.costs[k] if priced else [ball(0)] * m
+    total, zero = ball(0), [ball(0)] * m
     shares = dict.fromkeys(groups, zero) | {key: [part * price for price in prices] for key, part in counts.items()}
     if priced and case.charge == PEAK:
         shares = _shared(case, prices, groups)
@@ -231,18 +227,16 @@ def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[b
 def _shared(case: Case, prices: list[arb], groups: dict[bytes, list[arb]]) -> dict[bytes, list[arb]]:
     """The price of a channel's peak, parted among the groups as far as the control can give: ``max_g |u_g|`` is at
     least every mean of ``|u_g|``."""
-    from flint import arb
-
-    shares = {key: [arb(0)] * len(prices) for key in groups}
+    shares = {key: [ball(0)] * len(prices) for key in groups}
     for i, price in enumerate(prices):
-        axis = [arb(float(j == i)) for j in range(len(prices))]
+        axis = [ball(j == i) for j in range(len(prices))]
         high, low = known(case.problem.control).support(axis), known(case.problem.control).support([-x for x in axis])
         reach = {key: float((high if slope[i] < 0 else low).mid()) for key, slope in groups.items()}
         left = float(price.lower()) * SHARE
         for key in sorted(groups, key=lambda key: -reach[key]):
             part = min(left, abs(float(groups[key][i].mid()))) if reach[key] > 0.0 else 0.0
             part = max(part * SHARE, 0.0)
-            shares[key][i] = arb(part)
+            shares[key][i] = ball(part)
             left -= part
-        shares[next(iter(groups))][i] += arb(max(left * SHARE, 0.0))
+        shares[next(iter(groups))][i] += ball(max(left * SHARE, 0.0))
     return shares

@@ -12,8 +12,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.claims.window import Beside
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Clock, Unchecked
-from sparserob_core.checker.reach.loop_tube import LoopTube, Still
-from sparserob_core.checker.reach.tube import Polynomial, Tube
+from sparserob_core.checker.reach.tube import LoopTube, Polynomial, Still, VerifiedTube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.sides import Bounded, Sides
@@ -27,7 +26,7 @@ TIMES = 4
 MOST_BOXES = 8_000  # boxes of parameters and cells of directions
 BLAME = 0.2  # share of the error from which the box of parameters is to blame for it
 
-Reached: TypeAlias = Tube | LoopTube | Still
+Reached: TypeAlias = VerifiedTube | LoopTube | Still
 Interval: TypeAlias = tuple[int, float, float]
 """A piece of the grid, and a part of it from one time to another (which may be the same)."""
 
@@ -103,7 +102,7 @@ class Place:
     beside: Beside | None = None
 
     def cells(self, interval: Interval, z: Array, sharp: bool) -> list[Polynomial]:
-        """The polynomials of all rows on an interval, `Tube.cells` of them."""
+        """The polynomials of all rows on an interval, `VerifiedTube.cells` of them."""
         found = self.tube.cells(*interval, z, sharp)
         if self.beside is None:
             return found

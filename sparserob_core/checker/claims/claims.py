@@ -8,26 +8,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import below
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.arithmetic.balls import ball, below
+from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims import activity
-from sparserob_core.checker.claims.answers import answers_of
-from sparserob_core.checker.claims.case import Case, listed, number, numbers, written_policy
+from sparserob_core.checker.claims.answers import feedback_of
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers, written_policy
 from sparserob_core.checker.claims.cells import Work, prove
 from sparserob_core.checker.claims.constraints import bounded, equalities
-from sparserob_core.checker.claims.duality import Row, steps
 from sparserob_core.checker.claims.multipliers import multiplied, weighted
 from sparserob_core.checker.claims.replay import excused, witnessed
-from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.claims.units import units_of
+from sparserob_core.checker.claims.window import ConstraintWindow
+from sparserob_core.checker.cost.duality import ConstraintRow, steps
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, TOLERANCE, Broken, Finding, Unchecked
-from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.loop_tube import Still
+from sparserob_core.checker.problem.returning import single
+from sparserob_core.checker.reach.tube import Still
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.checker.sets.sides import Curved, Sides
+from sparserob_core.control.policies.policy import WrittenPolicy
+from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
@@ -152,12 +155,14 @@ def _policy(case: Case) -> str:
     told = f"answers {int(case.answers.sum())} of {case.control.pieces * (case.control.pieces + 1) // 2} pairs of a"
     told += f" piece and a measurement before it, and is charged {case.charge}"
     # what a component that is not loaded would say is not known: bounds are of the policies that are written
-    return f"it {told}" + (", as is written; its own component is not loaded" if case.unloaded else "")
+    return f"it {told}" + (
+        ", as is written; its own component is not loaded" if isinstance(case.policy, WrittenPolicy) else ""
+    )
 
 
 def _control(case: Case) -> str:
     """Every piece of the control in its set."""
-    commands, places = answers_of(case).commands, dict[int, int]()
+    commands, places = feedback_of(case).commands, dict[int, int]()
     for k, command in enumerate(commands):
         places.setdefault(id(command), k)
     shown = _in_set(case, case.problem.control, [*places.values()], lambda k: [commands[k]], "{}")
@@ -169,7 +174,7 @@ def _in_set(
 ) -> str:
     """Show that the control on every one of these pieces, or its change to it, is in its set, whatever it answers: it
     is a sum of ``parts (m, 1 + Q)`` that deviate apart. Figures in words."""
-    shape, answers, worst, wide = known(bound), answers_of(case), 0.0, list[int]()
+    shape, feedback, worst, wide = known(bound), feedback_of(case), 0.0, list[int]()
     for k in places:
         case.clock.check()
         every = parts(k)
@@ -179,15 +184,15 @@ def _in_set(
                 wide.append(k)
                 continue
             responses = [_without_nominal(part) for part in every]
-            beyond = lambda c, responses=responses: answers.heights(responses, exactly(c[None]))[0]  # noqa: E731
+            beyond = lambda c, responses=responses: feedback.heights(responses, exactly(c[None]))[0]  # noqa: E731
         over, where = shape.excess(point, beyond)
         if over > TOLERANCE:
             where = name.format("the control" if where == "it" else where)
-            at = case.at(float(case.control.breakpoints[k]))
+            at = _at(case, float(case.control.breakpoints[k]))
             raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from {at} on")
         worst = max(worst, over)
     if wide:
-        worst = max(worst, _turned(case, shape, wide, lambda k, rows: answers.heights(parts(k), rows)))
+        worst = max(worst, _turned(case, shape, wide, lambda k, rows: feedback.heights(parts(k), rows)))
     return f", to {worst:.1e} of its own units" if worst > 0 else ""
 
 
@@ -222,7 +227,8 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
     if case.problem.system.delay > 0.0:
         raise Broken("with a delay the last controls of a period act in the next one")
     fixed, centre = dict(case.equalities), np.asarray(case.stated.initial_state, dtype=float)
-    for state in case.single:
+    alone = single(case.stated)
+    for state in alone:
         if fixed.get(state) != float(centre[state]):
             name = case.problem.names.state(state)
             raise Broken(f"{name} begins at {float(centre[state])!r}, and does not end there")
@@ -233,14 +239,14 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
         if verdicts[name] != "holds":
             raise (Broken if verdicts[name] == "fails" else Unchecked)(f"it rests on {name}, which is {verdicts[name]}")
     back = "every final state is one of the initial states"
-    if len(case.single) == centre.size:
+    if len(alone) == centre.size:
         back = "the final state is the initial one, to rounding"
-    elif case.single:
-        back += ", in " + ", ".join(case.problem.names.state(state) for state in case.single) + " to rounding"
+    elif alone:
+        back += ", in " + ", ".join(case.problem.names.state(state) for state in alone) + " to rounding"
     return f"{back}, so that all constraints hold in every period"
 
 
-def _strictly(case: Case, window: Window) -> None:
+def _strictly(case: Case, window: ConstraintWindow) -> None:
     """That what the proof of the return allows is still in the set of initial states."""
     from flint import arb
 
@@ -249,14 +255,14 @@ def _strictly(case: Case, window: Window) -> None:
     mine, flat = window.seen.facets, known(bound).facets
     if mine is None or flat is None:
         return  # what is allowed there is a share of the whole set
-    kept: dict[tuple[float, ...], list[arb]] = {}
+    kept, alone = dict[tuple[float, ...], list[arb]](), {*single(case.stated)}
     for c, b in flat:
-        if not set(np.flatnonzero(c).tolist()) <= {*case.single}:
+        if not set(np.flatnonzero(c).tolist()) <= alone:
             kept.setdefault(tuple(c.tolist()), []).append(b)
     own = [tuple(c[: bound.dimension].tolist()) for c, _ in mine]  # one at every corner of parameters beside the time
     if {*own} != kept.keys():
         raise Unchecked("the sides of the set of initial states are not told apart")
-    for normal, (_, within), unit in zip(own, mine, case.units(window).rows.tolist(), strict=True):
+    for normal, (_, within), unit in zip(own, mine, units_of(case, window).rows.tolist(), strict=True):
         if not all(within + arb(TOLERANCE) * arb(unit) <= b for b in kept[normal]):
             raise Unchecked(
                 f"a violation that counts as none leaves the set of initial states along {[*normal]}: it is too thin"
@@ -268,13 +274,15 @@ def _steps(case: Case) -> str:
     """Every change of the control from piece to piece in its set."""
     bound, found = case.problem.control_step, steps(case.problem, case.control)
     assert bound is not None
-    return f"{len(found)} steps in their set{_in_set(case, bound, found, answers_of(case).changes, 'the change of {}')}"
+    return (
+        f"{len(found)} steps in their set{_in_set(case, bound, found, feedback_of(case).changes, 'the change of {}')}"
+    )
 
 
 def _cost(case: Case) -> str:
     if case.counts:
         return _counted(case)
-    derived = answers_of(case).cost()
+    derived = feedback_of(case).cost()
     _agrees("cost", number(case.certificate, "cost"), derived, CANCELLED * compared(case))
     return f"J = {float(derived):.12g}{_effort(case)}"
 
@@ -286,10 +294,8 @@ def _effort(case: Case) -> str:
 
 def _counted(case: Case) -> str:
     """The time that the control acts, the cost J beside it, and its letters."""
-    from flint import arb
-
     acted, total = activity.acted(case), activity.largest(case)
-    _agrees("cost", number(case.certificate, "cost"), arb(acted * total), 0.0)
+    _agrees("cost", number(case.certificate, "cost"), ball(acted * total), 0.0)
     derived = case.price.of(case.pieces)
     _agrees(
         "J",
@@ -304,10 +310,8 @@ def _counted(case: Case) -> str:
 
 
 def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
-    from flint import arb
-
-    off = abs(arb(written) - derived)
-    if not off <= arb(FIGURES) * arb(scale).max(abs(derived)):
+    off = abs(ball(written) - derived)
+    if not off <= ball(FIGURES) * ball(scale).max(abs(derived)):
         raise Broken(f"{name}: {written!r} is written, {float(derived)!r} is derived")
 
 
@@ -412,7 +416,7 @@ def _tree(case: Case) -> float:
         raise Unchecked("the control has fewer functions than pieces, which is not followed")
     known = listed(data, "constraints")
 
-    def of_leaf(leaf: Mapping[str, Any]) -> list[tuple[float, Row]]:
+    def of_leaf(leaf: Mapping[str, Any]) -> list[tuple[float, ConstraintRow]]:
         constraints = []
         for pair in listed(leaf, "multipliers"):
             if not (isinstance(pair, list) and len(pair) == 2 and type(pair[0]) is int and 0 <= pair[0] < len(known)):
@@ -460,7 +464,7 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
     if status == "verified":
         return f"every constraint is kept; the gap is {relative_gap(case, cost, lower):.2e}"
     if case.price.is_quadratic and not case.counts:
-        cost = max(cost, -below(-answers_of(case).cost()))
+        cost = max(cost, -below(-feedback_of(case).cost()))
     gap = relative_gap(case, cost, lower)
     written = case.certificate.get("gap_tolerance")
     if tolerance is None or written != tolerance:
@@ -510,8 +514,25 @@ def _exceeded(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> s
     if not over > none:
         raise Broken(f"it leads to a violation of {float(over):.3g}, up to {none:.3g} is none")
     # a figure in doubles is rounded by every step of the state's transition, d + 2 times each; slack is 17 roundings
-    rounded = slack * max(1.0, len(case.grid) * (case.problem.system.states + 2) / 17.0)
+    rounded = slack * max(1.0, len(case.timing.grid) * (case.problem.system.states + 2) / 17.0)
     if abs(float(over) - number(data, "violation")) > 1e-6 * abs(float(over)) + rounded:
         raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over)!r} is derived")
-    name, unit = data.get("constraint"), case.measured(str(data.get("constraint")), numbers(data.get("direction"), ""))
-    return f"{name} is exceeded by {float(over.lower()):.6g}{unit} at {case.at(number(data, 'time'))}"
+    name, unit = (
+        data.get("constraint"),
+        _measured(case, str(data.get("constraint")), numbers(data.get("direction"), "")),
+    )
+    return f"{name} is exceeded by {float(over.lower()):.6g}{unit} at {_at(case, number(data, 'time'))}"
+
+
+def _at(case: Case, time: float) -> str:
+    """A time in words."""
+    return f"t = {time:.6g} {case.problem.names.time}".rstrip()
+
+
+def _measured(case: Case, name: str, direction: Array) -> str:
+    """The unit of a row of a constraint with its normal, with a space before it; of a curved set none."""
+    held = {case.of_control: case.problem.control, STEP: case.problem.control_step}
+    shape = held[name] if name in held else None if name == EQUALS else case.window(name).shape
+    if shape is not None and shape.halfspaces() is None:
+        return ""
+    return unit_of_row(direction, case.problem.names, 0 if name in held else case.problem.system.states)

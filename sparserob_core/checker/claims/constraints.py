@@ -12,25 +12,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls, below
+from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.arithmetic.subdivision import fill
-from sparserob_core.checker.claims.answers import answers_of
+from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.cells import Interval, Proven, Reached, Work, prove
-from sparserob_core.checker.claims.units import RowUnits
-from sparserob_core.checker.claims.window import Window
-from sparserob_core.checker.flow.law import Box as ParameterBox
+from sparserob_core.checker.claims.followed import FollowedRow
+from sparserob_core.checker.claims.units import WindowUnits, nominal_sizes, units_of
+from sparserob_core.checker.claims.window import ConstraintWindow
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.adjoint import Adjoint, Stopped, Worst
-from sparserob_core.checker.reach.execution import Execution
-from sparserob_core.checker.reach.loop_tube import LoopTube
-from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.tube import Rows, Tube
+from sparserob_core.checker.reach.states import Scene, States
+from sparserob_core.checker.reach.tube import LoopTube, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
-from sparserob_core.checker.sets.polynomials import HALF_ULP, Enclosed
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.control.problem.names import joined, measured_in, unit_of_row
 from sparserob_core.control.sets.sets import Box
@@ -42,19 +38,10 @@ if TYPE_CHECKING:
     from flint import arb
 
 TUBES_KEPT = 8
-# States from which the rows of a known system are followed: a ball matrix for every length of a cell, as the tube has
-# them, takes as long as all rows. Of few states the tube takes less; of 48 it takes minutes, and of 270 hours.
-FOLLOWED = 16
-# Pieces up to which they are: what a piece adds is summed at every end of a cell. With a tenth of it tubes of 48 states
-# on 1600 pieces end without a verdict; with ten times as many the sums take minutes.
-MOST_PIECES = 4000
-MOST_CELLS = 400_000  # of time, examined for one row
-PARTS = 8  # into which a cell is cut that is not bounded: a tenth of a chord's distance is left, and less
-HALVINGS = 16  # rounds of cuts: cells are then rounding
 WIDER = 1e-12  # by which the boxes of a parameter set that is none are widened, relative to the whole
 
 
-def bounded(case: Case, window: Window) -> str:
+def bounded(case: Case, window: ConstraintWindow) -> str:
     """Show that a constraint is kept at every time, disturbance and parameter; a sentence with the figures."""
     data = case.certificate.get("proof", {})
     entry = data.get(window.name) if isinstance(data, Mapping) else None
@@ -70,210 +57,49 @@ def bounded(case: Case, window: Window) -> str:
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
     normals = normals_of(window, entry.get("normals"))
     covered(case, window, lower, upper)
-    if is_followed(case, window):
+    if case.followed.are_best and window.seen.facets is not None:
         found = _along_rows(case, window)
     else:
         basis, gains, work = _work(case, window, normals, lower, upper)
-        found = prove(
-            tubes(case, basis, gains, lower, upper),
-            parameters_of(case),
-            work,
-            case.clock,
-            case.beside(window, basis, gains),
-        )
+        found = prove_on_cells(case, window, (basis, gains), work, (lower, upper))
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     if found.bound < 0:
         return f"kept, with a margin of at least {-found.bound:.1e}{_unit(case, window)} ({size})"
     return f"kept to {found.bound:.1e}{_unit(case, window)}{_excused(case, window, normals)} ({size})"
 
 
-def _excused(case: Case, window: Window, normals: Array) -> str:
+def _excused(case: Case, window: ConstraintWindow, normals: Array) -> str:
     """In words, the largest violation that counts as none; of a curved set the largest along its normals."""
     if window.seen.facets is None:
-        curved = Curved(window.seen, normals, case.units(window).least)
+        curved = Curved(window.seen, normals, units_of(case, window).least)
         axes = np.eye(len(normals))
         return f" of its gauge, where {max(curved.true(z).slack for z in np.vstack([axes, -axes])):.2g} is excused"
-    return f", where {TOLERANCE * float(case.units(window).rows.max(initial=0.0)):.1e}{_unit(case, window)} is excused"
+    return (
+        f", where {TOLERANCE * float(units_of(case, window).rows.max(initial=0.0)):.1e}{_unit(case, window)} is excused"
+    )
 
 
-def is_followed(case: Case, window: Window) -> bool:
-    """Whether a constraint is proven along the adjoints of its rows, on cells of the checker's own."""
-    return follows(case) and window.seen.facets is not None
-
-
-def follows(case: Case) -> bool:
-    """Whether rows of the system, which is known, are followed by their adjoints: where it has many states, or
-    measurable disturbances, which would be integrated along matrices on every piece."""
-    system, still = case.problem.system, case.still
-    if case.answering or not case.alike or len(case.grid) > MOST_PIECES:
-        return False
-    known_system = still is not None and not system.parameter_count
-    return known_system and (case.measurable or system.states >= FOLLOWED)
-
-
-def _along_rows(case: Case, window: Window) -> Proven:
+def _along_rows(case: Case, window: ConstraintWindow) -> Proven:
     """Show that no row of a flat set is exceeded by more than what counts as none, along their adjoints."""
-    flat, units = window.seen.facets, case.units(window).rows.tolist()
+    flat, units = window.seen.facets, units_of(case, window).rows.tolist()
     assert flat is not None
     count, bound, share = 0, -np.inf, -np.inf
     for (direction, b), unit in zip(flat, units, strict=True):
         row = Bounded(direction, below(b), unit)
-        c = np.asarray(direction, dtype=float)
-        cells, top = along(case, window, c, followed(case, window.split(c)[0]), row.allowed)
+        cells, top = FollowedRow(case, window, np.asarray(direction, dtype=float)).prove(row.allowed)
         over = float(np.nextafter(top - row.limit, np.inf))
         count, bound, share = count + cells, max(bound, over), max(share, over / unit)
     return Proven(bound, share, count, 1)
 
 
-def followed(case: Case, c: Array, driven: bool = True) -> Worst:
-    """The worst of the row ``c (d,)`` of a known system, by its adjoint; one adjoint serves a row and its opposite. Not
-    ``driven``: without the control that the certificate decides on, of which there is none where nothing is
-    feasible."""
-    problem = case.problem
-    inputs = problem.system.controls + problem.system.drifts
-    table = Enclosed(*np.zeros((2, inputs, len(case.grid) - 1)))
-    if driven:
-        on_grid = [u.entries() for u in case.scene.control]
-        table = Enclosed.of(stacked([list(row) for row in zip(*on_grid, strict=True)]))
-    jumps = None if case.measurable else case.changes
-    return Worst(
-        _adjoint(case, c),
-        np.asarray(problem.initial_state, dtype=float),
-        problem.initial_set,
-        np.array(case.grid),
-        replace(table, rad=np.where(table.rad > 1e-290, table.rad, 0.0)),
-        problem.disturbance,
-        None if jumps is None else np.append(jumps, problem.horizon),
-    )
-
-
-def _adjoint(case: Case, c: Array) -> Adjoint | Stopped:
-    """That of a row ``c (d,)``, of what is integrated in a window as of two that stop."""
-    if case.running is not None:
-        parts = case.running.parts(c)
-        rows = [(_kept(case, row), until) for row, until in parts]
-        if case.measurable and len(parts) == 2 and not (parts[0][0] + parts[1][0]).any():
-            (row, end), (_, begin) = parts
-            return Stopped.integral(rows, row, begin, end)
-        if len(parts) > 1 or parts[0][1] < np.inf:
-            return Stopped(rows, [(*rows[0], 0.0)] if len(parts) == 1 else ())
-    return _kept(case, c)
-
-
-def _kept(case: Case, c: Array) -> Adjoint:
-    made, c = case.adjoints, c + 0.0  # no -0, of which the bytes of an opposite row would be others
-    if c.tobytes() not in made:
-        opposite = made.get((0.0 - c).tobytes())
-        made[c.tobytes()] = Adjoint.of(case.motion, c) if opposite is None else opposite.reversed()
-    return made[c.tobytes()]
-
-
-def along(case: Case, window: Window, direction: Array, worst: Worst, limit: float) -> tuple[int, float]:
-    """Show that a row is nowhere in its window above ``limit``; the number of cells that this took, and what it is at
-    most."""
-    breaks = case.control.breakpoints.tolist()
-    times = worst.cuts([window.start, window.stop, *window.cuts(breaks)])
-    times = times[(times >= window.start) & (times <= window.stop)]
-    start, stop = (times[:-1], times[1:]) if times.size > 1 else (times, times)
-    count, top = 0, -np.inf
-    for _ in range(HALVINGS):
-        case.clock.check()
-        count += start.size
-        if count > MOST_CELLS:
-            break
-        tops = worst.over(start, stop, _added(case, window, direction, start, stop))
-        open_ = ~(tops <= limit)
-        top = max(top, float(tops[~open_].max(initial=-np.inf)))
-        if not open_.any():
-            return count, top
-        _refute(case, window, direction, worst, start[open_], stop[open_], limit)
-        start, stop = _parts(start[open_], stop[open_])
-        if not start.size:
-            break
-    raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
-
-
-def beside(case: Case, window: Window, direction: Array, time: float, inside: float) -> tuple[float, float]:
-    """What stands beside the state in the row at a time, with the control of the piece that holds ``inside``, between
-    bounds."""
-    state, gains = window.split(direction)
-    offset, _ = window.moved(time, time)
-    total = -sum((a * b for a, b in zip(balls(state), offset, strict=True)), balls([0.0])[0])
-    if window.is_mixed:
-        ends = case.control.breakpoints
-        piece = int(np.clip(np.searchsorted(ends, inside, side="right") - 1, 0, case.control.pieces - 1))
-        window.meets(ends.tolist(), piece, time)
-        total = total + sum((a * u for a, u in zip(balls(gains), case.pieces[piece].entries(), strict=True)), 0 * total)
-    return below(total), above(total)
-
-
-def _added(case: Case, window: Window, direction: Array, start: Array, stop: Array) -> Array:
-    """What stands beside the state at both ends of cells, and what errors of execution add there, ``(2, k)``, at most;
-    with how far these may be above their chord."""
-    found, delivered = np.zeros((2, start.size)), _delivered(case)
-    if window.reference is not None or window.is_mixed:
-        cells = case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
-        found = np.array([[beside(case, window, direction, t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
-    if delivered is not None:
-        c, _ = window.split(direction)
-        bent = delivered.bent_over(c, start, stop)
-        more = np.stack([delivered.added_at(c, times)[1] for times in (start, stop)]) + bent
-        found = found + more + HALF_ULP * 4.0 * (np.abs(found) + more)
-    return found
-
-
-def _delivered(case: Case) -> Execution | None:
-    """How exactly the control is delivered, of a system whose rows are followed."""
-    found = case.execution
-    assert found is None or isinstance(found, Execution)  # they are followed by age there
-    return found
-
-
-def erring_at(case: Case, c: Array, times: Array) -> tuple[Array, Array]:
-    """What the worst errors of execution add to ``c'x`` at ``times (k,)``, of a system whose rows are followed: between
-    ``(k,)`` and ``(k,)``."""
-    delivered = _delivered(case)
-    return (np.zeros(times.size), np.zeros(times.size)) if delivered is None else delivered.added_at(c, times)
-
-
-def _refute(
-    case: Case, window: Window, direction: Array, worst: Worst, start: Array, stop: Array, limit: float
-) -> None:
-    """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell, with sets whose support
-    functions are sharp."""
-    sets = (case.problem.initial_set, case.problem.disturbance)
-    if any(one is not None and known(one).facets is None for one in sets):
-        return
-    middles = (start + stop) / 2
-    top, wide = worst.most(middles)
-    least = (top - wide) - HALF_ULP * 8.0 * np.abs(top)
-    if window.reference is not None or window.is_mixed:
-        more = [beside(case, window, direction, t, t)[0] for t in middles.tolist()]
-        least = least + np.array(more) - HALF_ULP * 8.0 * np.abs(more)
-    errors, _ = erring_at(case, window.split(direction)[0], middles)
-    least = least + errors - HALF_ULP * 8.0 * np.abs(errors)
-    place = int(least.argmax())
-    if least[place] > limit:
-        raise Broken(f"{limit!r} is exceeded, by {least[place] - limit:.3g} at t = {middles[place]:.6g}")
-
-
-def _parts(start: Array, stop: Array) -> tuple[Array, Array]:
-    """Cells in equal parts; none where these are rounding."""
-    ends = start[:, None] + (stop - start)[:, None] * (np.arange(PARTS + 1) / PARTS)
-    ends[:, 0], ends[:, -1] = start, stop
-    if not (np.diff(ends, axis=1) > 0.0).all():
-        return np.zeros(0), np.zeros(0)
-    return ends[:, :-1].ravel(), ends[:, 1:].ravel()
-
-
-def _unit(case: Case, window: Window) -> str:
+def _unit(case: Case, window: ConstraintWindow) -> str:
     """The units of the rows of a window; of a curved set, whose excess is in multiples of its gauge, none."""
     sides = window.shape.halfspaces()
     rows = () if sides is None else sides[0]
     return joined(unit_of_row(row, case.problem.names, window.states).strip() for row in rows)
 
 
-def normals_of(window: Window, data: object) -> Array:
+def normals_of(window: ConstraintWindow, data: object) -> Array:
     """The coordinates of a curved set's directions, ``(b, d)``: they must be able to name every direction in which it
     is bounded. Those of the state where the certificate has none."""
     shape, b, d = window.seen, window.seen.spanned, window.shape.dimension
@@ -295,7 +121,7 @@ def parameters_of(case: Case) -> Parameters:
     return Parameters(None if bound is None else known(bound))
 
 
-def covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
+def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> None:
     """The cells must fill the times and parameters, and for a curved set every face of the cube of directions too."""
     nu = case.problem.system.parameter_count
     b = 0 if window.seen.facets is not None else window.seen.spanned
@@ -314,7 +140,7 @@ def covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
             fill(lower[mine], upper[mine], *ends, case.clock)
 
 
-def _extent(case: Case, window: Window, lower: Array, upper: Array) -> tuple[Array, Array]:
+def _extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> tuple[Array, Array]:
     nu, bound = case.problem.system.parameter_count, case.problem.system.parameters
     if bound is None:
         return np.array([window.start]), np.array([window.stop])
@@ -332,37 +158,40 @@ def _extent(case: Case, window: Window, lower: Array, upper: Array) -> tuple[Arr
     return np.append(window.start, low), np.append(window.stop, high)
 
 
-def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array) -> tuple[Array, Array, list[Work]]:
+def _work(
+    case: Case, window: ConstraintWindow, normals: Array, lower: Array, upper: Array
+) -> tuple[Array, Array, list[Work]]:
     """What directions are combinations of, ``(b, d)``, with their parts on the control, ``(b, m)``, and the cells,
     those with the same parameters and directions together, their times cut wherever anything turns or jumps."""
-    nu, units = case.problem.system.parameter_count, case.units(window)
+    nu, units = case.problem.system.parameter_count, units_of(case, window)
     basis, gains, flat = _facets(window, units)
     curved = None if flat is not None else Curved(window.seen, normals, units.least)
     pairs = case.clock.each(zip(lower, upper, strict=True))
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in pairs]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
-    work: list[Work] = []
+    work = list[Work]()
     for (a, b), members in groupby(order, key=lambda i: keys[i]):
         case.clock.check()
         sides = Sides.cell(curved, np.array(a[nu:]), np.array(b[nu:])) if curved is not None else flat
         assert sides is not None
         times = [(float(lower[i, 0]), float(upper[i, 0])) for i in case.clock.each(members)]
-        work += [(box, sides, intervals) for box, intervals in divided(case, window, (a[:nu], b[:nu]), times)]
+        work.append(((a[:nu], b[:nu]), sides, cut_times(case, window, times)))
     return normals if curved is not None else basis, gains, work
 
 
-def divided(
-    case: Case, window: Window, box: Corners, times: Sequence[tuple[float, float]]
-) -> list[tuple[Corners, list[Interval]]]:
-    """A box of parameters in the parts over which the state is followed, and for each the ``times``, cut wherever
-    anything turns or jumps."""
-    always = window.cuts(case.control.breakpoints.tolist())
-    every = np.array(sorted({*case.grid, *always, *case.marks}))
-    parts = (cut(np.array(case.grid), every, start, stop) for start, stop in times)
-    return [(box, [one for several in parts for one in several])]
+def cut_times(case: Case, window: ConstraintWindow, times: Sequence[tuple[float, float]]) -> list[Interval]:
+    """The ``times``, cut wherever anything turns or jumps."""
+    every = np.union1d(_cuts(case), window.cuts(case.control.breakpoints.tolist()))
+    return [one for start, stop in times for one in cut(np.array(case.timing.grid), every, start, stop)]
 
 
-def _facets(window: Window, units: RowUnits) -> tuple[Array, Array, Sides | None]:
+@lru_cache(maxsize=2)
+def _cuts(case: Case) -> Array:
+    """The times from each of which to the next the state is a polynomial of the time, under one command."""
+    return np.union1d(case.timing.grid, case.flows.marks(case.timing.grid))
+
+
+def _facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array, Sides | None]:
     """The normals of a flat set's facets up to the sign, on the state and on the control, and its rows; no rows for a
     curved one."""
     found, flat = window.seen.basis, window.seen.facets
@@ -383,23 +212,32 @@ def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
     return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), parts, strict=True)]
 
 
+def prove_on_cells(
+    case: Case, window: ConstraintWindow, rows: tuple[Array, Array], work: Sequence[Work], cells: tuple[Array, Array]
+) -> Proven:
+    """`prove` of combinations of ``rows``, ``(b, d)`` on the state and ``(b, m)`` on the control, on the parts ``work``
+    of cells between lower and upper corners."""
+    beside = case.beside(window, *rows)
+    return prove(tubes(case, *rows, *cells), parameters_of(case), work, case.clock, beside)
+
+
 def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
     """What makes the tube of a box of parameters; the cells ``[lower, upper]`` say how far these go."""
     if case.answering:
-        loop_tube = LoopTube(answers_of(case).loop, basis, gains)
+        loop_tube = LoopTube(feedback_of(case).loop, basis, gains)
         return lambda _: loop_tube
     nu = case.problem.system.parameter_count
     widened = nu and not parameters_of(case).is_box
     extra = WIDER * (upper[:, 1 : 1 + nu].max(axis=0) - lower[:, 1 : 1 + nu].min(axis=0)) if widened else np.zeros(nu)
-    seen = dict[int, Rows]()
+    seen = dict[int, ProjectedStates]()
 
     @lru_cache(maxsize=TUBES_KEPT)
-    def tube(corners: Corners) -> Tube:
+    def tube(corners: Corners) -> VerifiedTube:
         box = ParameterBox.between(corners[0], corners[1]).wider(extra)
-        states = case.states(box)
+        states = case.states.over(box)
         if len(seen) >= TUBES_KEPT and id(states) not in seen:
             seen.clear()
-        return Tube(seen.setdefault(id(states), Rows(states, basis)), box)
+        return VerifiedTube(seen.setdefault(id(states), ProjectedStates(states, basis)), box)
 
     return tube
 
@@ -408,7 +246,7 @@ def equalities(case: Case) -> str:
     """Show that the fixed states are met at every parameter, disturbance and initial state; a sentence with the
     figures."""
     worst, states = 0.0, np.eye(case.problem.system.states)[[state for state, _ in case.equalities]]
-    sizes = case.nominal_sizes(states, np.zeros((len(states), 0))).tolist()
+    sizes = nominal_sizes(case, states, np.zeros((len(states), 0))).tolist()
     for (state, value), (off, added), size, row in zip(case.equalities, missed(case), sizes, states, strict=True):
         most = min(EQUALITY * max(added, abs(value)), TOLERANCE * max(size, abs(value)))
         if not off <= most:
@@ -425,16 +263,16 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     initial state and control do, and where deviations are answered also of these, with and without the control."""
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
-    sums = RowUnits(case.problem, case.flows, scene, everything, horizon, horizon).sums
-    answers, found = answers_of(case), []
-    last = answers.loop.nodes[-1].tolist() if case.answering else _unreached(case, scene)
+    sums = WindowUnits(case.problem, case.flows, scene, everything, horizon, horizon).sums
+    feedback, found = feedback_of(case), []
+    last = feedback.loop.nodes[-1].tolist() if case.answering else _unreached(case, scene)
     for state, value in case.equalities:
         (reached, *responses), (goal,) = last[state], balls([value])
         if not case.answering:
             reached = reached * 0 if _rests(case, state) else reached + pushed_by_middle(case, state)
         off = reached - goal
-        high, low = off + answers.support(responses), answers.support([-x for x in responses]) - off
-        found.append((high.max(low), float(sums[state]) + (answers.added(state) if case.answering else 0.0)))
+        high, low = off + feedback.support(responses), feedback.support([-x for x in responses]) - off
+        found.append((high.max(low), float(sums[state]) + (feedback.added(state) if case.answering else 0.0)))
     return found
 
 
@@ -443,16 +281,16 @@ def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
     for state, _ in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
-    return list(States(case.flows.at(case.nominal_parameter), scene).last.matrix.tolist())
+    return list(States(case.price.flow, scene).last.matrix.tolist())
 
 
 def pushed_by_middle(case: Case, state: int) -> arb:
     """What the disturbance in the middle of its set adds to a state at the end."""
-    (total,), about = balls([0.0]), case.middle
+    (total,), about = balls([0.0]), case.disturbances.middle
     if about.any():
         end, column = case.problem.horizon, stacked([[w] for w in balls(about)])
-        ends = [t for t in case.grid if t < end]
-        for part in case.flows.at(case.nominal_parameter).weights([*ends, end]).disturbance:
+        ends = [t for t in case.timing.grid if t < end]
+        for part in case.price.flow.weights([*ends, end]).disturbance:
             total = total + (part * column)[state, 0]
     return total
 
@@ -494,7 +332,7 @@ def _rests(case: Case, state: int) -> bool:
     idle = [all(command[channel, 0].is_zero() for command in commands) for channel in range(m)]
     d, columns = case.problem.system.states, case.flows.plant.driven
     acting = [d + channel for channel in range(columns) if channel >= m or not idle[channel]]
-    acting += [d + columns + int(w) for w in np.flatnonzero(case.middle)]
+    acting += [d + columns + int(w) for w in np.flatnonzero(case.disturbances.middle)]
     driven = bool(there[np.ix_(sorted(reaching), acting)].any())
     return not driven and not any(np.asarray(case.problem.initial_state)[[*reaching]])
 

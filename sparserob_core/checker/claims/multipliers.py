@@ -5,17 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.claims.answers import PEAK, WORST, Named, answers_of
-from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers
-from sparserob_core.checker.claims.constraints import followed, follows, pushed_by_middle
-from sparserob_core.checker.claims.duality import EFFORT, Row, before
-from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, feedback_of
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers, shaped
+from sparserob_core.checker.claims.constraints import pushed_by_middle
+from sparserob_core.checker.claims.window import ConstraintWindow
+from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
 
@@ -32,13 +34,11 @@ def multiplied(case: Case, priced: bool) -> arb:
     rows, pieces = weighted(case, data)
     price, touched = (case.price, touched_by(case, data)) if priced else (None, None)
     lengths, norms = case.charge not in (PEAK, WORST), norms_of(case, data) if priced else None
-    return case.duality.bound(rows, pieces, price, touched, lengths, norms) + answers_of(case).least(rows, priced)
+    return case.duality.bound(rows, pieces, price, touched, lengths, norms) + feedback_of(case).least(rows, priced)
 
 
-def weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
+def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]], Any]:
     """Multipliers with their constraints, and those of the control's pieces."""
-    from flint import arb
-
     if data is None:
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
     if not isinstance(data, Mapping):
@@ -54,44 +54,35 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
     middle = [] if bound is None else bound.interior_point().tolist()
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
-        if follows(case):
-            row = _along_adjoint(case, direction, case.problem.horizon, arb(value), disturbed=False)
+        if case.followed.are_best:
+            row = _along_adjoint(case, direction, case.problem.horizon, ball(value), disturbed=False)
         else:
-            row = case.duality.row(direction, case.problem.horizon, middle, arb(value), disturbed=False)
+            row = case.duality.row(direction, case.problem.horizon, middle, ball(value), disturbed=False)
         # what is known of a disturbance that does not vary counts; where none may reach the state it is any member
         rows.append((multiplier, replace(row, constant=row.constant + pushed_by_middle(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
         return rows, None
-    pieces, expected = numbers(data.get("pieces"), "pieces"), (case.problem.system.controls, case.control.pieces)
-    if pieces.shape != expected:
-        raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
-    return rows, pieces
+    return rows, shaped(data, "pieces", (case.problem.system.controls, case.control.pieces))
 
 
 def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
     """The control at which the certificate replaces the cost by its tangent, on every piece."""
     if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
         return None
-    said = data.get("tangent") if isinstance(data, Mapping) else None
-    at, expected = numbers(said, "tangent"), (case.problem.system.controls, case.control.functions)
-    if at.shape != expected:
-        raise Broken(f"the tangent's control has shape {at.shape}, expected {expected}")
+    said = data if isinstance(data, Mapping) else {}
+    at = shaped(said, "tangent", (case.problem.system.controls, case.control.functions))
     case.price.convex()
     return case.on_pieces(at)
 
 
 def norms_of(case: Case, data: object) -> Array | None:
     """The vectors ``(m, K)`` that the certificate offers in the place of norms of the control, if it does."""
-    said = data.get("norms") if isinstance(data, Mapping) else None
-    if said is None:
+    if not isinstance(data, Mapping) or data.get("norms") is None:
         return None
-    offered, expected = numbers(said, "norms"), (case.problem.system.controls, case.control.pieces)
-    if offered.shape != expected:
-        raise Broken(f"the vectors for norms have shape {offered.shape}, expected {expected}")
-    return offered
+    return shaped(data, "norms", (case.problem.system.controls, case.control.pieces))
 
 
-def rows_of(case: Case, entry: object) -> list[tuple[float, Row]]:
+def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     """A multiplier with its constraint, which must be one of the problem's; a step across the seam of a plan that
     answers is the sum of two, of the last control and of the first one, which answer what they see of two periods."""
     case.clock.check()
@@ -104,7 +95,7 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, Row]]:
         raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
     if parameter.size:  # what is asked of the control alone is at none
         sized(parameter, case.problem.system.parameter_count, name)
-    named = answers_of(case).named(entry, name) if case.answering else None
+    named = feedback_of(case).named(entry, name) if case.answering else None
     if any(window.name == name for window in case.windows) or (case.answering and name == EQUALS and case.equalities):
         return [(y, _of_state(case, entry, (name, direction, time, parameter), named))]
     if name == EFFORT and case.charge == WORST:
@@ -120,15 +111,17 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, Row]]:
     seen = replace(row, innovations=named.innovations)
     if time != float(case.control.breakpoints[-1]):
         return [(y, seen)]
-    begun, none = answers_of(case).following(named, entry, name), case.duality.nothing
+    begun, none = feedback_of(case).following(named, entry, name), ball(0)
     zero = [[none] * direction.size] * (case.control.pieces - 1)
     return [
         (y, replace(seen, slope=[*zero, balls(-direction)])),
-        (y, Row(none, [balls(direction), *zero], None, begun.innovations)),
+        (y, ConstraintRow(none, [balls(direction), *zero], None, begun.innovations)),
     ]
 
 
-def _of_state(case: Case, entry: Mapping[str, Any], said: tuple[str, Array, float, Array], named: Named | None) -> Row:
+def _of_state(
+    case: Case, entry: Mapping[str, Any], said: tuple[str, Array, float, Array], named: NamedDeviations | None
+) -> ConstraintRow:
     """The constraint on the state, and on the control on a piece of it, that an entry names."""
     name, direction, time, parameter = said
     window = None if name == EQUALS and case.equalities else case.window(name)
@@ -136,30 +129,37 @@ def _of_state(case: Case, entry: Mapping[str, Any], said: tuple[str, Array, floa
     if window is not None:
         admissible(case, window, time, parameter)
     key = name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
-    if key not in case.rows:
-        case.rows[key] = _undisturbed(case, window, entry, said)
-    row = case.rows[key]
+    made = _rows_of(case)
+    if key not in made:
+        made[key] = _undisturbed(case, window, entry, said)
+    row = made[key]
     if named is None:
         return row
     given = named.given(direction[: case.problem.system.states], time)
     return replace(row, constant=row.constant + given, innovations=named.innovations)
 
 
+@lru_cache(maxsize=2)
+def _rows_of(case: Case) -> dict[tuple[object, ...], ConstraintRow]:
+    """Constraints that were derived before."""
+    return {}
+
+
 def _undisturbed(
-    case: Case, window: Window | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
-) -> Row:
+    case: Case, window: ConstraintWindow | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
+) -> ConstraintRow:
     """The same for the worst deviations, or without any where the control answers them."""
     _, direction, time, parameter = said
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
-    if follows(case):
+    if case.followed.are_best:
         row = _along_adjoint(case, c, time, limit)
     else:
         row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.answering)
-        strayed = case.strayed_at(parameter.tolist())
+        strayed = case.sources.strayed_at(parameter.tolist())
         if strayed is not None:
             row = replace(row, constant=row.constant + balls([strayed.added(c, time)[0]])[0])
-    sizes, given = case.erring(c, time, parameter.tolist())
+    sizes, given = case.sources.erring(c, time, parameter.tolist())
     row = replace(row, constant=row.constant + given, sizes=sizes)
     if window is not None and window.is_mixed:
         piece = piece_of(case, window, entry, time)
@@ -167,16 +167,14 @@ def _undisturbed(
     return row
 
 
-def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> Row:
+def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> ConstraintRow:
     """``c'x(t) <= limit`` of a system whose rows are followed, for the worst deviations or without any: no matrix is
     made for a duration, which of hundreds of states takes a minute each."""
-    from flint import arb
-
-    worst, problem, delay = followed(case, c, driven=False), case.problem, case.problem.system.delay
+    worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
     m, begins = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
     state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
     begun = balls(np.asarray(problem.initial_state, dtype=float))
-    constant = sum((w * x for w, x in zip(state, begun, strict=True)), arb(0)) - limit
+    constant = sum((w * x for w, x in zip(state, begun, strict=True)), ball(0)) - limit
     if problem.system.drifts:  # a drift is an input that is 1
         constant = constant + worst.weights(time, np.zeros(1), np.full(1, np.inf))[0][m]
     if delay > 0.0:
@@ -186,10 +184,10 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
         constant = constant + known(problem.initial_set).support(state)
     if disturbed and problem.disturbance is not None:
         constant = constant + worst.pushed_by(time)
-    return Row(constant, [every[:m] for every in slope])
+    return ConstraintRow(constant, [every[:m] for every in slope])
 
 
-def _of_control(case: Case, name: str, direction: Array, time: float, named: Named | None) -> Row:
+def _of_control(case: Case, name: str, direction: Array, time: float, named: NamedDeviations | None) -> ConstraintRow:
     """The constraint on the control on one piece, or on its peak."""
     row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
     if named is not None:
@@ -199,35 +197,30 @@ def _of_control(case: Case, name: str, direction: Array, time: float, named: Nam
         return row
     if sorted(np.abs(direction).tolist()) != [0.0] * (direction.size - 1) + [1.0]:
         raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
-    return replace(row, constant=case.duality.nothing, charged=(piece, int(np.abs(direction).argmax())))
+    return replace(row, constant=ball(0), charged=(piece, int(np.abs(direction).argmax())))
 
 
-def _of_effort(case: Case, shares: Array, named: Named | None) -> Row:
+def _of_effort(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:
     """The control at deviations, each entry of it times a share of ``[-1, 1]``, is at most the effort."""
-    from flint import arb
-
     K, m = case.control.pieces, case.problem.system.controls
     if shares.shape != (m * K,) or not (np.abs(shares) <= 1.0).all():
         raise Broken(f"{EFFORT}: expected {m * K} numbers from -1 to 1")
     slope = [
-        [price * arb(float(shares[i * K + k])) for i, price in enumerate(costs)]
-        for k, costs in enumerate(case.price.costs)
+        [price * ball(shares[i * K + k]) for i, price in enumerate(costs)] for k, costs in enumerate(case.price.costs)
     ]
-    return Row(arb(0), slope, None, () if named is None else named.innovations, EFFORT)
+    return ConstraintRow(ball(0), slope, None, () if named is None else named.innovations, EFFORT)
 
 
 def fixed_limit(case: Case, direction: Array, time: float) -> arb:
     """The value of ``c'x(T)`` for a direction of one fixed state or its opposite."""
-    from flint import arb
-
     values = dict(case.equalities)
     states = np.flatnonzero(direction).tolist()
     if len(states) != 1 or states[0] not in values or time != case.problem.horizon:
         raise Broken(f"{EQUALS}: the direction {direction.tolist()} at t = {time!r} is not that of a fixed final state")
-    return arb(float(direction[states[0]])) * arb(values[states[0]])
+    return ball(direction[states[0]]) * ball(values[states[0]])
 
 
-def piece_of(case: Case, window: Window, entry: Mapping[str, Any], time: float) -> int:
+def piece_of(case: Case, window: ConstraintWindow, entry: Mapping[str, Any], time: float) -> int:
     """The piece of the control that a mixed constraint speaks of."""
     piece = entry.get("piece")
     if type(piece) is not int:
@@ -236,14 +229,14 @@ def piece_of(case: Case, window: Window, entry: Mapping[str, Any], time: float) 
     return piece
 
 
-def admissible(case: Case, window: Window, time: float, parameter: Array) -> None:
+def admissible(case: Case, window: ConstraintWindow, time: float, parameter: Array) -> None:
     """Raise `Broken` unless a constraint asks something at a time, and a parameter is shown to be in its set."""
     asked(case, window, time, parameter)
     if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
         raise Broken(f"{window.name}: the parameter {parameter.tolist()} is not shown to be in its set")
 
 
-def asked(case: Case, window: Window, time: float, parameter: Array) -> None:
+def asked(case: Case, window: ConstraintWindow, time: float, parameter: Array) -> None:
     """Raise `Broken` unless a constraint asks something at a time, and the parameter has as many numbers as there
     are."""
     sized(parameter, case.problem.system.parameter_count, f"{window.name}: parameter")

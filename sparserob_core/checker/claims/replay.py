@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.claims.answers import Named, answers_of, commanded
-from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers
+from sparserob_core.checker.arithmetic.series import exactly, stacked
+from sparserob_core.checker.claims.answers import NamedDeviations, commanded, feedback_of
+from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers, shaped
 from sparserob_core.checker.claims.cells import Reached
-from sparserob_core.checker.claims.constraints import beside, erring_at, followed, follows, missed
+from sparserob_core.checker.claims.constraints import missed
+from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
+from sparserob_core.checker.claims.units import units_of
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.loop_tube import LoopTube
 from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube
+from sparserob_core.checker.reach.tube import LoopTube, Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along
 from sparserob_core.sip.convex_set import Array
@@ -28,7 +28,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-    from sparserob_core.checker.claims.window import Window
+    from sparserob_core.checker.claims.window import ConstraintWindow
 
 # Of its row's unit, for every state, by how much the violation that a run tells may be off where rows are followed:
 # sums of so many terms are rounded. Of 348 states, whose modes are conditioned by 5e3, a run rounds 1.6e-9, for which
@@ -40,7 +40,7 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     """The state at ``time`` under the case's control, and ``signal (mw, pieces)`` on the pieces of the common grid
     (``None``: no disturbance), from the centre of the initial states and a ``deviation (d,)`` in their set."""
     w = _admissible(case, signal) if case.problem.disturbance is not None else None
-    weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.grid[1:-1] if t < time), time])
+    weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.timing.grid[1:-1] if t < time), time])
     x = weights.free * _start(case, deviation)
     for k, (acts, pushes) in enumerate(zip(weights.control, weights.disturbance, strict=True)):
         x = x + acts * case.scene.control[k]
@@ -66,21 +66,21 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
         number(data, "time"),
         numbers(data.get("direction"), "direction"),
     )
-    answers, named, held = answers_of(case), None, commanded(case, name)
+    feedback, named, held = feedback_of(case), None, commanded(case, name)
     if case.answering:
         if case.measurable or (case.problem.disturbance is not None and data.get("disturbance") is None):
             raise Unchecked("the certificate holds no disturbance of the witness")
-        named = answers.named(data, name)
+        named = feedback.named(data, name)
     if held is not None:
         sized(direction, case.problem.system.controls, name)
-        parts = answers.parts_at(name, time)
+        parts = feedback.parts_at(name, time)
         if len(parts) > 1 and case.answering:
             raise Unchecked("a witness across the seam is not followed")
         value, limit = sum(_along(direction, named, part.tolist()) for part in parts), known(held).limit(direction)
         slack = TOLERANCE * (1.0 if known(held).facets is None else max(known(held).units, default=1.0))
     elif name == EQUALS and named is not None:
         sized(direction, case.problem.system.states, name)
-        value, limit = _along(direction, named, answers.loop.nodes[-1].tolist()), fixed_limit(case, direction, time)
+        value, limit = _along(direction, named, feedback.loop.nodes[-1].tolist()), fixed_limit(case, direction, time)
         slack = EQUALITY * max(added for _, added in missed(case))
     else:
         window, parameter = case.window(name), numbers(data.get("parameter", []), "parameter")
@@ -88,17 +88,17 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
         admissible(case, window, time, parameter)
         piece = piece_of(case, window, data, time) if window.is_mixed else None
         limit = window.limit(direction, time)
-        slack = case.units(window).slack(direction, limit)
+        slack = units_of(case, window).slack(direction, limit)
         if named is not None:
-            rows = answers.loop.state(case.piece_at(time), time).tolist()
-            value = _along(direction, named, rows if piece is None else rows + answers.commands[piece].tolist())
-        elif case.strayed is not None:
+            rows = feedback.loop.state(case.timing.piece_at(time), time).tolist()
+            value = _along(direction, named, rows if piece is None else rows + feedback.commands[piece].tolist())
+        elif case.sources.strayed is not None:
             value = _farthest(case, window.split(direction), time, parameter.tolist(), piece)
         else:
             state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
             state += [] if piece is None else case.pieces[piece].entries()
             value = _along(direction, None, [[x] for x in state])
-        delivered = case.delivered_at(parameter.tolist())
+        delivered = case.sources.delivered_at(parameter.tolist())
         if delivered is not None:
             low, high = delivered.added(window.split(direction)[0], time)
             value = value + balls([low])[0].union(balls([high])[0])
@@ -112,7 +112,7 @@ def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
     if commanded(case, name) is not None or (name == EQUALS and case.equalities):
         return slack
     window = case.window(name)
-    return min(slack, case.units(window).excused(direction, window.limit(direction, number(data, "time"))))
+    return min(slack, units_of(case, window).excused(direction, window.limit(direction, number(data, "time"))))
 
 
 def _farthest(
@@ -120,7 +120,7 @@ def _farthest(
 ) -> arb:
     """The largest ``c'x(t) + gain'u``, ``u`` the control on a ``piece``, under measurable disturbances, at a
     parameter."""
-    (c, gain), none, strayed = direction, balls([0.0])[0], case.strayed_at(parameter)
+    (c, gain), none, strayed = direction, balls([0.0])[0], case.sources.strayed_at(parameter)
     assert strayed is not None
     row = case.duality.row(c, time, parameter, none)
     low, high = strayed.added(c, time)
@@ -132,7 +132,7 @@ def _farthest(
     return total + sum((a * u for a, u in zip(balls(gain), case.pieces[piece].entries(), strict=True)), none)
 
 
-def _along(direction: Array, named: Named | None, rows: Sequence[list[arb]]) -> arb:
+def _along(direction: Array, named: NamedDeviations | None, rows: Sequence[list[arb]]) -> arb:
     """The value of ``c'x`` of what is nominal and has responses, ``(1 + Q,)`` each, under deviations that are named."""
     return along(direction, [row[0] for row in rows] if named is None else named.of(rows))
 
@@ -144,10 +144,10 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     name, time, held = str(said.get("constraint")), number(said, "time"), commanded(case, str(said.get("constraint")))
     number(said, "violation")
     if held is not None:
-        flat, answers = known(held).facets, answers_of(case)
+        flat, feedback = known(held).facets, feedback_of(case)
         if flat is None:
             raise Unchecked("the worst direction of a curved set is not told")
-        heights = answers.heights(answers.parts_at(name, time), exactly(np.array([c for c, _ in flat])))
+        heights = feedback.heights(feedback.parts_at(name, time), exactly(np.array([c for c, _ in flat])))
         slack = TOLERANCE * max(known(held).units, default=1.0)
         return [float((height - b).mid()) for height, (_, b) in zip(heights, flat, strict=True)], slack
     if name == EQUALS and case.equalities:
@@ -159,9 +159,11 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     if flat is None or found is None:
         raise Unchecked("the worst direction of a curved set is not told")
     pieces = _pieces(case, time, jumps=window.is_mixed)
-    if follows(case):
+    if case.followed.are_best:
         over, slack = _along_rows(case, window, time, begun, pieces)
-        return over, slack + ROUNDED * case.problem.system.states * float(case.units(window).resolved.max(initial=0.0))
+        return over, slack + ROUNDED * case.problem.system.states * float(
+            units_of(case, window).resolved.max(initial=0.0)
+        )
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
     tube = _tube(case, parameter, begun, basis, gains)
     beside = case.beside(window, basis, gains, parameter.tolist())
@@ -172,13 +174,13 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     limits = [float(b) for _, b in flat] * (len(polynomials) // max(1, len(flat)))
     over = [float(poly.coefficients[0, 0]) - b for poly, b in zip(polynomials, limits, strict=True)]
     slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(
-        case.units(window).resolved.max(initial=0.0)
+        units_of(case, window).resolved.max(initial=0.0)
     )
     return over, slack
 
 
 def _along_rows(
-    case: Case, window: Window, time: float, begun: Array | None, pieces: Sequence[tuple[int, int]]
+    case: Case, window: ConstraintWindow, time: float, begun: Array | None, pieces: Sequence[tuple[int, int]]
 ) -> tuple[list[float], float]:
     """By how much the worst disturbance exceeds each row of a flat set at a time, by the adjoints of the rows, and how
     closely that is known."""
@@ -187,13 +189,11 @@ def _along_rows(
     breaks = case.control.breakpoints.tolist()
     for _, k in pieces:
         for direction, b in flat:
-            c = np.asarray(direction, dtype=float)
-            worst = followed(case, window.split(c)[0])
-            if begun is not None:
-                worst = replace(worst, centre=begun, begun=None)
+            row = FollowedRow(case, window, np.asarray(direction, dtype=float))
+            worst = row.worst if begun is None else replace(row.worst, centre=begun, begun=None)
             (top,), (wide,) = worst.most(np.array([time]))
-            low, high = beside(case, window, c, time, (breaks[k] + breaks[k + 1]) / 2)
-            (least,), (most,) = erring_at(case, window.split(c)[0], np.array([time]))
+            low, high = row.beside(time, (breaks[k] + breaks[k + 1]) / 2)
+            (least,), (most,) = row.erring(np.array([time]))
             low, high = low + least, high + most
             over.append(float(top - wide / 3.0 + (low + high) / 2.0) - float(b))
             slack = max(slack, float(wide + high - low))
@@ -203,7 +203,7 @@ def _along_rows(
 def _pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
     """The pieces of the grid and of the control that a time is in; where the control ``jumps``, on either side."""
     sides: tuple[Literal["left", "right"], ...] = ("left", "right") if jumps else ("right",)
-    ends = np.array(case.grid), case.control.breakpoints
+    ends = np.array(case.timing.grid), case.control.breakpoints
     places = ([int(np.clip(np.searchsorted(e, time, side=side) - 1, 0, e.size - 2)) for e in ends] for side in sides)
     return sorted({(piece, k) for piece, k in places})
 
@@ -211,19 +211,17 @@ def _pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
 def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains: Array) -> Reached:
     """The states that are reached at a parameter, from the initial state ``begun (d,)`` alone where one is given."""
     if case.answering:
-        return LoopTube(answers_of(case).loop, basis, gains)
+        return LoopTube(feedback_of(case).loop, basis, gains)
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
     flow = case.flows.at(parameter.tolist())
-    return Tube(Rows(States(flow, scene), basis), flow.box)
+    return VerifiedTube(ProjectedStates(States(flow, scene), basis), flow.box)
 
 
 def _begun(case: Case, data: object) -> Array:
     """The deviation of the initial state, shown to be one of the problem's."""
     bound = case.problem.initial_set
     assert bound is not None
-    deviation = numbers(data, "deviation")
-    if deviation.shape != (bound.dimension,):
-        raise Broken(f"deviation: expected {bound.dimension} numbers, got shape {deviation.shape}")
+    deviation = shaped({"deviation": data}, "deviation", (bound.dimension,))
     if not known(bound).contains(deviation):
         raise Broken(f"the deviation {deviation.tolist()} of the initial state is not shown to be in its set")
     return deviation
@@ -231,16 +229,18 @@ def _begun(case: Case, data: object) -> Array:
 
 def _admissible(case: Case, signal: object) -> Array:
     """The disturbance, shown to be one of the problem's."""
-    changes, bound = case.changes, case.problem.disturbance
+    changes, bound = case.disturbances.changes, case.problem.disturbance
     assert changes is not None and bound is not None
     w = numbers(signal, "disturbance")
     if w.ndim != 2 or w.shape[0] != bound.dimension:
         raise Broken(f"disturbance: expected {bound.dimension} rows, got shape {w.shape}")
-    if w.shape[1] != len(case.grid) - 1:
+    if w.shape[1] != len(case.timing.grid) - 1:
         raise Unchecked("the disturbance is given on another grid")
     for k in range(w.shape[1]):
-        if k and ((w[:, k] != w[:, k - 1]) & ~case.may_jump(case.grid[k])).any():
-            raise Broken(f"the disturbance jumps at t = {case.grid[k]:.6g}, within a piece")
+        if k and ((w[:, k] != w[:, k - 1]) & ~case.disturbances.may_jump(case.timing.grid[k])).any():
+            raise Broken(f"the disturbance jumps at t = {case.timing.grid[k]:.6g}, within a piece")
         if not known(bound).contains(w[:, k]):
-            raise Broken(f"the disturbance {w[:, k].tolist()} at t = {case.grid[k]:.6g} is not shown to be in its set")
+            raise Broken(
+                f"the disturbance {w[:, k].tolist()} at t = {case.timing.grid[k]:.6g} is not shown to be in its set"
+            )
     return w

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 import numpy.typing as npt
 
-from sparserob_core.checker.claims.duality import before
-from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.arithmetic.remembered import remembered
+from sparserob_core.checker.claims.answers import feedback_of
+from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.window import ConstraintWindow
+from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import RESOLVED, THIN, TOLERANCE, Unchecked
-from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.problem.timing import before
+from sparserob_core.checker.reach.states import Scene
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -37,7 +41,7 @@ MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 
 @final
 @dataclass(frozen=True, eq=False)
-class RowUnits:
+class WindowUnits:
     """The units of the constraint ``x(t) - r(t)`` in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in one
     of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``;
     ``acting (m,)``: how far the control of a decision goes; ``flows``: those of the system; ``nominal``: the largest
@@ -53,7 +57,7 @@ class RowUnits:
     """
 
     problem: OptimalControlProblem
-    flows: Flows
+    flows: VerifiedFlows
     scene: Scene
     shape: ConvexSet
     start: float
@@ -156,26 +160,21 @@ class RowUnits:
         axes = np.vstack([np.eye(bound.dimension)[:MOST_AXES], np.ones((1, bound.dimension))])
         return [tuple(map(float, point)) for point in bound.support_point(np.vstack([axes, -axes]))]
 
+    @remembered()
     def _measured(self, parameter: tuple[float, ...], states: bool) -> tuple[Array, Array]:
         """How far the normal of every facet, or every one of the ``states``, reaches at one parameter, and the largest
         sums of absolute numbers from which these are computed, ``(k,)`` each; by one walk back through the pieces from
         every time that is looked at, as many of them together as fit."""
-        if (parameter, states) not in self._known:
-            with np.errstate(over="ignore", invalid="ignore"):
-                nodes, places = self._nodes()
-                each = len(nodes) * len(self._rows_of(states)[0])
-                each *= self.problem.system.controls + 1 + self.problem.system.disturbances
-                parts = np.array_split(places, min(places.size, -(-places.size * each // MOST_HELD)))
-                every = [self._walked(parameter, states, nodes[: part[-1] + 1], part) for part in parts]
-                found = np.max([one for one, _ in every], axis=0), np.max([sums for _, sums in every], axis=0)
-            if not all(np.isfinite(numbers).all() for numbers in found):
-                raise Unchecked("the response grows beyond what numbers can hold")
-            self._known[parameter, states] = found
-        return self._known[parameter, states]
-
-    @cached_property
-    def _known(self) -> dict[tuple[tuple[float, ...], bool], tuple[Array, Array]]:
-        return {}
+        with np.errstate(over="ignore", invalid="ignore"):
+            nodes, places = self._nodes()
+            each = len(nodes) * len(self._rows_of(states)[0])
+            each *= self.problem.system.controls + 1 + self.problem.system.disturbances
+            parts = np.array_split(places, min(places.size, -(-places.size * each // MOST_HELD)))
+            every = [self._walked(parameter, states, nodes[: part[-1] + 1], part) for part in parts]
+            found = np.max([one for one, _ in every], axis=0), np.max([sums for _, sums in every], axis=0)
+        if not all(np.isfinite(numbers).all() for numbers in found):
+            raise Unchecked("the response grows beyond what numbers can hold")
+        return found
 
     def _rows_of(self, states: bool) -> tuple[Array, Array]:
         """The normals of the facets on the state and on the control, or every state: ``(k, d)``, ``(k, m)``."""
@@ -257,3 +256,52 @@ class RowUnits:
         if window.size > MOST_TIMES:
             window = window[np.unique(np.linspace(0, window.size - 1, MOST_TIMES).round().astype(int))]
         return nodes, window
+
+
+@lru_cache(maxsize=2)
+def _units_of(case: Case) -> dict[ConstraintWindow, WindowUnits]:
+    """Those that were made."""
+    return {}
+
+
+def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
+    """What violations of a constraint are judged by."""
+    made = _units_of(case)
+    if window not in made:
+        made[window] = WindowUnits(
+            case.problem,
+            case.flows,
+            case.scene,
+            window.shape,
+            window.start,
+            window.stop,
+            window.reference,
+            None if case.answering else np.abs(case.control.control(case.theta)).max(axis=1),
+            partial(nominal_sizes, case),
+        )
+    return made[window]
+
+
+@lru_cache(maxsize=2)
+def _nominal_values(case: Case) -> tuple[Array, Array]:
+    """The nominal ``(x, u)`` of the decision where every piece begins to act, and at the end, and their radii."""
+    states = case.price.nominal_states(case.pieces)
+    every = np.array([[(float(x), float(x.rad())) for x in one.entries()] for one in states])
+    seen = np.delete(every, case.problem.system.states, axis=1)  # without the 1
+    return seen[:, :, 0], seen[:, :, 1]
+
+
+def nominal_sizes(case: Case, rows: Array, gains: Array) -> Array:
+    """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``.
+
+    They are seen where every piece of the control begins to act, of ``rows (k, d)`` and ``gains (k, m)``, and never
+    too large. Under feedback, rows of the state alone count what deviations do too.
+    """
+    if case.answering and not gains.any():
+        return feedback_of(case).sizes(rows)
+    mid, rad = _nominal_values(case)
+    both = np.zeros((len(rows), mid.shape[1]))
+    d = case.problem.system.states
+    both[:, :d], both[:, d : d + gains.shape[1]] = rows, gains
+    sizes = np.abs(both @ mid.T) - np.abs(both) @ rad.T
+    return np.asarray(np.where(np.isfinite(sizes), np.maximum(sizes, 0.0), 0.0).max(axis=1, initial=0.0))

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.arithmetic.balls import above, ball
+from sparserob_core.checker.arithmetic.remembered import remembered
+from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.outcome import Broken
-from sparserob_core.checker.reach.closed_loop import exactly
-from sparserob_core.checker.reach.kernels import Missed
-from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.reach.kernels import BoundedInput
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
@@ -33,7 +32,7 @@ DIRECTIONS_KEPT = 4096  # of cells of directions, which are asked for at every t
 
 @final
 @dataclass(frozen=True, eq=False)
-class Window:
+class ConstraintWindow:
     """``x(t) - r(t)`` in ``shape`` for all ``t`` from ``start`` to ``stop``; of more coordinates than the ``states``:
     ``(x(t), u(t))``, with ``u`` of every piece of the control that meets the window in positive length.
 
@@ -65,21 +64,21 @@ class Window:
         """The largest ``c'x + g'u`` that is allowed at a time."""
         c, _ = self.split(direction)
         offset, _ = self.moved(time, time)
-        moved = [_exact(a) * r for a, r in zip(c, offset, strict=True) if a]
+        moved = [ball(a) * r for a, r in zip(c, offset, strict=True) if a]
         return sum(moved, self.seen.limit(direction))
 
     def moved(self, start: float, stop: float) -> tuple[list[arb], list[arb]]:
         """``r(start)`` and ``r'`` on ``[start, stop]``, which no time of the reference cuts, ``(d,)`` each."""
-        zero = [_exact(0.0)] * self.states
+        zero = [ball(0.0)] * self.states
         if self.reference is None:
             return zero, zero
         times = self.reference[:, 0].tolist()
         place = bisect_right(times, start) - 1
         if place < 0 or place >= len(times) - 1:
-            return [_exact(v) for v in self.reference[max(place, 0), 1:]], zero
+            return [ball(v) for v in self.reference[max(place, 0), 1:]], zero
         (t, *p), (s, *q) = self.reference[place].tolist(), self.reference[place + 1].tolist()
-        slope = [(_exact(b) - _exact(a)) / (_exact(s) - _exact(t)) for a, b in zip(p, q, strict=True)]
-        return [_exact(a) + v * (_exact(start) - _exact(t)) for a, v in zip(p, slope, strict=True)], slope
+        slope = [(ball(b) - ball(a)) / (ball(s) - ball(t)) for a, b in zip(p, q, strict=True)]
+        return [ball(a) + v * (ball(start) - ball(t)) for a, v in zip(p, slope, strict=True)], slope
 
     def cuts(self, breakpoints: Sequence[float]) -> list[float]:
         """Times at which its rows turn or jump, beside what the state does; ``breakpoints`` are the control's."""
@@ -101,14 +100,12 @@ class Beside:
     """What stands beside ``c'x(t)`` in the rows of a window: ``g'u - c'r(t)``, for ``c = z'basis``, ``g = z'gains``,
     ``basis (b, d)``, ``gains (b, m)``. ``breakpoints`` and ``pieces`` are the commanded control's."""
 
-    window: Window
+    window: ConstraintWindow
     basis: Array
     gains: Array
-    scene: Scene
     breakpoints: Sequence[float]
     pieces: Sequence[arb_mat]
-    delivered: Sequence[Missed] = ()
-    _directions: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
+    delivered: Sequence[BoundedInput] = ()
 
     def added(
         self,
@@ -123,15 +120,15 @@ class Beside:
         the control of a ``piece``, that of the interval unless given. ``within``: the box of parameters, where they are
         over one, and the monomials on it."""
         offset, slope = self.window.moved(start, stop)
-        basis = stacked([[_exact(v) for v in row] for row in self.basis])
+        basis = exactly(self.basis)
         level = -basis * stacked([[r] for r in offset])
         if self.window.is_mixed:
             place = bisect_right(self.breakpoints, start) - 1 if piece is None else piece
             control = self.pieces[min(place, len(self.pieces) - 1)]
-            level = level + stacked([[_exact(v) for v in row] for row in self.gains]) * control
+            level = level + exactly(self.gains) * control
         terms = [level]
         if stop > start and self.window.reference is not None:
-            length = _exact(stop) - _exact(start)
+            length = ball(stop) - ball(start)
             terms.append(-basis * stacked([[v * length] for v in slope]))
         enclosed = Enclosed.all(terms, (len(terms), self.basis.shape[0]))
         mid = enclosed.mid @ z.T
@@ -146,25 +143,21 @@ class Beside:
             found = [self._erring(poly, one, c, missed, times, within) for poly, c, missed in rows]
         return list(found)
 
+    @remembered(lambda: DIRECTIONS_KEPT, lambda self, z: z.tobytes())
     def directions(self, z: Array) -> tuple[Array, Array]:
         """``c = z'basis`` as floats ``(k, d)``, and how far they are off at most: where nothing is added up, and mostly
         elsewhere, they are exact."""
-        key = z.tobytes()
-        if key not in self._directions:
-            exact = (exactly(z) * exactly(self.basis)).entries()
-            floats = [float(x) for x in exact]
-            left = [x - _exact(c) for x, c in zip(exact, floats, strict=True)]
-            off = [0.0 if x.is_zero() else above(abs(x)) for x in left]
-            if len(self._directions) >= DIRECTIONS_KEPT:
-                self._directions.clear()
-            shape = len(z), self.basis.shape[1]
-            self._directions[key] = np.reshape(floats, shape), np.reshape(off, shape)
-        return self._directions[key]
+        exact = (exactly(z) * exactly(self.basis)).entries()
+        floats = [float(x) for x in exact]
+        left = [x - ball(c) for x, c in zip(exact, floats, strict=True)]
+        off = [0.0 if x.is_zero() else above(abs(x)) for x in left]
+        shape = len(z), self.basis.shape[1]
+        return np.reshape(floats, shape), np.reshape(off, shape)
 
     @staticmethod
     def _erring(
         poly: Polynomial,
-        one: Missed,
+        one: BoundedInput,
         c: Array,
         off: Array,
         times: Sequence[float],
@@ -197,9 +190,3 @@ def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
     changed += terms
     lost += 2.0 * HALF_ULP * float(np.abs(changed).sum())
     return replace(poly, coefficients=coefficients, error=(poly.error + lost) * OUTWARD)
-
-
-def _exact(value: float) -> arb:
-    from flint import arb
-
-    return arb(float(value))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.sip.convex_set import Array
@@ -32,12 +33,11 @@ def at_most(
     ``support``: the largest ``z'b`` of ``b (Q,)``; ``reach (Q,)``: about how far deviations go, which decides the order
     only. Raises `Broken` where the effort is certainly larger, `Unchecked` where that was not decided.
     """
-    from flint import arb
-
     high = [x + support(row) for x, row in zip(a, A, strict=True)]
     low = [x - support([-y for y in row]) for x, row in zip(a, A, strict=True)]
     slopes = np.array([_slope(float(u), float(v)) for u, v in zip(high, low, strict=True)])
-    heights = [(u * (1 - arb(s))).max(-v * (1 + arb(s))).max(arb(0)) for u, v, s in zip(high, low, slopes, strict=True)]
+    ends = zip(high, low, balls(slopes), strict=True)
+    heights = [(u * (1 - s)).max(-v * (1 + s)).max(ball(0)) for u, v, s in ends]
     about, table = np.array([float(x) for x in a]), stacked([[x, *row] for x, row in zip(a, A, strict=True)])
     rough = np.array([[float(x) for x in row] for row in A]).reshape(len(a), -1)
     tall = np.array([float(h) for h in heights])
@@ -49,9 +49,9 @@ def at_most(
         count += len(taken)
         if count > MOST:
             raise Unchecked(f"the largest effort was not bounded by {count} parts of the signs of the control")
-        sums = (stacked([[arb(float(s)) for s in one] for one, _ in taken]) * table).tolist()
+        sums = (stacked([[ball(s) for s in one] for one, _ in taken]) * table).tolist()
         for (signs, open_), (start, *along) in zip(taken, sums, strict=True):
-            bound = start + support(along) + sum((heights[k] for k in np.flatnonzero(open_)), arb(0))
+            bound = start + support(along) + sum((heights[k] for k in np.flatnonzero(open_)), ball(0))
             if bound <= limit:
                 continue
             if not open_.any():

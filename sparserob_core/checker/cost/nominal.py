@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls, rational
-from sparserob_core.checker.arithmetic.series import around, identity, stacked, zeros
-from sparserob_core.checker.flow.flow import Flow, Part
-from sparserob_core.checker.flow.segment import Segment
+from sparserob_core.checker.arithmetic.balls import ball, balls, rational
+from sparserob_core.checker.arithmetic.remembered import remembered
+from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked, zeros
+from sparserob_core.checker.flow.flow import FlowPart, VerifiedFlow
+from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -39,7 +40,7 @@ class Walk:
     terms: float
 
 
-def walked(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> Walk:
+def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> Walk:
     """``z = (x, 1, u)`` along the nominal trajectory, and back with the costates of what it costs; a control acts on
     the state as late as the system says, and costs when it is given."""
     from flint import arb, arb_mat
@@ -63,7 +64,7 @@ def walked(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> 
             slope[k] = [g + 2 * entry[0] for g, entry in zip(slope[k], both[d + 1 :], strict=True)]
     R = problem.cost.terms[1]
     if R is not None:
-        matrix, ends = stacked([balls(row) for row in R.Q]), [Fraction(float(t)) for t in control.breakpoints]
+        matrix, ends = exactly(R.Q), [Fraction(float(t)) for t in control.breakpoints]
         for k, (begin, end) in enumerate(pairwise(ends)):
             push = matrix * pieces[k] * rational(end - begin)
             value = value + (pieces[k].transpose() * push)[0, 0]
@@ -76,7 +77,7 @@ def walked(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> 
     return Walk(value, slope, blurred, terms)
 
 
-def nominal_states(nominal: Nominal, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
+def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
     """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and at the end.
 
     Every uncertainty is at its nominal point; ``u = 0`` before the first piece acts, and at the end.
@@ -111,15 +112,12 @@ def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[f
 
 @final
 @dataclass(frozen=True, eq=False)
-class Nominal:
+class NominalMotion:
     """The motion of ``z = (x, 1, u)`` with every uncertainty at its nominal point, of which ``flow`` is the flow there,
     and the cost of the states. A control stays the same; before the first piece acts it is ``before (m, 1)``."""
 
     problem: OptimalControlProblem
-    flow: Flow
-    _steps: dict[tuple[object, ...], arb_mat] = field(default_factory=dict, repr=False)
-    _weights: dict[tuple[object, ...], arb_mat] = field(default_factory=dict, repr=False)
-    _tables: dict[Segment, tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
+    flow: VerifiedFlow
 
     @cached_property
     def begin(self) -> arb_mat:
@@ -152,32 +150,29 @@ class Nominal:
         term, d = self.problem.cost.terms[which], self.problem.system.states
         if term is None:
             return zeros(d + 1, d + 1)
-        Q, r = stacked([balls(row) for row in term.Q]), stacked([[x] for x in balls(term.reference)])
+        Q, r = exactly(term.Q), stacked([[x] for x in balls(term.reference)])
         side, corner = (-(Q * r)).entries(), (r.transpose() * Q * r)[0, 0]
         return stacked([*([*row, b] for row, b in zip(Q.tolist(), side, strict=True)), [*side, corner]])
 
+    @remembered(key=lambda self, start, stop: self.flow.alike(start, stop))
     def step(self, start: float, stop: float) -> arb_mat:
         """Return what an interval makes of ``z``, a square matrix."""
-        key = self.flow.alike(start, stop)
-        if key not in self._steps:
-            Phi, Gamma, Delta = self.flow.over(start, stop)
-            self._steps[key] = self._lift(Phi.beside(Gamma).beside(Delta).matrix, 1)
-        return self._steps[key]
+        Phi, Gamma, Delta = self.flow.over(start, stop)
+        return self._lift(Phi.beside(Gamma).beside(Delta).matrix, 1)
 
+    @remembered(key=lambda self, start, stop: self.flow.alike(start, stop))
     def weight(self, start: float, stop: float) -> arb_mat:
         """Return what an interval costs as a quadratic form of the ``z`` at its beginning."""
-        key, size = self.flow.alike(start, stop), self.running.nrows()
-        if key not in self._weights:
-            whole, passed = zeros(size, size), identity(size)
-            for part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():
-                step, cost = self._integrate(part)
-                for _ in range(part.doublings):
-                    step, cost = step * step, cost + step.transpose() * cost * step
-                whole, passed = whole + passed.transpose() * cost * passed, step * passed
-            self._weights[key] = whole
-        return self._weights[key]
+        size = self.running.nrows()
+        whole, passed = zeros(size, size), identity(size)
+        for part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():
+            step, cost = self._integrate(part)
+            for _ in range(part.doublings):
+                step, cost = step * step, cost + step.transpose() * cost * step
+            whole, passed = whole + passed.transpose() * cost * passed, step * passed
+        return whole
 
-    def _integrate(self, part: Part) -> tuple[arb_mat, arb_mat]:
+    def _integrate(self, part: FlowPart) -> tuple[arb_mat, arb_mat]:
         """Return what a share of a segment makes of ``z``, and what that costs.
 
         Up to the share the flow is ``sum_n X_n x^n``, and what this leaves out is in a ball at every ``x``. With ``M``
@@ -195,28 +190,23 @@ class Nominal:
         every, pushed = (arb_mat(count * size, size, table.entries()) for table in (terms, pushed))
         return step + off, every.transpose() * pushed + missed * part.length
 
-    def _tabulate(self, segment: Segment) -> tuple[arb_mat, arb_mat, arb_mat]:
+    @remembered(lambda: KEPT)
+    def _tabulate(self, segment: VerifiedSegment) -> tuple[arb_mat, arb_mat, arb_mat]:
         """Return the terms of a segment's flow on ``z`` and their products with the cost per time, a row for each; and
         what they leave out."""
         from flint import arb_mat
 
-        if segment not in self._tables:
-            if len(self._tables) >= KEPT:
-                self._tables.clear()
-            terms = [self._lift(X.matrix, int(not n)) for n, X in enumerate(segment.terms)]
-            table, priced = ([X.entries() for X in some] for some in (terms, [self.running * X for X in terms]))
-            self._tables[segment] = arb_mat(table), arb_mat(priced), self._lift(around(segment.off), 0)
-        return self._tables[segment]
+        terms = [self._lift(X.matrix, int(not n)) for n, X in enumerate(segment.terms)]
+        table, priced = ([X.entries() for X in some] for some in (terms, [self.running * X for X in terms]))
+        return arb_mat(table), arb_mat(priced), self._lift(around(segment.off), 0)
 
     def _lift(self, term: arb_mat, one: int) -> arb_mat:
         """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square one on ``z``, of
         which the 1 and the control are multiplied by ``one``."""
-        from flint import arb
-
         system, bound = self.problem.system, self.problem.disturbance
         d, m, mw = system.states, system.controls, system.disturbances
         w = np.zeros(mw) if bound is None else nominal_point(bound)
         given = balls([*np.ones(term.ncols() - d - m - mw), *w])  # the input of a drift is 1
-        rows = [[*row[:d], sum((e * v for e, v in zip(row[d + m :], given, strict=True)), arb(0)), *row[d : d + m]]
+        rows = [[*row[:d], sum((e * v for e, v in zip(row[d + m :], given, strict=True)), ball(0)), *row[d : d + m]]
                 for row in term.tolist()]  # fmt: skip
         return stacked(rows + (identity(d + 1 + m) * one).tolist()[d:])

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls, rational
+from sparserob_core.checker.arithmetic.balls import ball, balls, rational
 from sparserob_core.checker.arithmetic.series import norm, stacked
-from sparserob_core.checker.cost.nominal import Nominal, Walk, nominal_states, walked
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.cost.nominal import NominalMotion, Walk, nominal_states, walked
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic
@@ -48,10 +48,10 @@ class Price:
 
     problem: OptimalControlProblem
     control: Dictionary
-    flow: Flow
+    flow: VerifiedFlow
     clock: Clock = NO_LIMIT
     _latest: deque[tuple[Sequence[arb_mat], int, Walk]] = field(default_factory=lambda: deque(maxlen=KEPT))
-    _nominals: dict[int, Nominal] = field(default_factory=dict)
+    _nominals: dict[int, NominalMotion] = field(default_factory=dict)
 
     @cached_property
     def _lengths(self) -> list[Fraction]:
@@ -65,16 +65,14 @@ class Price:
     @cached_property
     def costs(self) -> list[list[arb]]:
         """What a channel's absolute value costs on every piece, ``(K, m)``: its weights, integrated."""
-        from flint import arb
-
-        l1, ends = arb(float(self.problem.cost.l1)), [Fraction(t) for t in self.control.breakpoints.tolist()]
+        l1, ends = ball(self.problem.cost.l1), [Fraction(t) for t in self.control.breakpoints.tolist()]
         times = [Fraction(t) for t in self._changes[0]]
         rows = [balls(row) for row in self._changes[1]]
         found, first = [], 0
         for begin, end in self.clock.each(pairwise(ends)):
             while first + 1 < len(times) and times[first + 1] <= begin:
                 first += 1
-            total, now, row = [arb(0)] * len(rows[0]), begin, first
+            total, now, row = [ball(0)] * len(rows[0]), begin, first
             while now < end:
                 until = min(end, times[row + 1]) if row + 1 < len(times) else end
                 total = [one + w * rational(until - now) for one, w in zip(total, rows[row], strict=True)]
@@ -109,23 +107,17 @@ class Price:
 
     def of(self, pieces: Sequence[arb_mat]) -> arb:
         """``J`` of a control ``(m, 1)`` on every piece."""
-        from flint import arb
-
-        total = arb(0)
+        total = ball(0)
         for costs, piece in self.clock.each(zip(self.costs, pieces, strict=True)):
             total = total + self._norms(costs, piece.entries())
         return total + self.squares(pieces)
 
     def squares(self, pieces: Sequence[arb_mat]) -> arb:
         """The quadratic terms of a control ``(m, 1)`` on every piece."""
-        from flint import arb
-
-        return self._quadratic(pieces).value if self.is_quadratic else arb(0)
+        return self._quadratic(pieces).value if self.is_quadratic else ball(0)
 
     def _norms(self, costs: Sequence[arb], u: Sequence[arb]) -> arb:
-        from flint import arb
-
-        found = arb(0)
+        found = ball(0)
         for block in self.blocks:
             size = abs(u[block[0]]) if len(block) == 1 else norm(stacked([[u[c]] for c in block]))
             found = found + costs[block[0]] * size
@@ -184,13 +176,13 @@ class Price:
         return self.problem.cost.terms
 
     @property
-    def _nominal(self) -> Nominal:
+    def _nominal(self) -> NominalMotion:
         """The nominal motion, in numbers of as many bits as are used now, or more."""
         from flint import ctx
 
         if not any(bits >= ctx.prec for bits in self._nominals):
             flow = self.flow.sharper(2.0**-ctx.prec) if self._nominals else self.flow
-            self._nominals[int(ctx.prec)] = Nominal(self.problem, flow)
+            self._nominals[int(ctx.prec)] = NominalMotion(self.problem, flow)
         return next(nominal for bits, nominal in self._nominals.items() if bits >= ctx.prec)
 
     def nominal_states(self, pieces: Sequence[arb_mat]) -> list[arb_mat]:
@@ -206,9 +198,7 @@ class Price:
     @cached_property
     def _still(self) -> list[arb_mat]:
         """The control that stays 0."""
-        from flint import arb
-
-        return [stacked([[arb(0)]] * self.problem.system.controls)] * len(self._lengths)
+        return [stacked([[ball(0)]] * self.problem.system.controls)] * len(self._lengths)
 
     def _quadratic(self, pieces: Sequence[arb_mat]) -> Walk:
         """The quadratic terms and their slopes, with as many bits as it takes, or more. The latest are kept: a cost,

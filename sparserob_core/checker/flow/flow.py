@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import difference
+from sparserob_core.checker.arithmetic.balls import ball, difference
 from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, middles, products, zeros
-from sparserob_core.checker.flow.law import Box, Law, Stretch
+from sparserob_core.checker.flow.law import Law, ParameterBox, Stretch
 from sparserob_core.checker.flow.plant import Plant, called
-from sparserob_core.checker.flow.segment import LONGER, ROUGH, SHARP, Segment, solve
+from sparserob_core.checker.flow.segment import LONGER, ROUGH, SHARP, VerifiedSegment, solve
 from sparserob_core.checker.flow.still import held_about
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
@@ -38,7 +39,7 @@ ENOUGH = 2.0**-64  # of a kernel, which goes on as numbers of 53 bits, what its 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Weights:
+class StateWeights:
     """What a state at a time is made of: ``free`` times the state at 0, and ``control`` and ``disturbance`` times the
     inputs on every piece of a grid."""
 
@@ -49,11 +50,11 @@ class Weights:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Part:
+class FlowPart:
     """A ``share`` of a ``segment``, which takes a time of this ``length``, so many ``doublings`` of it: the flow of two
     times is that of one twice."""
 
-    segment: Segment
+    segment: VerifiedSegment
     share: arb
     length: arb
     doublings: int = 0
@@ -61,39 +62,32 @@ class Part:
 
 @final
 @dataclass(eq=False)
-class Flow:
+class VerifiedFlow:
     """The system ``x' = A x + B u + E w`` from 0 to ``until``, at every parameter of a ``box``; a drift is one more
     column of ``B``, whose input is always 1. To a ``degree`` in the parameters, of which there may be none; between
     the marks of a ``timing`` where there is one. ``sharp``: of the states, what a guess may leave out."""
 
     plant: Plant
     until: float
-    box: Box = Box()  # noqa: RUF009  immutable
+    box: ParameterBox = ParameterBox()  # noqa: RUF009  immutable
     degree: int = 0
     timing: Law | None = None
     sharp: float = SHARP
-    _segments: dict[tuple[float, float], Segment] = field(default_factory=dict, repr=False)
+    _segments: dict[tuple[float, float], VerifiedSegment] = field(default_factory=dict, repr=False)
     _longest: dict[float, float] = field(default_factory=dict, repr=False)
-    _over: dict[tuple[object, ...], tuple[Series, Series]] = field(default_factory=dict, repr=False)
-    _ends: dict[tuple[int, tuple[float, float]], Series] = field(default_factory=dict, repr=False)
     _about: dict[tuple[int, float], tuple[Array, Array]] = field(default_factory=dict, repr=False)
-    _points: dict[tuple[float, ...], Flow] = field(default_factory=dict, repr=False)
-    _weights: dict[tuple[float, ...], Weights] = field(default_factory=dict, repr=False)
 
-    def at(self, parameter: Sequence[float]) -> Flow:
+    @remembered(lambda: POINTS_KEPT, lambda self, parameter: tuple(map(float, parameter)))
+    def at(self, parameter: Sequence[float]) -> VerifiedFlow:
         """The flow at one parameter."""
         point = tuple(map(float, parameter))
         if point == self.box.middle and not self.degree:
             return self
-        if point not in self._points:
-            if len(self._points) >= POINTS_KEPT:
-                self._points.clear()
-            self._points[point] = Flow(self.plant, self.until, Box(point, (0.0,) * len(point)))
-        return self._points[point]
+        return VerifiedFlow(self.plant, self.until, ParameterBox(point, (0.0,) * len(point)))
 
-    def sharper(self, sharp: float) -> Flow:
+    def sharper(self, sharp: float) -> VerifiedFlow:
         """The flow anew, of whose states a guess leaves out less."""
-        return Flow(self.plant, self.until, self.box, self.degree, self.timing, min(self.sharp, sharp))
+        return VerifiedFlow(self.plant, self.until, self.box, self.degree, self.timing, min(self.sharp, sharp))
 
     @cached_property
     def law(self) -> Law:
@@ -141,13 +135,11 @@ class Flow:
                 found += [float(t) for t in np.linspace(a, b, max(1, ceil(count)) + 1)[1:-1]] + [b]
         return found
 
-    def segment(self, start: float, stop: float) -> tuple[Segment, arb]:
+    def segment(self, start: float, stop: float) -> tuple[VerifiedSegment, arb]:
         """The flow from ``start`` on, and which share of it has passed at ``stop``."""
-        from flint import arb
-
         stretch = self.law.stretches[self._place(start, stop)]
         if stretch.is_still:
-            share = (arb(stop) - arb(start)) / stretch.stride
+            share = (ball(stop) - ball(start)) / stretch.stride
             if not share <= LONGER:
                 raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
             return self._still(stretch), share
@@ -159,8 +151,8 @@ class Flow:
             self._segments[start, stop] = solve(*stretch.between(start, stop), stretch.units, self.sharp)
             longest = self._longest[start] = stop
         if longest == start:
-            return self._segments[start, longest], arb(1)
-        return self._segments[start, longest], (arb(stop) - arb(start)) / (arb(longest) - arb(start))
+            return self._segments[start, longest], ball(1)
+        return self._segments[start, longest], (ball(stop) - ball(start)) / (ball(longest) - ball(start))
 
     def kind(self, start: float, stop: float) -> tuple[int, tuple[float, float]]:
         """Intervals of one kind have one flow."""
@@ -168,34 +160,25 @@ class Flow:
         still = self.law.stretches[place].is_still
         return (place, difference(stop, start)) if still else (-1 - place, (start, stop))
 
+    @remembered(lambda: KEPT, lambda self, start, stop: self.kind(start, stop))
     def step(self, start: float, stop: float) -> Series:
         """``[Phi Gamma]``, what an interval from one mark to the next makes of states and of inputs."""
-        key = self.kind(start, stop)
-        if key not in self._ends:
-            if len(self._ends) >= KEPT:
-                self._ends.clear()
-            segment, share = self.segment(start, stop)
-            self._ends[key] = segment.at(share)
-        return self._ends[key]
+        segment, share = self.segment(start, stop)
+        return segment.at(share)
 
+    @remembered(lambda: KEPT, lambda self, start, stop: self.alike(start, stop))
     def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
         """What an interval makes of a state, of controls that stay the same (a drift among them), and of such
         disturbances."""
-        key = self.alike(start, stop)
-        if key not in self._over:
-            whole: tuple[Series, Series] | None = None
-            for part in self.parts(start, stop):
-                both = part.segment.at(part.share)
-                Phi, pushed = both.columns(0, self.states), both.columns(self.states, None)
-                for _ in range(part.doublings):
-                    Phi, pushed = Phi * Phi, Phi * pushed + pushed
-                whole = (Phi, pushed) if whole is None else (Phi * whole[0], Phi * whole[1] + pushed)
-            assert whole is not None
-            if len(self._over) >= KEPT:
-                self._over.clear()
-            self._over[key] = whole
-        Phi, pushed = self._over[key]
-        return Phi, pushed.columns(0, self.driven), pushed.columns(self.driven, None)
+        whole: tuple[Series, Series] | None = None
+        for part in self.parts(start, stop):
+            both = part.segment.at(part.share)
+            Phi, pushed = both.columns(0, self.states), both.columns(self.states, None)
+            for _ in range(part.doublings):
+                Phi, pushed = Phi * Phi, Phi * pushed + pushed
+            whole = (Phi, pushed) if whole is None else (Phi * whole[0], Phi * whole[1] + pushed)
+        assert whole is not None
+        return whole[0], whole[1].columns(0, self.driven), whole[1].columns(self.driven, None)
 
     def about(self, start: float, stop: float) -> tuple[Array, Array, Array]:
         """`over` in floats, off by their rounding, of which units of rows are made, and no claim."""
@@ -216,21 +199,19 @@ class Flow:
                 found[:, d:] += pushed
         return found[:, :d], found[:, d : d + self.driven], found[:, d + self.driven :]
 
-    def parts(self, start: float, stop: float) -> Iterator[Part]:
+    def parts(self, start: float, stop: float) -> Iterator[FlowPart]:
         """Yield the parts of an interval, one after another."""
-        from flint import arb
-
         for a, b in pairwise([start, *(one for one in self._begins if start < one < stop), stop]):
-            stretch, doublings, length = self.law.stretches[self._place(a, b)], 0, arb(b) - arb(a)
+            stretch, doublings, length = self.law.stretches[self._place(a, b)], 0, ball(b) - ball(a)
             if not stretch.is_still:
-                yield Part(*self.segment(a, b), length)
+                yield FlowPart(*self.segment(a, b), length)
                 continue
             share = length / stretch.stride
             while not share <= 1:
                 share, length, doublings = share / 2, length / 2, doublings + 1
-            yield Part(self._still(stretch), share, length, doublings)
+            yield FlowPart(self._still(stretch), share, length, doublings)
 
-    def _still(self, stretch: Stretch) -> Segment:
+    def _still(self, stretch: Stretch) -> VerifiedSegment:
         """The flow of a stretch on which nothing changes with time."""
         key = (-1.0, stretch.start)
         if key not in self._segments:
@@ -241,13 +222,11 @@ class Flow:
         """What the time from ``begin`` on makes of states and of inputs that stay the same, on ``[start, stop]`` within
         ``[begin, end]``, on which the flow is a polynomial: so many terms in the share of the interval, ``(d, d + w)``
         each, and by how much they are off at most."""
-        from flint import arb
-
         segment, share = self.segment(begin, end)
         if begin == end:
-            return segment.within(arb(0), arb(0), order)
-        length = arb(end) - arb(begin)
-        first, width = ((arb(b) - arb(a)) / length * share for a, b in ((begin, start), (start, stop)))
+            return segment.within(ball(0), ball(0), order)
+        length = ball(end) - ball(begin)
+        first, width = ((ball(b) - ball(a)) / length * share for a, b in ((begin, start), (start, stop)))
         return segment.within(first, width, order)
 
     def kernel(self, start: float, stop: float) -> tuple[list[Series], Array]:
@@ -298,16 +277,12 @@ class Flow:
         stretch = self.law.stretches[self._place(start, stop)]
         return *stretch.sizes, stretch.units
 
-    def weights(self, grid: Sequence[float]) -> Weights:
+    @remembered(lambda: WEIGHTS_KEPT, lambda self, grid: tuple(grid))
+    def weights(self, grid: Sequence[float]) -> StateWeights:
         """What the state at the end of a grid, which begins at 0, is made of, where the parameters are known."""
-        key = tuple(grid)
-        if key not in self._weights:
-            if len(self._weights) >= WEIGHTS_KEPT:
-                self._weights.clear()
-            parts = [self.over(*ends) for ends in pairwise(grid)]
-            after = products([part[0] for part in parts])
-            control, disturbance = (
-                [(Z * part[i]).matrix for Z, part in zip(after[1:], parts, strict=True)] for i in (1, 2)
-            )
-            self._weights[key] = Weights(after[0].matrix, control, disturbance)
-        return self._weights[key]
+        parts = [self.over(*ends) for ends in pairwise(grid)]
+        after = products([part[0] for part in parts])
+        control, disturbance = (
+            [(Z * part[i]).matrix for Z, part in zip(after[1:], parts, strict=True)] for i in (1, 2)
+        )
+        return StateWeights(after[0].matrix, control, disturbance)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.law import Box, Law, most
+from sparserob_core.checker.arithmetic.remembered import remembered
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.law import Law, ParameterBox, most
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
@@ -26,44 +27,37 @@ ASIDE = 0.3819  # of half the width of all parameters, from their middle
 
 @final
 @dataclass(eq=False)
-class Flows:
+class VerifiedFlows:
     """The flows of a ``plant`` up to the time ``until``, whose parameters are in a ``box``."""
 
     plant: Plant
     until: float
-    box: Box = Box()  # noqa: RUF009  immutable
-    _made: dict[tuple[Box, int], Flow] = field(default_factory=dict, repr=False)
-    _close: dict[tuple[Box, int], bool] = field(default_factory=dict, repr=False)
+    box: ParameterBox = ParameterBox()  # noqa: RUF009  immutable
 
     @staticmethod
-    def of(system: System, until: float) -> Flows:
+    def of(system: System, until: float) -> VerifiedFlows:
         """Those of a system over the box around its parameters."""
         bound = None if system.parameters is None else system.parameters.bounding_box()
-        box = Box() if bound is None else Box.between(bound.lower.tolist(), bound.upper.tolist())
-        return Flows(Plant.of(system, until), until, box)
+        box = ParameterBox() if bound is None else ParameterBox.between(bound.lower.tolist(), bound.upper.tolist())
+        return VerifiedFlows(Plant.of(system, until), until, box)
 
-    def at(self, parameter: Sequence[float]) -> Flow:
+    def at(self, parameter: Sequence[float]) -> VerifiedFlow:
         """The flow at one parameter, of which there may be none."""
         return self._points.at(parameter)
 
     @cached_property
-    def _points(self) -> Flow:
-        return Flow(self.plant, self.until)
+    def _points(self) -> VerifiedFlow:
+        return VerifiedFlow(self.plant, self.until)
 
     @property
     def degree(self) -> int:
         """That of expansions over boxes."""
         return DEGREES.get(len(self.box.middle), 2)
 
-    def over(self, box: Box, degree: int) -> Flow:
+    @remembered(lambda: KEPT)
+    def over(self, box: ParameterBox, degree: int) -> VerifiedFlow:
         """The flow over a box, to a degree."""
-        if not degree:
-            return self.at(())
-        if (box, degree) not in self._made:
-            if len(self._made) >= KEPT:
-                self._made.pop(next(iter(self._made)))
-            self._made[box, degree] = Flow(self.plant, self.until, box, degree, self.timing)
-        return self._made[box, degree]
+        return VerifiedFlow(self.plant, self.until, box, degree, self.timing) if degree else self.at(())
 
     @cached_property
     def timing(self) -> Law:
@@ -76,10 +70,10 @@ class Flows:
         return tuple(m + ASIDE * h for m, h in zip(self.box.middle, self.box.halves, strict=True))
 
     def marks(self, times: Sequence[float]) -> list[float]:
-        """`Flow.marks` of every box."""
+        """`VerifiedFlow.marks` of every box."""
         return self.at(self.aside).marks(times)
 
-    def holding(self, box: Box) -> Flow:
+    def holding(self, box: ParameterBox) -> VerifiedFlow:
         """A flow over a box, or over a larger one where the expansion is close over all of that."""
         if self._is_still:
             return self.over(box, self.degree)
@@ -95,20 +89,19 @@ class Flows:
         """Whether nothing changes with time, or nothing is uncertain: then flows are cheap."""
         return not self.box.middle or all(one.is_still for one in self.timing.stretches)
 
-    def _is_close(self, box: Box, degree: int) -> bool:
+    @remembered()
+    def _is_close(self, box: ParameterBox, degree: int) -> bool:
         """Whether little is left out over a box, to a degree."""
-        if (box, degree) not in self._close:
-            try:
-                flow = self.over(box, degree)
-                Phi, units = flow.over(0.0, self.until)[0], flow.law.units
-                off = np.array([[float(x.rad()) for x in row] for row in Phi.parts[0].tolist()])
-                size, lost = ((one * units / units[:, None]).max() for one in (Phi.size, off))
-                self._close[box, degree] = bool(lost <= CLOSE * max(1.0, size))
-            except Unchecked:
-                self._close[box, degree] = False
-        return self._close[box, degree]
+        try:
+            flow = self.over(box, degree)
+            Phi, units = flow.over(0.0, self.until)[0], flow.law.units
+        except Unchecked:
+            return False
+        off = np.array([[float(x.rad()) for x in row] for row in Phi.parts[0].tolist()])
+        size, lost = ((one * units / units[:, None]).max() for one in (Phi.size, off))
+        return bool(lost <= CLOSE * max(1.0, size))
 
-    def _axis(self, box: Box) -> int:
+    def _axis(self, box: ParameterBox) -> int:
         """The parameter that moves the system most across a box."""
         try:
             law = Law(self.plant, self.until, box, 1, self.timing)

@@ -35,41 +35,43 @@ SHORTEST = 2.0**-30  # of the horizon: a shorter stretch holds a pole
 
 @final
 @dataclass(frozen=True)
-class Box:
+class ParameterBox:
     """A box of parameters: its ``middle (nu,)``, exact numbers, and ``halves (nu,)`` of its widths, or more."""
 
     middle: tuple[float, ...] = ()
     halves: tuple[float, ...] = ()
 
     @staticmethod
-    def between(low: Sequence[float], high: Sequence[float]) -> Box:
+    def between(low: Sequence[float], high: Sequence[float]) -> ParameterBox:
         """That between two corners."""
         ends = [(a, b, (a + b) / 2) for a, b in zip(map(float, low), map(float, high), strict=True)]
         halves = [0.0 if a == b else float(np.nextafter(max(b - m, m - a), np.inf)) for a, b, m in ends]
-        return Box(tuple(m for _, _, m in ends), tuple(halves))
+        return ParameterBox(tuple(m for _, _, m in ends), tuple(halves))
 
-    def wider(self, extra: Sequence[float] | Array) -> Box:
+    def wider(self, extra: Sequence[float] | Array) -> ParameterBox:
         """The box with so much more at either side."""
         more = [h + float(x) for h, x in zip(self.halves, extra, strict=True)]
         return (
-            Box(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more)) if any(extra) else self
+            ParameterBox(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more))
+            if any(extra)
+            else self
         )
 
-    def holds(self, other: Box) -> bool:
+    def holds(self, other: ParameterBox) -> bool:
         """Whether another box is in this one; exactly, where sums of two floats are rounded."""
         for m, h, n, k in zip(self.middle, self.halves, other.middle, other.halves, strict=True):
             if abs(Fraction(n) - Fraction(m)) + Fraction(k) > Fraction(h):
                 return False
         return True
 
-    def halved(self, axis: int) -> list[Box]:
+    def halved(self, axis: int) -> list[ParameterBox]:
         """Both halves across a parameter, each a little larger than half."""
         found = []
         for sign in (-0.5, 0.5):
             middle, halves = list(self.middle), list(self.halves)
             middle[axis] += sign * halves[axis]
             halves[axis] *= 0.5 * (1.0 + 1e-9)
-            found.append(Box(tuple(middle), tuple(halves)))
+            found.append(ParameterBox(tuple(middle), tuple(halves)))
         return found
 
 
@@ -150,7 +152,7 @@ class Law:
 
     plant: Plant
     until: float
-    box: Box
+    box: ParameterBox
     degree: int = 0
     timing: Law | None = None
 
@@ -277,12 +279,10 @@ class Law:
 
         frame = Frame(monomials, ORDER)
         p = np.empty(1 + len(self.box.middle), dtype=object)
-        p[0] = Model.time(frame, (arb(start) + arb(stop)) / 2, (arb(stop) - arb(start)) / 2)
+        p[0] = frame.time((arb(start) + arb(stop)) / 2, (arb(stop) - arb(start)) / 2)
         for j, (middle, half) in enumerate(zip(self.box.middle, self.box.halves, strict=True)):
             wide = arb(half) if monomials.count else arb(0)
-            p[1 + j] = (
-                Model.number(frame, arb(middle)) if wide.is_zero() else Model.parameter(frame, j, arb(middle), wide)
-            )
+            p[1 + j] = frame.number(arb(middle)) if wide.is_zero() else frame.parameter(j, arb(middle), wide)
         values = called(phase, p)
         found = [[[arb_poly([])] * values.shape[1] for _ in range(values.shape[0])] for _ in range(monomials.size)]
         for (i, j), value in np.ndenumerate(values):

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, dot, identity, sizes_of, zeros
 from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
@@ -74,7 +75,7 @@ class Powers:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Segment:
+class VerifiedSegment:
     """``[Phi Gamma]``, what a share ``x`` of the time makes of the states at its beginning and of inputs that stay the
     same: ``sum_n terms_n x^n``, off by at most ``off (d, d + w)`` at every share up to `LONGER` and every parameter."""
 
@@ -134,12 +135,12 @@ def _binomials(count: int) -> Array:
     return np.array([[float(comb(n, j)) for n in range(count)] for j in range(count)])
 
 
-def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float = SHARP) -> Segment:
+def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float = SHARP) -> VerifiedSegment:
     """The flow of ``sum_k A_k x^k`` and ``sum_k F_k x^k`` for ``x`` from 0 to 1; ``units (d,)`` are those of the
     states, in which the system is small. ``sharp``: of the states, what the guess may leave out."""
     equation = Equation(A, F)
     terms = guess(equation, units, max(sharp, ROUGH) if A[0].monomials.degree else sharp)
-    return Segment(terms, verify(equation, terms, units))
+    return VerifiedSegment(terms, verify(equation, terms, units))
 
 
 def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series]:
@@ -165,7 +166,7 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
     `Unchecked` where that is not known."""
     A, F, last, d = equation.A, equation.F, len(terms) - 1, len(units)
     longer = LONGER ** (last + max(len(A), len(F)) + 1) * OUTWARD
-    defects = [terms[n + 1].scaled(_exact(n + 1)) - equation.slope(terms, n) for n in range(last)]
+    defects = [terms[n + 1].scaled(ball(n + 1)) - equation.slope(terms, n) for n in range(last)]
     orders = np.array([1.0, *range(1, last + 1)])[:, None, None]
     missed = (sizes_of([terms[0] - equation.begin, *defects]) / orders).sum(axis=0)
     sizes, paces, drives = map(sizes_of, (terms, A, F))
@@ -213,13 +214,5 @@ class Equation:
         return known[1]
 
 
-def _exact(value: float) -> arb:
-    from flint import arb
-
-    return arb(value)
-
-
 def _inverse(value: int) -> arb:
-    from flint import arb
-
-    return 1 / arb(value)
+    return 1 / ball(value)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import NONE
 from sparserob_core.checker.arithmetic.series import stacked
@@ -23,15 +24,12 @@ TERMS = 18  # of the series of a transition in floats, at a norm of at most a ha
 
 def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_mat]]:
     """``A``, ``B`` with the drift beside it, and ``E`` of the systems that take turns."""
-    from flint import arb
-
     p = np.empty(1 + len(parameter), dtype=object)
-    p[:] = [Model.number(POINT, arb(float(value))) for value in (0.0, *parameter)]
+    p[:] = [POINT.number(ball(value)) for value in (0.0, *parameter)]
     found = []
     for mode in system.modes:
         table = [
-            [value.constant if isinstance(value, Model) else arb(float(value)) for value in row]
-            for row in called(mode, p)
+            [value.constant if isinstance(value, Model) else ball(value) for value in row] for row in called(mode, p)
         ]
         d, m = mode.states, mode.controls + (mode.c is not None)
         cuts = {"A": slice(0, d), "B": slice(d, d + m), "E": slice(d + m, None)}

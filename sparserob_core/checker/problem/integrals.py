@@ -15,7 +15,7 @@ from typing import Any, TypeAlias, final
 import numpy as np
 
 from sparserob_core.control.policies.measurements import Measurements
-from sparserob_core.control.problem.cost import Cost, Quadratic
+from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -93,12 +93,10 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
         return problem
     d, (coordinates, windows) = problem.system.states, _coordinates(problem)
     size = d + len(coordinates)
-    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
     return replace(
         problem,
+        **with_zeros(problem, len(coordinates)),
         system=_larger(problem.system, coordinates, problem.horizon),
-        initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(size - d)]),
-        initial_set=None if begun is None else _begun(begun, size),
         path=[
             *(_freed(entry, size) for entry in problem.windows),
             *(Accumulated(_summed(sums, size), time, time, name) for name, time, sums in windows),
@@ -110,10 +108,8 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
             for end in problem.terminal
         ],
         integral=(),
-        cost=_cost(problem.cost, size - d),
         names=_named(problem, coordinates),
         commanded=tuple(d + i for i, one in enumerate(coordinates) if one.g.any() and problem.execution is not None),
-        measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, size - d)))),
     )
 
 
@@ -148,7 +144,7 @@ def _coordinates(
 
 @final
 @dataclass(frozen=True, eq=False)
-class Running:
+class RunningIntegrals:
     """What a problem with integrals is of where nothing changes with time but what is integrated: the ``system`` whose
     coordinates are integrated all along. What is integrated from ``begins (k,)`` to ``ends (k,)`` is what has been
     until the end, less what had been at the beginning."""
@@ -158,7 +154,7 @@ class Running:
     ends: Array
 
     @staticmethod
-    def of(problem: OptimalControlProblem) -> Running | None:
+    def of(problem: OptimalControlProblem) -> RunningIntegrals | None:
         """That of a problem as it is stated, of which one known system acts; ``None`` for others."""
         system = problem.system
         if not problem.integral or system.varies or system.switches or system.parameters is not None:
@@ -166,7 +162,7 @@ class Running:
         coordinates, _ = _coordinates(problem)
         whole = _with(system.phases[0], [(one.h, one.g) for one in coordinates])
         ends = np.array([[one.begin, one.end] for one in coordinates])
-        return Running(System((whole,), None, system.delay), *ends.T)
+        return RunningIntegrals(System((whole,), None, system.delay), *ends.T)
 
     def is_beside(self, phase: Phase, d: int) -> bool:
         """Whether a phase is the same of the first ``d`` states, whatever is integrated beside them."""
@@ -244,12 +240,25 @@ def _free(bound: ConvexSet, size: int) -> ConvexSet:
     return Cylinder(bound, size) if flat is None else Polytope(np.pad(flat[0], ((0, 0), (0, more))), flat[1])
 
 
-def _begun(bound: ConvexSet, size: int) -> ConvexSet:
-    """The deviations of the initial state, beside integrals that begin at 0."""
-    zero = np.zeros(size - bound.dimension)
-    if isinstance(bound, Box):
-        return Box(np.append(bound.lower, zero), np.append(bound.upper, zero))
-    return Product((bound, Box(zero, zero)))
+def with_zeros(problem: OptimalControlProblem, more: int) -> dict[str, Any]:
+    """What a problem says of its initial states, its cost and its measurements, where so many states that begin at 0
+    and cost nothing are after its own."""
+    begun, zero, d = problem.initial_set, np.zeros(more), problem.system.states
+    if isinstance(begun, Box):
+        begun = Box(np.append(begun.lower, zero), np.append(begun.upper, zero))
+    elif begun is not None and more:
+        begun = Product((begun, Box(zero, zero)))
+    state, _, final = (
+        None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
+        for term in problem.cost.terms
+    )
+    measured = problem.measurements or Measurements(np.eye(d))
+    return {
+        "initial_state": np.concatenate([np.asarray(problem.initial_state), zero]),
+        "initial_set": begun,
+        "cost": replace(problem.cost, state=state, final=final),
+        "measurements": replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, more)))),
+    }
 
 
 def _summed(sums: list[tuple[list[int], float, float]], size: int) -> ConvexSet:
@@ -281,11 +290,3 @@ def _unit(names: Names, h: Array, g: Array) -> str:
         return ""
     head, slash, per = unit.rpartition("/")
     return head if slash and per == names.time else f"{unit} {names.time}"
-
-
-def _cost(cost: Cost, more: int) -> Cost:
-    state, _, final = (
-        None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
-        for term in cost.terms
-    )
-    return replace(cost, state=state, final=final)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.polynomials import OUTWARD, rounding
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -87,13 +88,11 @@ class Lasting:
 
 def summed(lasting: Lasting | None, weights: Sequence[Sequence[arb]]) -> list[list[arb]]:
     """`Lasting.gathered` of weights ``(mw,)`` on every piece, exactly; as they are where no component lasts longer."""
-    from flint import arb
-
     found = [list(one) for one in weights]
     for columns, firsts in () if lasting is None else lasting.parts:
         first = 0
         for piece in range(len(found)):
             first = piece if piece in firsts else first
             for j in range(columns.start, columns.stop) if piece != first else ():
-                found[first][j], found[piece][j] = found[first][j] + found[piece][j], arb(0)
+                found[first][j], found[piece][j] = found[first][j] + found[piece][j], ball(0)
     return found

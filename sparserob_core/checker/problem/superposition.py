@@ -21,15 +21,14 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.control.policies.measurements import Measurements
-from sparserob_core.control.problem.cost import Quadratic
+from sparserob_core.checker.problem.integrals import with_zeros
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint
-from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope, Product
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality, Polytope
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ class Affine:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Parts:
+class ParameterExpansion:
     """The system of a problem about the ``middle (nu,)`` of its parameters."""
 
     system: System
@@ -188,7 +187,7 @@ class Parts:
 class Larger:
     """One of the matrices of the system of all coordinates."""
 
-    parts: Parts
+    parts: ParameterExpansion
     name: str
     entry: object
 
@@ -212,12 +211,11 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     system = problem.system
     if not system.varies or system.parameters is None:
         return problem
-    parts = Parts(system, tuple(system.parameters.interior_point().tolist()))
+    parts = ParameterExpansion(system, tuple(system.parameters.interior_point().tolist()))
     if not parts.is_affine:  # then it is expanded, box by box by the flow
         return problem
     d, more = system.states, parts.size - system.states
     corners = [parts.seen(shares) for shares in parts.corners()]
-    measured, begun = problem.measurements or Measurements(np.eye(d)), problem.initial_set
     reached = {place for places in parts.moved for place in places}
     if any(reached & set(end.fixed.tolist()) for end in problem.terminal_equalities):
         raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
@@ -228,13 +226,10 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     for name, scale, places in zip(system.names, parts.scales, parts.moved, strict=True):
         called += [f"{called[i]} per {scale:.3g} {name}" for i in places]
         units += [units[i] for i in places] if problem.names.state_units else []
-    costs = [None if q is None else Quadratic(np.pad(q.Q, (0, more)), np.pad(q.reference, (0, more)))
-             for q in problem.cost.terms]  # fmt: skip
     return replace(
         problem,
+        **with_zeros(problem, more),
         system=System(tuple(_larger(parts, phase) for phase in system.phases), None, system.delay),
-        initial_state=np.concatenate([np.asarray(problem.initial_state), np.zeros(more)]),
-        initial_set=_begun(begun, more) if begun is not None and more else begun,
         path=[one for entry, name in zip(problem.path, called_as, strict=True) for one in _seen(entry, name, corners)],
         terminal=[
             one
@@ -246,9 +241,7 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
             )
         ],
         integral=[_sums(entry, corners) for entry in problem.integral],
-        cost=replace(problem.cost, state=costs[0], final=costs[2]),
         names=replace(problem.names, states=called, state_units=units),
-        measurements=replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, more)))),
     )
 
 
@@ -266,17 +259,10 @@ def _above(exact: Fraction) -> float:
     return nextafter(found, inf) if Fraction(found) < exact else found
 
 
-def _larger(parts: Parts, phase: Phase) -> Phase:
+def _larger(parts: ParameterExpansion, phase: Phase) -> Phase:
     made = {name: Larger(parts, name, phase.entry(name)) for name in NAMES if phase.entry(name) is not None}
     times = Box([phase.begin], [phase.until])
     return Phase(made["A"], made["B"], made["E"], times, ("t",), made.get("c"), phase.begin, phase.until, timed=True)
-
-
-def _begun(bound: ConvexSet, more: int) -> ConvexSet:
-    zero = np.zeros(more)
-    if isinstance(bound, Box):
-        return Box(np.append(bound.lower, zero), np.append(bound.upper, zero))
-    return Product((bound, Box(zero, zero)))
 
 
 def _rows(blocks: list[Array]) -> Array:

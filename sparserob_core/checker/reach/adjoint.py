@@ -17,15 +17,14 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import Series, middles, stacked, zeros
-from sparserob_core.checker.flow.segment import Segment, solve
+from sparserob_core.checker.flow.segment import VerifiedSegment, solve
 from sparserob_core.checker.flow.units import balanced
 from sparserob_core.checker.outcome import Clock, Unchecked
-from sparserob_core.checker.reach.closed_loop import middle
 from sparserob_core.checker.reach.measurable import Side
-from sparserob_core.checker.sets.along import Curve
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -55,22 +54,20 @@ SUMMED = 32
 
 @final
 @dataclass(frozen=True, eq=False)
-class Motion:
+class AdjointFlow:
     """What all rows of a system ``x' = A x + F u`` share: the flow on a ``segment`` of time, a ``step``, of which there
     are ``count`` one after another. Its length is a power of two, so that places within a step are exact."""
 
     A: arb_mat
     F: arb_mat
-    segment: Segment
+    segment: VerifiedSegment
     step: float
     count: int
     clock: Clock
 
     @staticmethod
-    def of(A: arb_mat, F: arb_mat, horizon: float, clock: Clock) -> Motion:
+    def of(A: arb_mat, F: arb_mat, horizon: float, clock: Clock) -> AdjointFlow:
         """That of rows with inputs through ``F (d, q)`` up to the ``horizon``."""
-        from flint import arb
-
         plain, speed = middles(A), np.abs(middles(F)).sum(axis=1)
         units = balanced(plain, horizon, speed)
         step = choose_step(plain * units / units[:, None], horizon)
@@ -78,8 +75,8 @@ class Motion:
         if not (count <= MOST_STEPS and count * A.nrows() <= MOST):
             raise Unchecked("the system is too fast for its horizon to be followed")
         clock.check()
-        segment = solve([Series.known(A * arb(step))], [Series.known(zeros(A.nrows(), 0))], units)
-        return Motion(A, F, segment, step, count, clock)
+        segment = solve([Series.known(A * ball(step))], [Series.known(zeros(A.nrows(), 0))], units)
+        return AdjointFlow(A, F, segment, step, count, clock)
 
     @property
     def states(self) -> int:
@@ -161,22 +158,20 @@ def choose_step(A: Array, horizon: float) -> float:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Adjoint:
+class AdjointRow:
     """``l`` at the ends of the steps of a ``motion``, ``nodes (N + 1, d)``."""
 
-    motion: Motion
+    motion: AdjointFlow
     nodes: Enclosed
-    opposite: Adjoint | None = None  # that of ``-c``, which is as large everywhere
+    opposite: AdjointRow | None = None  # that of ``-c``, which is as large everywhere
 
     @staticmethod
-    def of(motion: Motion, c: Array) -> Adjoint:
+    def of(motion: AdjointFlow, c: Array) -> AdjointRow:
         """That of the row ``c (d,)``, an exact one."""
-        from flint import arb
-
-        return Adjoint.of_balls(motion, [arb(float(v)) for v in c])
+        return AdjointRow.of_balls(motion, [ball(v) for v in c])
 
     @staticmethod
-    def of_balls(motion: Motion, c: list[arb]) -> Adjoint:
+    def of_balls(motion: AdjointFlow, c: list[arb]) -> AdjointRow:
         """That of a row ``(d,)`` of balls."""
         found, place, count = [c], floor(log2(motion.apart)), motion.count // motion.apart + 1
         while len(found) < BLOCK:
@@ -195,14 +190,14 @@ class Adjoint:
             motion.clock.check()
             for node, product in zip(nodes, _product(Enclosed(mid, rad), motion.between[j - 1]), strict=True):
                 node[:, j] = product[:, 0]
-        return Adjoint(motion, Enclosed(*(node.reshape(-1, len(c))[: motion.count + 1] for node in nodes)))
+        return AdjointRow(motion, Enclosed(*(node.reshape(-1, len(c))[: motion.count + 1] for node in nodes)))
 
     @property
     def step(self) -> float:
         """The length of a step."""
         return self.motion.step
 
-    def reversed(self) -> Adjoint:
+    def reversed(self) -> AdjointRow:
         """That of ``-c``."""
         return replace(self, nodes=Enclosed(-self.nodes.mid, self.nodes.rad), opposite=self)
 
@@ -306,9 +301,9 @@ class SupportIntegrals:
     """The integrals from 0 on of the support functions of some ``sides`` at the ``columns`` of ``l'F`` of one ``row``:
     one for every side."""
 
-    row: Adjoint
+    row: AdjointRow
     columns: slice
-    sides: Sequence[Side | Curve]
+    sides: Sequence[Side | CurvedSide]
 
     @cached_property
     def _polynomials(self) -> tuple[Array, Array, Array]:
@@ -360,18 +355,18 @@ class SupportIntegrals:
 @dataclass(frozen=True, eq=False)
 class Stopped:
     """A sum of rows of which each stays what it was at a time of its own: at the earlier of ``t`` and that time. In the
-    place of an `Adjoint`, at single times.
+    place of an `AdjointRow`, at single times.
 
     ``ways``: of an integral from ``a`` to ``b``, what of it measurable disturbances meet, backwards: its row for
     ``b - a``, and for ``a`` what has become of the row then, less the row. How long each is, and by how much that is
     rounded.
     """
 
-    parts: Sequence[tuple[Adjoint, float]]
-    ways: Sequence[tuple[Adjoint, float, float]] = ()
+    parts: Sequence[tuple[AdjointRow, float]]
+    ways: Sequence[tuple[AdjointRow, float, float]] = ()
 
     @staticmethod
-    def integral(parts: Sequence[tuple[Adjoint, float]], row: Array, begin: float, end: float) -> Stopped:
+    def integral(parts: Sequence[tuple[AdjointRow, float]], row: Array, begin: float, end: float) -> Stopped:
         """That of ``parts`` which are a row ``(d,)`` that is integrated from ``begin`` to ``end``."""
         from flint import arb, arb_mat
 
@@ -379,19 +374,19 @@ class Stopped:
         exact = arb_mat([[arb(float(v)) for v in row]])
         turned = exact * (motion.A * (arb(end) - arb(begin))).exp() - exact
         length, rounded = (part.item() for part in subtract_times(np.array([end]), begin))
-        return Stopped(parts, [(first, length, rounded), (Adjoint.of_balls(motion, turned.tolist()[0]), begin, 0.0)])
+        return Stopped(parts, [(first, length, rounded), (AdjointRow.of_balls(motion, turned.tolist()[0]), begin, 0.0)])
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> AdjointFlow:
         """What they share."""
         return self.parts[0][0].motion
 
     def at(self, times: Array) -> Enclosed:
-        """`Adjoint.at`."""
+        """`AdjointRow.at`."""
         return _sum([row.at(np.minimum(times, until)) for row, until in self.parts])
 
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
-        """`Adjoint.between`."""
+        """`AdjointRow.between`."""
         return _sum([row.between(np.minimum(times, until), start, stop) for row, until in self.parts])
 
 
@@ -441,7 +436,7 @@ class Worst:
     the last inputs of the ``adjoint``: constant between ``changes (M + 1,)``, or, where these are ``None``, measurable;
     the ``drives (q', L)`` between times ``grid (L + 1,)`` enter by the first."""
 
-    adjoint: Adjoint | Stopped
+    adjoint: AdjointRow | Stopped
     centre: Array
     begun: ConvexSet | None
     grid: Array
@@ -450,7 +445,7 @@ class Worst:
     changes: Array | None
 
     @property
-    def _row(self) -> Adjoint:
+    def _row(self) -> AdjointRow:
         """The one row that this is of, where it is known at all times."""
         if isinstance(self.adjoint, Stopped):
             raise Unchecked("a sum of rows that stop is known at single times alone")
@@ -620,7 +615,7 @@ class Worst:
     def cuts(self, more: Sequence[float]) -> Array:
         """Times between which no input jumps, and ``more``; no two are farther apart than a step."""
         parts = [np.asarray(more, dtype=float)]
-        if isinstance(self.adjoint, Adjoint):
+        if isinstance(self.adjoint, AdjointRow):
             parts.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
         parts += [self.grid] if self.drives.mid.any() else []
         parts += [self.changes] if self.pushed is not None and self.changes is not None else []

@@ -15,19 +15,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import around, identity, stacked
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.still import modes_at
-from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.deviations import Deviations, HeldDeviations
 from sparserob_core.checker.reach.preimages import Pushed
-from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
@@ -41,23 +40,8 @@ if TYPE_CHECKING:
 ORDER = 8  # of the states in the time on a cell; what comes after counts twice, half of it takes shorter cells
 
 
-def arb_of(value: float) -> arb:
-    """The ball of an exact number."""
-    from flint import arb
-
-    return arb(float(value))
-
-
-def middle(shape: ConvexSet) -> Array:
-    """The middle ``(d,)`` of a bounded set; of one without an interior floats next to it."""
-    found = shape.middle()  # any point of the set would be right: what is claimed is claimed of deviations from it
-    if known(shape).member(found) is None:
-        raise Unchecked(f"the middle of the {shape.kind} is not shown to be in it")
-    return found
-
-
 @dataclass(frozen=True, eq=False)
-class ClosedLoop:
+class VerifiedLoop:
     """A known system from ``initial_state`` under the ``nominal`` control, ``(m, 1)`` on each of its ``K`` pieces, and
     ``gains (K, K, m, d)``; ``grid``: every breakpoint; ``breakpoints``: those of the control; ``changes``: where the
     disturbance may jump; ``initial``: the set of deviations of the initial state; ``before (m,)``: what acts until a
@@ -76,84 +60,36 @@ class ClosedLoop:
     before: tuple[float, ...] = ()
     measured: Measurements | None = None
     observer: Array | None = None
-    law: Flow | None = None
+    law: VerifiedFlow | None = None
 
     @cached_property
-    def flow(self) -> Flow:
+    def flow(self) -> VerifiedFlow:
         """The flow of the system, its ``law`` where that is given."""
         until = self.grid[-1]
-        return Flow(Plant.of(self.system, until), until) if self.law is None else self.law
+        return VerifiedFlow(Plant.of(self.system, until), until) if self.law is None else self.law
 
     @cached_property
     def acting(self) -> list[float]:
         """When every piece of the control begins to act."""
         return [time + self.system.delay for time in self.breakpoints[:-1]]
 
-    @property
-    def blocks(self) -> int:
-        """How many blocks the disturbance has."""
-        return len(self.changes) if self.shape is not None else 0
-
-    @property
-    def width(self) -> int:
-        """How many entries a block has."""
-        return int(self.system.disturbances)
-
     @cached_property
-    def middle(self) -> Array:
-        """What deviations are counted from, ``(mw,)``."""
-        return np.zeros(self.width) if self.shape is None else middle(self.shape)
-
-    @cached_property
-    def sets(self) -> list[tuple[ConvexSet, Array]]:
-        """The set and the middle of every block of the deviations: those of the disturbance, that of the initial
-        state."""
-        held = [] if self.shape is None else [(self.shape, self.middle)] * self.blocks
-        noise = None if self.measured is None else self.measured.noise
-        held += [] if noise is None else [(noise, middle(noise))] * self.noises
-        return held if self.initial is None else [*held, (self.initial, middle(self.initial))]
-
-    @cached_property
-    def rests(self) -> list[list[arb]]:
-        """Of every block of the deviations one from its middle, to a point that is in its set whatever was rounded: 0
-        where the middle is."""
-        found: dict[int, list[arb]] = {}
-        for shape, about in self.sets:
-            if id(shape) not in found:
-                point = known(shape).member(about)
-                assert point is not None
-                found[id(shape)] = [x - m for x, m in zip(point, balls(about), strict=True)]
-        return [found[id(shape)] for shape, _ in self.sets]
-
-    @property
-    def noises(self) -> int:
-        """How many blocks the noise of the measurements has, after those of the disturbance."""
-        return 0 if self.measured is None or self.measured.noise is None else len(self.breakpoints) - 1
-
-    @property
-    def begun(self) -> int:
-        """The place of the block of the initial state, where there is one: the last."""
-        return self.blocks + self.noises
+    def deviations(self) -> Deviations:
+        """What the control may have to answer."""
+        noise, K = None if self.measured is None else self.measured.noise, len(self.breakpoints) - 1
+        width, noises = self.system.disturbances, 0 if noise is None else K
+        return HeldDeviations(self.shape, width, self.initial, len(self.changes), noise, noises)
 
     @property
     def outputs(self) -> int:
         """How many numbers an innovation has."""
         return int(self.system.states) if self.measured is None else self.measured.outputs
 
-    @cached_property
-    def starts(self) -> list[int]:
-        """Where the entries of every block begin, and how many there are."""
-        return [0, *accumulate(shape.dimension for shape, _ in self.sets)]
-
     def _places(self, piece: int) -> tuple[int, int]:
         """Of a piece of the grid the piece of the control that acts, -1 where the one before does, and the block of the
         disturbance."""
         inside = (self.grid[piece] + self.grid[piece + 1]) / 2
         return bisect_right(self.acting, inside) - 1, bisect_right(self.changes, inside) - 1
-
-    @property
-    def _identity(self) -> arb_mat:
-        return identity(self.system.states)
 
     def _moved(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         """What a part of a piece of the grid makes of the states at its beginning, and what is added by what drives
@@ -183,20 +119,20 @@ class ClosedLoop:
     def _observed(self, measured: Measurements) -> list[dict[int, arb_mat]]:
         """The innovations of the observer: its error goes on from breakpoint to breakpoint, less what it corrects."""
         assert self.observer is not None
-        C = stacked([[arb_of(v) for v in row] for row in np.asarray(measured.C)])
-        unit = stacked([[arb_of(i == j) for j in range(self.outputs)] for i in range(self.outputs)])
+        C = exactly(np.asarray(measured.C))
+        unit = identity(self.outputs)
         found: list[dict[int, arb_mat]] = []
         error: dict[int, arb_mat] = {}
         for j, entering in enumerate(self._entering):
             for block, push in entering.items():
                 error[block] = error[block] + push if block in error else push
             seen = {block: C * push for block, push in error.items()}
-            if self.noises:
-                seen[self.blocks + j] = unit
+            if self.deviations.begun > self.deviations.blocks:
+                seen[self.deviations.blocks + j] = unit
             found.append(seen)
             if j + 1 == len(self.breakpoints) - 1:
                 break
-            L, flow = stacked([[arb_of(v) for v in row] for row in self.observer[j]]), self._between[j]
+            L, flow = exactly(self.observer[j]), self._between[j]
             error = {block: flow * error[block] - L * push if block in error else -L * push
                      for block, push in seen.items()}  # fmt: skip
         return found
@@ -204,7 +140,7 @@ class ClosedLoop:
     @cached_property
     def _between(self) -> list[arb_mat]:
         """The flows from each breakpoint of the control to the next."""
-        found = [self._identity for _ in self.breakpoints[:-1]]
+        found = [identity(self.system.states) for _ in self.breakpoints[:-1]]
         for piece in range(len(self.grid) - 1):
             found[self.on(piece)] = self._passed(piece)[0] * found[self.on(piece)]
         return found
@@ -216,8 +152,8 @@ class ClosedLoop:
         K = len(self.breakpoints) - 1
         found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
-            found[0][self.begun] = self._identity
-        for piece in range(len(self.grid) - 1 if self.blocks else 0):
+            found[0][self.deviations.begun] = identity(self.system.states)
+        for piece in range(len(self.grid) - 1 if self.deviations.blocks else 0):
             k, (_, block) = self.on(piece), self._places(piece)
             if k + 1 >= K:
                 break
@@ -231,16 +167,14 @@ class ClosedLoop:
     @cached_property
     def effects(self) -> list[list[list[arb]]]:
         """``F_k (m, Q)``: how the control on each piece depends on the deviations."""
-        from flint import arb
-
-        m, zero, starts = self.gains.shape[2], arb(0), self.starts
+        m, zero, starts = self.gains.shape[2], ball(0), self.deviations.starts
         table = []
         for k in range(self.gains.shape[0]):
             rows = [[zero] * starts[-1] for _ in range(m)]
             for j in range(k + 1):
                 if not self.gains[k, j].any():
                     continue
-                M = stacked([[arb(float(v)) for v in row] for row in self.gains[k, j]])
+                M = exactly(self.gains[k, j])
                 for block, push in self.seen[j].items():
                     for i, row in enumerate((M * push).tolist()):
                         for b, value in enumerate(row):
@@ -252,12 +186,12 @@ class ClosedLoop:
     def drives(self) -> list[arb_mat]:
         """What acts on each piece of the grid, nominally and as answers: control, drift and disturbance, ``(m + mw, 1 +
         Q)``."""
-        found, none = [], [0.0] * self.starts[-1]
+        found, none = [], [0.0] * self.deviations.starts[-1]
         for piece in range(len(self.grid) - 1):
             k, block = self._places(piece)
             given = [balls([1.0, *none])] if self.flow.driven > self.system.controls else []
-            entering = [balls([middle, *none]) for middle in self.middle.tolist()]
-            if self.blocks:
+            entering = [balls([middle, *none]) for middle in self.deviations.middle.tolist()]
+            if self.deviations.blocks:
                 self._entered(entering, block)
             found.append(stacked([*self.inputs(k).tolist(), *given, *entering]))
         return found
@@ -265,7 +199,7 @@ class ClosedLoop:
     def _entered(self, rows: list[list[arb]], block: int) -> None:
         """Add a block of the disturbance to what acts, row by row."""
         for i, row in enumerate(rows):
-            place = 1 + block * self.width + i
+            place = 1 + block * self.system.disturbances + i
             row[place] = row[place] + 1
 
     def _ended(self, piece: int, state: arb_mat) -> arb_mat:
@@ -275,14 +209,12 @@ class ClosedLoop:
     @cached_property
     def nodes(self) -> list[arb_mat]:
         """The nominal state and every response at the breakpoints of the grid, ``(d, 1 + Q)``."""
-        from flint import arb
-
-        begin, answers = [arb(float(v)) for v in self.initial_state], self._identity.tolist()
+        begin, answers = [ball(v) for v in self.initial_state], identity(self.system.states).tolist()
         if self.initial is None:
             answers = [[] for _ in begin]
         else:
-            begin = [v + arb(float(m)) for v, m in zip(begin, self.sets[-1][1], strict=True)]
-        zero = [arb(0)] * self.starts[self.begun]
+            begin = [v + ball(m) for v, m in zip(begin, self.deviations.sets[-1][1], strict=True)]
+        zero = [ball(0)] * self.deviations.starts[self.deviations.begun]
         found = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, ends in enumerate(pairwise(self.grid)):
             Phi, added = self._moved(piece, *ends)
@@ -298,39 +230,16 @@ class ClosedLoop:
         Phi, added = self._moved(piece, self.grid[piece], time)
         return Phi * self.nodes[piece] + added
 
-    @cached_property
-    def radii(self) -> Array:
-        """How far each entry of a deviation comes from 0, ``(Q,)``, rounded up."""
-        far = [np.array(known(shape).radius) + np.abs(about) for shape, about in self.sets]
-        return np.nextafter(np.concatenate([np.zeros(0), *far]) * OUTWARD, np.inf)
-
-    def support(self, a: list[arb]) -> arb:
-        """``max z'a`` over all deviations, ``a (Q,)`` in balls."""
-        from flint import arb
-
-        total = arb(0)
-        for first, (shape, about) in zip(self.starts, self.sets, strict=False):
-            block = a[first : first + shape.dimension]
-            if any(not x.is_zero() for x in block):
-                total = total + known(shape).support(block)
-                for x, m in zip(block, about, strict=True):
-                    total = total - x * arb(float(m)) if m else total
-        return total
-
     def inputs(self, k: int) -> arb_mat:
         """The nominal control and its answers on a piece of it, ``(m, 1 + Q)``; on piece -1 the control before."""
-        from flint import arb
-
-        none = [arb(0)] * self.starts[-1]
+        none = [ball(0)] * self.deviations.starts[-1]
         if k < 0:
-            return stacked([[arb(float(v)), *none] for v in self.before])
+            return stacked([[ball(v), *none] for v in self.before])
         return stacked([[v, *row] for v, row in zip(self.nominal[k].entries(), self.effects[k], strict=True)])
 
     def answers(self, k: int) -> arb_mat:
         """The answers on a piece of the control without what is nominal, ``(m, 1 + Q)``, the first column 0."""
-        from flint import arb
-
-        return stacked([[arb(0), *row] for row in self.effects[k]])
+        return stacked([[ball(0), *row] for row in self.effects[k]])
 
     def on(self, piece: int) -> int:
         """The piece of the control that is commanded on a piece of the grid: the one that acts, where there is no
@@ -342,7 +251,8 @@ class ClosedLoop:
         what stands ``beside`` it, ``(r, 1 + Q)``."""
         product = exactly(rows) * state
         along = (product if beside is None else product + beside).tolist()
-        return [row[0] + self.support(row[1:]) for row in along]
+        most = self.deviations.supports([row[1:] for row in along])
+        return [row[0] + more for row, more in zip(along, most, strict=True)]
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         """`heights` at a time in a piece of the grid."""
@@ -354,7 +264,7 @@ class ClosedLoop:
         s^n`` is at most ``(n - 1) n^(-n / (n - 1)) |a|`` from its chord."""
         terms, off = self.flow.within(start, stop, start, stop, ORDER + 1)
         both = stacked([*self.state(piece, start).tolist(), *self.drives[piece].tolist()])
-        line, sizes = exactly(rows), np.concatenate([[1.0], self.radii])
+        line, sizes = exactly(rows), np.concatenate([[1.0], self.deviations.radii])
         total = np.zeros((line.nrows(), sizes.size))
         for n, term in enumerate(terms[2:], 2):
             found = Enclosed.of(line * (term.matrix * both))
@@ -363,10 +273,3 @@ class ClosedLoop:
         found = Enclosed.of(line * (around(off) * both))
         total += 2.0 * (np.abs(found.mid) + found.rad)
         return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)
-
-
-def exactly(rows: Array | arb_mat) -> arb_mat:
-    """Rows of floats as balls."""
-    from flint import arb
-
-    return stacked([[arb(float(v)) for v in row] for row in rows]) if isinstance(rows, np.ndarray) else rows

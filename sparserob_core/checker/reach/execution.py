@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Clock
-from sparserob_core.checker.reach.adjoint import Adjoint, Motion, SupportIntegrals, subtract_times
-from sparserob_core.checker.reach.kernels import MissedHere
+from sparserob_core.checker.reach.adjoint import AdjointFlow, AdjointRow, SupportIntegrals, subtract_times
+from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Execution(MissedHere):
+class FollowedExecution(BoundedInputHere):
     """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
     none where only rows are asked for."""
 
@@ -39,25 +40,21 @@ class Execution(MissedHere):
     breakpoints: Array
     pieces: Sequence[arb_mat]
     clock: Clock = field(default_factory=Clock)
-    _known: dict[bytes, SupportIntegrals] = field(default_factory=dict, repr=False)
 
     @cached_property
-    def motion(self) -> Motion:
+    def motion(self) -> AdjointFlow:
         """What the rows share, with ``B`` as far as errors enter by it."""
         (mode,) = modes_at(self.problem.system, [])
         A, B, m = mode["A"], mode["B"], self.shares.size
         B = stacked([[x * (i not in self.problem.commanded) for x in row[:m]] for i, row in enumerate(B.tolist())])
-        return Motion.of(A, B, float(self.breakpoints[-1]), self.clock)
+        return AdjointFlow.of(A, B, float(self.breakpoints[-1]), self.clock)
 
+    @remembered(key=lambda self, c: min((c + 0.0).tobytes(), (0.0 - c).tobytes()))
     def absolute(self, c: Array) -> SupportIntegrals:
         """The integrals of ``|c'e^{A s} B_j|`` of a direction ``c (d,)``, which is exact; its opposite has the same."""
-        exact = c + 0.0
-        key = min(exact.tobytes(), (0.0 - exact).tobytes())
-        if key not in self._known:
-            ends = np.eye(self.shares.size)
-            sides = [Side(np.stack([one, -one]), 0.0 * ends[:2]) for one in ends]
-            self._known[key] = SupportIntegrals(Adjoint.of(self.motion, exact), slice(None), sides)
-        return self._known[key]
+        ends = np.eye(self.shares.size)
+        sides = [Side(np.stack([one, -one]), 0.0 * ends[:2]) for one in ends]
+        return SupportIntegrals(AdjointRow.of(self.motion, c + 0.0), slice(None), sides)
 
     def integrals(self, c: Array, times: Array, points: Array) -> tuple[Array, Array]:
         """``F_j`` at the ages ``times (k,)`` minus ``points (q,)``, exactly, between ``(k, q, m)`` and ``(k, q, m)``; 0

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.series import Series
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.reach.closed_loop import ORDER, exactly
+from sparserob_core.checker.arithmetic.series import exactly
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.reach.closed_loop import ORDER
 from sparserob_core.checker.reach.states import enclosed
 from sparserob_core.checker.reach.tube import Around
 from sparserob_core.checker.sets.parameters import Corners
@@ -32,12 +32,12 @@ class Added(NamedTuple):
     wide: Array
 
 
-class Missed(ABC):
+class BoundedInput(ABC):
     """What enters at any time and is known by its size alone: errors of execution, and measurable disturbances about
     the middle of their set."""
 
     @abstractmethod
-    def at(self, parameter: Sequence[float]) -> MissedHere:
+    def at(self, parameter: Sequence[float]) -> BoundedInputHere:
         """That at one parameter, of which there may be none."""
 
     @abstractmethod
@@ -46,8 +46,8 @@ class Missed(ABC):
         parameters with the monomials on it."""
 
 
-class MissedHere(Missed):
-    """`Missed` of a known system."""
+class BoundedInputHere(BoundedInput):
+    """`BoundedInput` of a known system."""
 
     @abstractmethod
     def added(self, c: Array, time: float) -> tuple[float, float]:
@@ -61,19 +61,19 @@ class MissedHere(Missed):
     def bent(self, c: Array, start: float, stop: float) -> float:
         """How far `added` may be above its chord on ``[start, stop]``, which lies within one piece and one segment."""
 
-    def at(self, parameter: Sequence[float]) -> MissedHere:
-        """`Missed.at`."""
+    def at(self, parameter: Sequence[float]) -> BoundedInputHere:
+        """`BoundedInput.at`."""
         return self
 
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
-        """`Missed.over`."""
+        """`BoundedInput.over`."""
         ends = np.array([self.added(c, time) for time in times])
         off = float((ends[:, 1] - ends[:, 0]).max())
         bent = self.bent(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
         return Added(ends.mean(axis=1)[:, None], off + bent, 0.0, np.zeros(0))
 
 
-def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:
+def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
     """What some ``columns`` of ``[B E]`` make, at any time of an interval without marks, of the state at its end, times
     its length: coefficients ``(p + 1, M, d, m)`` of powers of ``u`` from -1 to 1 across what is left of it."""
     from flint import arb, arb_mat
@@ -88,7 +88,7 @@ def pushes(law: Flow, start: float, stop: float, columns: slice) -> Enclosed:
 
 
 def above_chord(
-    law: Flow, rows: Array | arb_mat, start: float, stop: float, begun: Array, size: Array, first: int
+    law: VerifiedFlow, rows: Array | arb_mat, start: float, stop: float, begun: Array, size: Array, first: int
 ) -> Array:
     """How far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to the time may be above their chords on ``[start,
     stop]``, which lies between two marks, for ``rows (r, d)``: ``(r,)``, at every parameter. Of every state they are at
@@ -105,7 +105,7 @@ def above_chord(
     terms, off = law.within(start, stop, start, stop, ORDER + 1)
     total = 2.0 * (far @ off[:, :d]) @ begun
     for n, term in enumerate(terms[2:], 2):
-        found = enclosed([Series(term.monomials, [lines * part for part in term.columns(0, d).parts])])
+        found = enclosed([term.columns(0, d).along(lines)])
         total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(found.mid) + found.rad).sum(axis=(0, 1)) @ begun)
     if size.any():
         most, slope, units = law.sizes(start, stop)

@@ -9,7 +9,7 @@ is best there stands for all, and where another one could be better, by how much
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, final
@@ -17,12 +17,15 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
+from sparserob_core.checker.arithmetic.remembered import remembered
+from sparserob_core.checker.arithmetic.series import identity, stacked
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
+from sparserob_core.checker.reach.deviations import Deviations, of_block, rounded_radii
 from sparserob_core.checker.reach.kernels import above_chord, pushes
-from sparserob_core.checker.sets.along import Curve
+from sparserob_core.checker.sets.along import CurvedSide
 from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -45,7 +48,7 @@ class Side:
     rad: Array
 
     @staticmethod
-    def of(shape: ConvexSet) -> list[Side | Curve]:
+    def of(shape: ConvexSet) -> list[Side | CurvedSide]:
         """Those of a set, counted from its middle: of a box one for every channel, of a zonotope one for every segment,
         a curved one as it is."""
         from flint import arb, fmpq
@@ -66,7 +69,7 @@ class Side:
             exact = [[arb(fmpq(x.numerator, x.denominator)) for x in corner] for corner in seen.corners]
             found = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
         else:
-            curved = Curve(seen, middle(shape))
+            curved = CurvedSide(seen, middle(shape))
             _ = curved.far  # of a set that is not known it is `Unchecked`
             return [curved]
         return [Side(one.mid, one.rad) for one in (Enclosed.of(stacked(rows)) for rows in found)]
@@ -95,7 +98,7 @@ class Side:
 class Together:
     """The sum of several ``sides``, of which there is at least one: its support function is the sum of theirs."""
 
-    sides: Sequence[Side | Curve]
+    sides: Sequence[Side | CurvedSide]
 
     @property
     def dimension(self) -> int:
@@ -117,7 +120,7 @@ class Together:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Kernel:
+class VerifiedKernel:
     """``Phi(end, s) E(s)`` for the time ``r`` that is left of an interval at ``s``, on parts one after another, as
     polynomials of ``u`` from -1 to 1 across each, times its length: coefficients ``(S, p + 1, d, mw)``, all together
     off by at most ``off (S, d, mw)``."""
@@ -139,7 +142,7 @@ class Kernel:
         off = (off + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
         return plain, off
 
-    def most(self, a: Enclosed, sides: Sequence[Side | Curve]) -> Enclosed:
+    def most(self, a: Enclosed, sides: Sequence[Side | CurvedSide]) -> Enclosed:
         """The integral of the support function of ``K(r)'a`` for ``a (N, d)``: between bounds, as a middle and a radius
         ``(N,)``."""
         size, count = np.abs(a.mid), self.count
@@ -228,117 +231,80 @@ def _equal(P: Array, start: Array, stop: Array) -> Array:
     return np.asarray(np.where(crossing & (cut > start + least) & (cut < stop - least), cut, middle_of))
 
 
+@final
 @dataclass(frozen=True, eq=False)
-class MeasurableLoop(ClosedLoop):
-    """`ClosedLoop` under measurable disturbances. Its deviations are what they make of the state by the end of every
-    piece of the grid, ``(d,)`` each, and that of the initial state."""
+class MeasurableDeviations(Deviations):
+    """What measurable disturbances make of the state by the end of every piece of the ``grid``, ``(d,)`` each, through
+    a ``flow``; and the deviation of the initial state."""
 
-    _ways: dict[tuple[object, ...], Kernel] = field(default_factory=dict, repr=False)
+    flow: VerifiedFlow
+    grid: list[float]
 
     @property
     def blocks(self) -> int:
         return len(self.grid) - 1
 
-    @cached_property
-    def sets(self) -> list[tuple[ConvexSet, Array]]:
-        """That of the initial state only."""
-        return [] if self.initial is None else [(self.initial, middle(self.initial))]
+    @property
+    def begun(self) -> int:
+        return self.blocks
 
     @cached_property
     def starts(self) -> list[int]:
-        d = self.system.states
-        return [0, *accumulate([d] * (self.blocks + (self.initial is not None)))]
+        return [0, *accumulate([self.flow.states] * (self.blocks + len(self.sets)))]
 
     @cached_property
-    def sides(self) -> list[Side | Curve]:
-        """The sets of the deviations, which add up."""
+    def sets(self) -> list[tuple[ConvexSet, Array]]:
+        return [] if self.initial is None else [(self.initial, middle(self.initial))]
+
+    @cached_property
+    def sides(self) -> list[Side | CurvedSide]:
+        """The sets of the disturbances, which add up."""
         assert self.shape is not None
         return Side.of(self.shape)
 
-    def kernel(self, piece: int) -> Kernel:
+    def kernel(self, piece: int) -> VerifiedKernel:
         """That of a piece."""
-        return self._way(self.grid[piece], self.grid[piece + 1])
+        return self.way(self.grid[piece], self.grid[piece + 1])
 
-    def _way(self, start: float, stop: float) -> Kernel:
+    @remembered(lambda: KEPT, lambda self, start, stop: self.flow.alike(start, stop))
+    def way(self, start: float, stop: float) -> VerifiedKernel:
         """The kernel of an interval, whose parts are those between marks, in shares of each."""
-        key = self.flow.alike(start, stop)
-        if key not in self._ways:
-            if len(self._ways) >= KEPT:
-                self._ways.clear()
-            every, onward = list[Enclosed](), self._identity
-            columns = slice(self.flow.driven, self.flow.driven + self.width)
-            for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
-                terms = pushes(self.flow, first, last, columns)
-                every.append(product(Enclosed.of(onward), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
-                onward = onward * self.flow.over(first, last)[0].matrix
-            most = max(len(one.mid) for one in every)
-            mid, rad = (
-                np.array([np.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in parts])
-                for parts in zip(*((one.mid, one.rad) for one in every), strict=True)
-            )
-            self._ways[key] = Kernel(mid, rad.sum(axis=1) * OUTWARD)
-        return self._ways[key]
-
-    @cached_property
-    def seen(self) -> list[dict[int, arb_mat]]:
-        K = len(self.breakpoints) - 1
-        found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
-        if self.initial is not None:
-            found[0][self.blocks] = self._identity
-        later: tuple[int, arb_mat] = (K, self._identity)  # the piece of the control, and what is left of it
-        for piece in reversed(range(self.blocks)):
-            k = self.on(piece)
-            left = later[1] if later[0] == k else self._identity
-            if k + 1 < K:
-                found[k + 1][piece] = left
-            later = k, left * self._passed(piece)[0]
-        return found
-
-    def _entered(self, rows: list[list[arb]], block: int) -> None:
-        """Nothing: what happens within a piece counts at its end."""
-
-    def _ended(self, piece: int, state: arb_mat) -> arb_mat:
-        rows, unit = state.tolist(), self._identity
-        for i, row in enumerate(rows):
-            for j in range(len(rows)):
-                row[1 + self.starts[piece] + j] = row[1 + self.starts[piece] + j] + unit[i, j]
-        return stacked(rows)
-
-    def state(self, piece: int, time: float) -> arb_mat:
-        """The nominal state and every response at a time in a piece of the grid, before what happens in it counts."""
-        if time == self.grid[piece]:
-            return self.nodes[piece]
-        Phi, added = self._moved(piece, self.grid[piece], time)
-        return Phi * self.nodes[piece] + added
+        every, onward = list[Enclosed](), identity(self.flow.states)
+        columns = slice(self.flow.driven, self.flow.driven + self.width)
+        for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
+            terms = pushes(self.flow, first, last, columns)
+            every.append(product(Enclosed.of(onward), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
+            onward = onward * self.flow.over(first, last)[0].matrix
+        most = max(len(one.mid) for one in every)
+        mid, rad = (
+            np.array([np.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in parts])
+            for parts in zip(*((one.mid, one.rad) for one in every), strict=True)
+        )
+        return VerifiedKernel(mid, rad.sum(axis=1) * OUTWARD)
 
     @cached_property
     def radii(self) -> Array:
-        d = self.system.states
+        d = self.flow.states
         axes = np.vstack([np.eye(d), -np.eye(d)])
         exact = Enclosed(axes, np.zeros_like(axes))
-        alike: dict[int, tuple[Kernel, Array]] = {}  # kernels are kept with their numbers
-        found = []
+        alike: dict[int, tuple[VerifiedKernel, Array]] = {}  # kernels are kept with their numbers
+        found = list[Array]()
         for piece in range(self.blocks):
             kernel = self.kernel(piece)
             if id(kernel) not in alike:
                 ends = kernel.most(exact, self.sides)
                 alike[id(kernel)] = kernel, (ends.mid + ends.rad).reshape(2, d).max(axis=0)
             found.append(alike[id(kernel)][1])
-        found += [np.array(known(shape).radius) + np.abs(about) for shape, about in self.sets]
-        return np.nextafter(np.concatenate(found) * OUTWARD, np.inf)
+        return rounded_radii(found, self.sets)
 
-    def support(self, a: list[arb]) -> arb:
-        return self.supports([a])[0]
-
-    def supports(self, every: list[list[arb]]) -> list[arb]:
-        """`support` of several, ``(n, Q)``."""
+    def supports(self, every: Sequence[list[arb]]) -> list[arb]:
         from flint import arb
 
-        d, blocks = self.system.states, self.blocks
+        d, blocks = self.flow.states, self.blocks
         table = Enclosed.of(stacked(every))
         mid, rad = (part[:, : blocks * d].reshape(len(every), blocks, d) for part in (table.mid, table.rad))
         rad = np.where(rad > 1e-290, rad, 0.0)  # of exact zeros
-        alike: dict[int, tuple[Kernel, list[int]]] = {}
+        alike: dict[int, tuple[VerifiedKernel, list[int]]] = {}
         for piece in range(blocks):
             kernel = self.kernel(piece)
             alike.setdefault(id(kernel), (kernel, []))[1].append(piece)
@@ -352,17 +318,53 @@ class MeasurableLoop(ClosedLoop):
             for place, m, r in zip((used // len(pieces)).tolist(), found.mid.tolist(), found.rad.tolist(), strict=True):
                 total[place] = total[place] + arb(m, r)
         for shape, about in self.sets:
-            for n, a in enumerate(every):
-                block = a[blocks * d :]
-                if any(not x.is_zero() for x in block):
-                    off = sum((x * arb(float(m)) for x, m in zip(block, about, strict=True)), arb(0))
-                    total[n] = total[n] + known(shape).support(block) - off
+            total = [one + of_block(shape, about, a[blocks * d :]) for one, a in zip(total, every, strict=True)]
         return total
 
-    def heights(self, state: arb_mat, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
-        product = exactly(rows) * state
-        along = (product if beside is None else product + beside).tolist()
-        return [row[0] + more for row, more in zip(along, self.supports([row[1:] for row in along]), strict=True)]
+
+@final
+@dataclass(frozen=True, eq=False)
+class MeasurableLoop(VerifiedLoop):
+    """`VerifiedLoop` under measurable disturbances."""
+
+    @cached_property
+    def deviations(self) -> MeasurableDeviations:
+        return MeasurableDeviations(self.shape, self.system.disturbances, self.initial, self.flow, self.grid)
+
+    @cached_property
+    def seen(self) -> list[dict[int, arb_mat]]:
+        K = len(self.breakpoints) - 1
+        found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
+        if self.initial is not None:
+            found[0][self.deviations.blocks] = identity(self.system.states)
+        later: tuple[int, arb_mat] = (
+            K,
+            identity(self.system.states),
+        )  # the piece of the control, and what is left of it
+        for piece in reversed(range(self.deviations.blocks)):
+            k = self.on(piece)
+            left = later[1] if later[0] == k else identity(self.system.states)
+            if k + 1 < K:
+                found[k + 1][piece] = left
+            later = k, left * self._passed(piece)[0]
+        return found
+
+    def _entered(self, rows: list[list[arb]], block: int) -> None:
+        """Nothing: what happens within a piece counts at its end."""
+
+    def _ended(self, piece: int, state: arb_mat) -> arb_mat:
+        rows, unit = state.tolist(), identity(self.system.states)
+        for i, row in enumerate(rows):
+            for j in range(len(rows)):
+                row[1 + self.deviations.starts[piece] + j] = row[1 + self.deviations.starts[piece] + j] + unit[i, j]
+        return stacked(rows)
+
+    def state(self, piece: int, time: float) -> arb_mat:
+        """The nominal state and every response at a time in a piece of the grid, before what happens in it counts."""
+        if time == self.grid[piece]:
+            return self.nodes[piece]
+        Phi, added = self._moved(piece, self.grid[piece], time)
+        return Phi * self.nodes[piece] + added
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         from flint import arb
@@ -375,12 +377,15 @@ class MeasurableLoop(ClosedLoop):
 
     def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
         """What disturbances on a piece make of ``rows (r, d)`` at most until a time in it."""
-        return self._way(self.grid[piece], time).most(as_enclosed(rows), self.sides)
+        return self.deviations.way(self.grid[piece], time).most(as_enclosed(rows), self.deviations.sides)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
-        """As of `ClosedLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
+        """As of `VerifiedLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
         axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
-        begun, size = np.zeros(len(axes)), sum((side.far for side in self.sides), np.zeros(self.width))
+        begun, size = (
+            np.zeros(len(axes)),
+            sum((side.far for side in self.deviations.sides), np.zeros(self.deviations.width)),
+        )
         if start > self.grid[piece]:
             ends = self.under_way(piece, start, axes)
             begun = np.maximum(ends.mid + ends.rad, 0.0) * OUTWARD

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
-from sparserob_core.checker.arithmetic.balls import spanning
+from sparserob_core.checker.arithmetic.balls import ball, spanning
 from sparserob_core.checker.arithmetic.series import middles, stacked
 from sparserob_core.checker.flow.units import scaled
 from sparserob_core.checker.outcome import Unchecked
@@ -87,7 +87,7 @@ def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenDeviations:
     """What some innovations see of some blocks: ``matrix``, and which of its entries may be other than 0, ``pattern``.
     ``rows``: of every group of rows, one for each innovation, where it ends and how many of it are independent at most;
     ``columns``: the same for each block. ``reach``: how far every column deviates, all alike unless given."""
@@ -158,9 +158,7 @@ def _groups(groups: Sequence[tuple[int, int]], count: int) -> list[int]:
 
 def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
     """The columns of a matrix at these places of ``count``, 0 at the others."""
-    from flint import arb
-
-    zero, found = arb(0), []
+    zero, found = ball(0), []
     for row in matrix.tolist():
         given = dict(zip(places, row, strict=True))
         found.append([given.get(i, zero) for i in range(count)])

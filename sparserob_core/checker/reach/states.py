@@ -11,21 +11,41 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
-from sparserob_core.checker.arithmetic.series import Series, identity, stacked
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.segment import Powers, Segment, shifted
-from sparserob_core.checker.reach.scene import Scene
+from sparserob_core.checker.arithmetic.remembered import remembered
+from sparserob_core.checker.arithmetic.series import Series, exactly, identity, stacked
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.flows import VerifiedFlows
+from sparserob_core.checker.flow.law import ParameterBox
+from sparserob_core.checker.flow.segment import Powers, VerifiedSegment, shifted
+from sparserob_core.checker.problem.lasting import Lasting
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
-    from flint import arb
+    from flint import arb_mat
 
 PATHS_KEPT = 256  # intervals of which the states are remembered
+BOXES_KEPT = 8  # of parameters, over which states are remembered
 EFFECTS_KEPT = 16  # marks, at which the effect of every piece before is remembered; cells come one after another
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of ``x(0)`` and the set
+    of deviations from it, and the disturbance: its set and the breakpoints between which it is constant, of which some
+    components may be ``lasting`` longer."""
+
+    grid: list[float]
+    control: list[arb_mat]
+    initial_state: list[float]
+    disturbance: ConvexSet | None
+    changes: list[float]
+    initial_set: ConvexSet | None = None
+    lasting: Lasting | None = None
 
 
 @final
@@ -33,7 +53,7 @@ EFFECTS_KEPT = 16  # marks, at which the effect of every piece before is remembe
 class States:
     """What a ``flow`` makes of a ``scene``."""
 
-    flow: Flow
+    flow: VerifiedFlow
     scene: Scene
     _tables: dict[int, tuple[Series, Series]] = field(default_factory=dict, repr=False)
     _floats: dict[int, Enclosed] = field(default_factory=dict, repr=False)
@@ -43,9 +63,6 @@ class States:
     _driven: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
     _made: dict[tuple[int, ...], Series] = field(default_factory=dict, repr=False)
     _inputs: dict[int, Series] = field(default_factory=dict, repr=False)
-    _paths: dict[int, Powers] = field(default_factory=dict, repr=False)
-    _rows: dict[tuple[int, bytes], tuple[Lines, Segment]] = field(default_factory=dict, repr=False)
-    _effects: dict[int, tuple[Enclosed, Enclosed]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def marks(self) -> list[float]:
@@ -94,26 +111,23 @@ class States:
                 self._made[key] = (
                     self._tables[self._block(level - 1, last)][0] * parts[0] + parts[1]
                     if level
-                    else self._inputs[block].applied(u)
+                    else self._inputs[block].scaled(u)
                 )
             self._driven[level, number] = self._made[key]
         return self._driven[level, number]
 
+    @remembered(lambda: EFFECTS_KEPT)
     def effect(self, mark: int) -> tuple[Enclosed, Enclosed]:
         """What the state at 0, ``(M, d, d)``, and the disturbance on every interval before a mark, ``(M, d, mark mw)``,
         made of the state there: by blocks of 1, 2, 4, ... intervals, each carried on by those that follow it."""
-        if mark not in self._effects:
-            d, blocks = self.flow.states, [self._block(*one) for one in _blocks(mark)]
-            monomials = self.flow.monomials
-            after, found = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
-            for block in reversed(blocks):
-                found.insert(1, ring(monomials, single(after), self._floats[block]))
-                after = after * self._tables[block][0]
-            mid, rad = (np.concatenate([getattr(one, name) for one in found], axis=2) for name in ("mid", "rad"))
-            if len(self._effects) >= EFFECTS_KEPT:
-                self._effects.clear()
-            self._effects[mark] = single(after), Enclosed(mid, rad)
-        return self._effects[mark]
+        d, blocks = self.flow.states, [self._block(*one) for one in _blocks(mark)]
+        monomials = self.flow.monomials
+        after, found = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
+        for block in reversed(blocks):
+            found.insert(1, ring(monomials, single(after), self._floats[block]))
+            after = after * self._tables[block][0]
+        mid, rad = (np.concatenate([getattr(one, name) for one in found], axis=2) for name in ("mid", "rad"))
+        return single(after), Enclosed(mid, rad)
 
     def _block(self, level: int, number: int) -> int:
         """The number of what ``2^level`` intervals in a row make of the state before them, and of the disturbances on
@@ -151,11 +165,11 @@ class States:
         flow, scene, d, m = self.flow, self.scene, self.flow.states, self.flow.driven
         begin, end, order = self.marks[place], self.marks[place + 1], 1 if start == stop else order
         segment, share = flow.segment(begin, end)
-        first, width = ((_exact(b) - _exact(a)) / (_exact(end) - _exact(begin)) * share
+        first, width = ((ball(b) - ball(a)) / (ball(end) - ball(begin)) * share
                         for a, b in ((begin, start), (start, stop)))  # fmt: skip
         terms, off = self._path(place).within(first, width, order)
-        rows = stacked([balls(row) for row in basis])
-        state = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in terms])
+        rows = exactly(basis)
+        state = enclosed([one.along(rows) for one in terms])
         state.rad[0, 0] += np.abs(basis) @ off * OUTWARD
         lines = self._lines(segment, basis).shifted(float(first), float(width), order)
         carried, found = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
@@ -178,24 +192,17 @@ class States:
             found.append((scene.initial_set, Enclosed(*(np.swapaxes(p, 2, 3)[None] for p in (begun.mid, begun.rad)))))
         return Enclosed(state.mid[..., 0], state.rad[..., 0]), found
 
+    @remembered(lambda: PATHS_KEPT)
     def _path(self, place: int) -> Powers:
         """The undisturbed state from one mark to the next, ``(d, 1)``."""
-        if place not in self._paths:
-            if len(self._paths) >= PATHS_KEPT:
-                self._paths.clear()
-            segment, _ = self.flow.segment(self.marks[place], self.marks[place + 1])
-            control = self.scene.control[min(self.pieces[place], len(self.scene.control) - 1)]
-            self._paths[place] = segment.applied(self.node(place).above(control))
-        return self._paths[place]
+        segment, _ = self.flow.segment(self.marks[place], self.marks[place + 1])
+        control = self.scene.control[min(self.pieces[place], len(self.scene.control) - 1)]
+        return segment.applied(self.node(place).above(control))
 
-    def _lines(self, segment: Segment, basis: Array) -> Lines:
+    @remembered(lambda: PATHS_KEPT, lambda self, segment, basis: (segment, basis.tobytes()))
+    def _lines(self, segment: VerifiedSegment, basis: Array) -> Lines:
         """Rows of a segment."""
-        key = id(segment), basis.tobytes()
-        if key not in self._rows:
-            if len(self._rows) >= PATHS_KEPT:
-                self._rows.clear()
-            self._rows[key] = Lines.of(segment, basis), segment  # which is kept with its number
-        return self._rows[key][0]
+        return Lines.of(segment, basis)
 
     def blur(self, place: int) -> Array:
         """About how much of the state at a mark, ``(d,)``, is due to the size of the box of parameters and unknown."""
@@ -212,6 +219,23 @@ class States:
 
 @final
 @dataclass(frozen=True, eq=False)
+class StatesOverBoxes:
+    """The states that a ``scene`` reaches over boxes of parameters; those over the latest ones are remembered."""
+
+    flows: VerifiedFlows
+    scene: Scene
+
+    def over(self, box: ParameterBox) -> States:
+        """The states over a box, or over a larger one."""
+        return self._of(self.flows.holding(box))
+
+    @remembered(lambda: BOXES_KEPT)
+    def _of(self, flow: VerifiedFlow) -> States:
+        return States(flow, self.scene)
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Lines:
     """Rows of the terms of a segment, ``(N, M, b, d + w)``, and by how much they are ``off`` at any share of it, ``(b,
     d + w)``; ``sizes (N, b, d + w)``: how large the terms are at every parameter."""
@@ -221,10 +245,10 @@ class Lines:
     sizes: Array
 
     @staticmethod
-    def of(segment: Segment, basis: Array) -> Lines:
+    def of(segment: VerifiedSegment, basis: Array) -> Lines:
         """Those of a ``basis (b, d)``."""
-        rows = stacked([balls(row) for row in basis])
-        terms = enclosed([Series(one.monomials, [rows * part for part in one.parts]) for one in segment.terms])
+        rows = exactly(basis)
+        terms = enclosed([one.along(rows) for one in segment.terms])
         return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.powers.sizes * OUTWARD)
 
     def shifted(self, first: float, width: float, order: int) -> Enclosed:
@@ -236,12 +260,6 @@ class Lines:
         rad = np.tensordot(kept, self.terms.rad + rounding(20 * count) * size, axes=1)
         rad[0, 0] += self.off + np.tensordot(table[order:].sum(axis=0), self.sizes, axes=1)
         return Enclosed(mid, rad * OUTWARD)
-
-
-def _exact(value: float) -> arb:
-    from flint import arb
-
-    return arb(value)
 
 
 def _blocks(mark: int) -> list[tuple[int, int]]:

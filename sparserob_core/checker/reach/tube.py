@@ -1,23 +1,31 @@
-"""The worst case of ``c'x(t)`` over every disturbance and initial state, on cells of time and over one box of
-parameters, as polynomials with an error."""
+"""The worst case of ``c'x(t)`` over all deviations, on cells of time, as polynomials with an error: over one box of
+parameters; of a loop that answers close; and of what has places in place of times."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import comb
-from typing import NamedTuple, final
+from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import ball
+from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
-from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.flow.law import Box
+from sparserob_core.checker.arithmetic.remembered import remembered
+from sparserob_core.checker.arithmetic.series import exactly, stacked
+from sparserob_core.checker.flow.law import ParameterBox
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.supports import bounded
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, lengths, rounding
+from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
 
 ORDER = 6  # of polynomials in the time on a cell: half of it takes shorter cells, twice it takes longer for each
 CELLS_KEPT = 20_000  # of which rows are remembered: those of a box are asked for again in its parts
@@ -53,7 +61,7 @@ class Around(NamedTuple):
 
 @final
 @dataclass(eq=False)
-class Rows:
+class ProjectedStates:
     """The ``states`` along the rows of a ``basis (b, d)``."""
 
     states: States
@@ -74,12 +82,12 @@ class Rows:
 
 @final
 @dataclass(eq=False)
-class Tube:
+class VerifiedTube:
     """The reachable states over a ``box`` of parameters, seen along combinations of ``rows``, which are known over that
     box or one that holds it."""
 
-    rows: Rows
-    box: Box = Box()  # noqa: RUF009  immutable
+    rows: ProjectedStates
+    box: ParameterBox = ParameterBox()  # noqa: RUF009  immutable
 
     @cached_property
     def flow(self) -> Around:
@@ -91,8 +99,6 @@ class Tube:
     def _recentred(self) -> Enclosed | None:
         """What makes of coefficients about the middle of the larger box those on this one, ``(M, M)``; ``None`` where
         these are the same."""
-        from flint import arb
-
         whole = self.rows.states.flow.box
         if whole == self.box:
             return None
@@ -100,14 +106,14 @@ class Tube:
         for middle, half, centre, width in zip(
             self.box.middle, self.box.halves, whole.middle, whole.halves, strict=True
         ):
-            unit = arb(width) if width else arb(1)
-            moves.append(((arb(middle) - arb(centre)) / unit, arb(half) / unit))
+            unit = ball(width) if width else ball(1)
+            moves.append(((ball(middle) - ball(centre)) / unit, ball(half) / unit))
         for e in self.flow.monomials.exponents:  # of this box
             row = []
             for f in self.flow.monomials.exponents:
-                entry = arb(1)
+                entry = ball(1)
                 for k, n, (c, r) in zip(e, f, moves, strict=True):
-                    entry = entry * comb(n, k) * c ** (n - k) * r**k if n >= k else arb(0)
+                    entry = entry * comb(n, k) * c ** (n - k) * r**k if n >= k else ball(0)
                 row.append(entry)
             table.append(row)
         return Enclosed.of(stacked(table))
@@ -124,7 +130,9 @@ class Tube:
         rad, kinks, turning = np.abs(z) @ lost.sum(axis=(0, 1)), np.zeros(len(z)), np.zeros(len(z))
         for convex, part in parts:
             here = self._moved(part, 2)
-            moved, off, switching, of_box = bounded(known(convex), self.flow.monomials, here.mid, here.rad, z, sharp)
+            moved, off, switching, of_box = bound_supports(
+                known(convex), self.flow.monomials, here.mid, here.rad, z, sharp
+            )
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
             mid, kinks, turning = mid + moved, kinks + switching, turning + of_box
         blur = np.abs(z) @ (np.abs(self.rows.basis) @ states.blur(place))
@@ -141,3 +149,126 @@ class Tube:
         mid, rad, size = (np.moveaxis(one, axis, -1) for one in (rows.mid, rows.rad, np.abs(rows.mid)))
         off = (rad + rounding(moves.mid.shape[0]) * size) @ (np.abs(moves.mid) + moves.rad).T + size @ moves.rad.T
         return Enclosed(np.moveaxis(mid @ moves.mid.T, -1, axis), np.moveaxis(off * OUTWARD, -1, axis))
+
+
+def bound_supports(
+    shape: Shape, monomials: Monomials, every: Array, errors: Array, z: Array, sharp: bool
+) -> tuple[Array, Array, Array, Array]:
+    """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at
+    most ``errors``, for combinations ``z (k, b)`` of them: coefficients ``(k, J + 1, M)``, their error ``(k,)``, how
+    much of that, or of the coefficients, is due to switching, and about how much of that would go in smaller boxes of
+    parameters. ``sharp``: less of it where the set is round, which takes longer."""
+    pieces = every.shape[0]
+    mid, w, lost, error, kinks, share = _linear(shape, every, errors, z, pieces)
+    k, mw = mid.shape[0], mid.shape[-1]
+    if not sharp or shape.round is None:
+        moved = np.einsum("ilw,iljkw->ijk", w, mid)
+        return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
+    # of every piece the better of this linear bound and of a polynomial above the length of L'f
+    m, L = shape.round
+    parts = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
+    above, off, over = (part.reshape(k, pieces, *part.shape[1:]) for part in lengths(monomials, parts))
+    spare = (lost + rounding(mw) * np.abs(mid).sum(axis=(2, 3))) @ np.abs(L)
+    off = off + np.linalg.norm(spare, axis=2) + lost @ np.abs(m)
+    off = (off + rounding(pieces) * np.abs(above).sum(axis=(2, 3))) * OUTWARD
+    better = off < error
+    linear = np.einsum("ilw,iljkw->iljk", w, mid)
+    moved = np.where(better[:, :, None, None], above + mid @ m, linear).sum(axis=1)
+    error, kinks = np.where(better, off, error), np.where(better, over, kinks)
+    return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
+
+
+def _linear(
+    shape: Shape, every: Array, errors: Array, z: Array, count: int
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """The weights ``(k, pieces, J + 1, M, mw)`` for combinations ``z (k, b)``, the points ``(k, pieces, mw)`` of the
+    set that are best at them or nearly, what is lost of the weights, ``(k, pieces, mw)``, where up to ``count``
+    pieces are added up, and by how much the points' products may be too small, ``(k, pieces)``; with what of that is
+    due to switching, and about what share of this to the size of the box of parameters."""
+    mid = np.einsum("ljkwb,ib->iljkw", every, z)
+    rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
+    k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
+    value, spread, of_box = _ranges(mid, rad)
+    w, excess = shape.bound(value.reshape(-1, mw), spread.reshape(-1, mw))
+    w, kinks = w.reshape(k, pieces, mw), excess.reshape(k, pieces) * OUTWARD
+    lost = rad.sum(axis=(2, 3)) + rounding(count * mw) * np.abs(mid).sum(axis=(2, 3))
+    radius = np.array(shape.radius)
+    far, wide = spread @ radius, of_box @ radius
+    share = np.divide(wide, far, out=np.zeros_like(far), where=far > 0.0)
+    return mid, w, lost, np.einsum("ilw,ilw->il", np.abs(w), lost) * OUTWARD + kinks, kinks, share
+
+
+def _ranges(mid: Array, rad: Array) -> tuple[Array, Array, Array]:
+    """The ranges that weights ``(k, pieces, J + 1, M, mw)`` stay in on the cell: middles and half-widths, ``(k, pieces,
+    mw)``, and what parameters have to do with these."""
+    k, pieces, orders, _, mw = mid.shape
+    ends = bernstein(np.moveaxis(mid[:, :, :, 0], 2, 3).reshape(-1, orders), [False]).reshape(k, pieces, mw, -1)
+    highest, lowest = ends.max(axis=3), ends.min(axis=3)
+    of_box = np.abs(mid[:, :, :, 1:]).sum(axis=(2, 3))
+    spread = (highest - lowest) / 2 + of_box + rad.sum(axis=(2, 3)) + ROUNDING * np.abs(mid[:, :, :, 0]).sum(axis=2)
+    return (highest + lowest) / 2, spread * OUTWARD, of_box
+
+
+@final
+@dataclass(eq=False)
+class LoopTube:
+    """The reachable states of a closed ``loop``, seen along combinations of the rows of ``basis (b, d)``, and of
+    ``gains (b, m)`` on the answers of the control beside them, its nominal part left out."""
+
+    loop: VerifiedLoop
+    basis: Array
+    gains: Array
+    flow: Around = Around()  # noqa: RUF009  immutable
+
+    def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
+        """As `VerifiedTube.cells`, with the chord as polynomial; of its error `expansion` is due to the length of the
+        cell. The truth may be far below it between the ends."""
+        begin, end = self._height(piece, start, z), self._height(piece, stop, z)
+        bent = np.zeros(z.shape[0])
+        if start < stop:
+            bent = self.loop.bent(piece, start, stop, _combined(z, self.basis))
+        lost = np.maximum(begin.rad, end.rad) + rounding(2) * (np.abs(begin.mid) + np.abs(end.mid)) + bent
+        chords = np.stack([begin.mid, end.mid - begin.mid] if start < stop else [begin.mid])
+        return [
+            Polynomial(chord[:, None], float(error) * OUTWARD, float(length), 0.0)
+            for chord, error, length in zip(chords.T, lost, bent, strict=True)
+        ]
+
+    @remembered(key=lambda self, piece, time, z: (piece, time, z.tobytes()))
+    def _height(self, piece: int, time: float, z: Array) -> Enclosed:
+        """The largest ``c'x`` at a time in a piece of the grid, ``(k,)``."""
+        beside = None
+        if self.gains.shape[1]:
+            beside = exactly(_combined(z, self.gains)) * self.loop.answers(self.loop.on(piece))
+        return _of_column(self.loop.highest(piece, time, _combined(z, self.basis), beside))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Still:
+    """Of what has places in place of times: ``heights`` of a place, by number, along rows ``(r, d)``, which are
+    combinations of those of ``basis (b, d)``."""
+
+    heights: Callable[[int, arb_mat], list[arb]]
+    basis: Array
+    flow: Around = Around()  # noqa: RUF009  immutable
+
+    def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
+        """As `VerifiedTube.cells`, at one place."""
+        found = _of_column(self.heights(piece, exactly(_combined(z, self.basis))))
+        return [
+            Polynomial(np.array([[height]]), float(error), 0.0, 0.0)
+            for height, error in zip(found.mid, found.rad, strict=True)
+        ]
+
+
+def _combined(z: Array, basis: Array) -> Array | arb_mat:
+    """``z'basis (k, d)``: floats where nothing is added up, balls elsewhere."""
+    alone = (np.count_nonzero(z, axis=1) <= 1).all() and np.isin(z, (-1.0, 0.0, 1.0)).all()
+    return np.asarray(z @ basis) if alone else exactly(z) * exactly(basis)
+
+
+def _of_column(heights: Sequence[arb]) -> Enclosed:
+    """Balls as numbers with their radii, ``(k,)`` each."""
+    found = Enclosed.of(stacked([[height] for height in heights]))
+    return Enclosed(found.mid[:, 0], found.rad[:, 0])

@@ -37,7 +37,7 @@ AT_ONCE = 20_000  # cells that are looked at together: some 50 MB
 
 @final
 @dataclass(frozen=True, eq=False)
-class Curve:
+class CurvedSide:
     """A set counted from a point ``about (mw,)``, by what its support function is along polynomials."""
 
     shape: Shape

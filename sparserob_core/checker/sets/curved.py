@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls
+from sparserob_core.checker.arithmetic.balls import above, ball, balls, largest
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
 from sparserob_core.checker.sets.shape import NEAR, Shape, along, total
@@ -95,48 +95,35 @@ class Ball(Shape):
         return np.asarray(self.source.centre, dtype=float)
 
     def support(self, direction: Sequence[arb]) -> arb:
-        from flint import arb
-
-        return along(self.centre, direction) + arb(self.source.radius) * self._dual(direction)
+        return along(self.centre, direction) + ball(self.source.radius) * self._dual(direction)
 
     def _dual(self, direction: Sequence[arb]) -> arb:
-        from flint import arb
-
         p, sizes = self.source.p, [abs(c) for c in direction]
         if p == 1.0:
-            largest = sizes[0]
-            for size in sizes[1:]:
-                largest = largest.max(size)
-            return largest
+            return largest(sizes)
         if p == 2.0:
             return total(c * c for c in direction).nonnegative_part().sqrt()
-        q = arb(p) / (arb(p) - 1)
+        q = ball(p) / (ball(p) - 1)
         summed = total(_power(size, q) for size in sizes if not size.is_zero())
         return summed if summed.is_zero() else _power(summed, 1 / q)
 
     def far(self, direction: Sequence[arb]) -> list[arb]:
-        from flint import arb
-
-        q = arb(self.source.p) / (arb(self.source.p) - 1)
+        q = ball(self.source.p) / (ball(self.source.p) - 1)
         steep = [_power(c, q - 1) if not c.is_zero() else c for c in direction]
         size = self.gauge(steep)
         return [v / size if c > 0 else -v / size for c, v in zip(direction, steep, strict=True)]
 
     def holds(self, point: Sequence[arb]) -> bool:
-        from flint import arb
-
-        p, radius = self.source.p, arb(self.source.radius)
+        p, radius = self.source.p, ball(self.source.radius)
         offsets = [x - m for x, m in zip(point, balls(self.centre), strict=True)]
         if p == 2.0:
             return bool(total(v * v for v in offsets) <= radius**2)
-        return bool(total(abs(v) ** arb(p) for v in offsets if not v.is_zero()) <= radius ** arb(p))
+        return bool(total(abs(v) ** ball(p) for v in offsets if not v.is_zero()) <= radius ** ball(p))
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
-        from flint import arb
-
-        p = arb(self.source.p)
+        p = ball(self.source.p)
         summed = total(_power(v, p) for v in offsets if not v.is_zero())
-        return (summed if summed.is_zero() else _power(summed, 1 / p)) / arb(self.source.radius)
+        return (summed if summed.is_zero() else _power(summed, 1 / p)) / ball(self.source.radius)
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         """``h(f) - w'f`` is convex: on a range it is largest at one of the corners."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls, below, rational, spanning
+from sparserob_core.checker.arithmetic.balls import above, ball, balls, below, largest, rational, smallest, spanning
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, rounding
 from sparserob_core.checker.sets.shape import NEAR, Facet, Shape, along, dot, facet, total
@@ -65,14 +65,12 @@ class Boxed(Flat):
     """A box, or what is one: a ball of the maximum norm, of any norm in one dimension."""
 
     def __init__(self, source: Box | NormBall) -> None:
-        from flint import arb
-
         super().__init__(source)
         self.is_box = isinstance(source, Box)
         if isinstance(source, Box):
-            self._low, self._high = ([arb(float(v)) for v in ends] for ends in (source.lower, source.upper))
+            self._low, self._high = ([ball(v) for v in ends] for ends in (source.lower, source.upper))
         else:
-            middles, radius = [arb(float(v)) for v in source.centre], arb(source.radius)
+            middles, radius = [ball(v) for v in source.centre], ball(source.radius)
             self._low, self._high = [m - radius for m in middles], [m + radius for m in middles]
 
     @cached_property
@@ -93,9 +91,7 @@ class Boxed(Flat):
         ]
 
     def support(self, direction: Sequence[arb]) -> arb:
-        from flint import arb
-
-        height = arb(0)
+        height = ball(0)
         for c, low, high in zip(direction, self._low, self._high, strict=True):
             if c.is_zero():
                 continue
@@ -139,11 +135,8 @@ class Cornered(Flat):
         """All corners of a bounded set, exactly."""
 
     def support(self, direction: Sequence[arb]) -> arb:
-        heights = [total(rational(x) * c for x, c in zip(corner, direction, strict=True)) for corner in self.corners]
-        answer = heights[0]
-        for height in heights[1:]:
-            answer = answer.max(height)
-        return answer
+        corners = ([rational(x) for x in corner] for corner in self.corners)
+        return largest(total(x * c for x, c in zip(corner, direction, strict=True)) for corner in corners)
 
     @cached_property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
@@ -199,9 +192,7 @@ class Polyhedral(Cornered):
 
     @cached_property
     def facets(self) -> list[Facet]:
-        from flint import arb
-
-        return [(c, arb(float(b))) for c, b in zip(self.source.H, self.source.h, strict=True)]
+        return [(c, ball(b)) for c, b in zip(self.source.H, self.source.h, strict=True)]
 
     @cached_property
     def corners(self) -> list[tuple[Fraction, ...]]:
@@ -230,10 +221,8 @@ class Octahedral(Cornered):
 
     @cached_property
     def facets(self) -> list[Facet]:
-        from flint import arb
-
         normals = np.array(list(product((-1.0, 1.0), repeat=self.dimension)))
-        return [(c, dot(c, self.source.centre) + arb(self.source.radius)) for c in normals]
+        return [(c, dot(c, self.source.centre) + ball(self.source.radius)) for c in normals]
 
     @cached_property
     def corners(self) -> list[tuple[Fraction, ...]]:
@@ -449,10 +438,7 @@ def _height(up: arb, down: arb, slope: arb, value: arb) -> arb:
 def _least(values: Sequence[arb]) -> arb:
     if not values:
         raise Unchecked("the set of controls has no corners")
-    least = values[0]
-    for value in values[1:]:
-        least = least.min(value)
-    return least
+    return smallest(values)
 
 
 @lru_cache(maxsize=64)

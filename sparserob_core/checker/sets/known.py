@@ -14,6 +14,7 @@ from sparserob_core.checker.sets.curved import Ball, Cylindrical, Ellipsoidal, J
 from sparserob_core.checker.sets.flat import Boxed, Octahedral, Polyhedral, Segments
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Product, Zonotope
+from sparserob_core.sip.convex_set import Array
 
 MOST_SIGNS = 10  # dimension up to which a 1-norm ball is listed by its facets
 
@@ -50,3 +51,11 @@ def known(source: ConvexSet) -> Shape:
 @lru_cache(maxsize=64)
 def _seen(source: ConvexSet, precision: int) -> Shape:
     return KINDS[type(source)](source)
+
+
+def middle(shape: ConvexSet) -> Array:
+    """The middle ``(d,)`` of a bounded set; of one without an interior floats next to it."""
+    found = shape.middle()  # any point of the set would be right: what is claimed is claimed of deviations from it
+    if known(shape).member(found) is None:
+        raise Unchecked(f"the middle of the {shape.kind} is not shown to be in it")
+    return found

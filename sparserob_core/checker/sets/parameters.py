@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, balls
-from sparserob_core.checker.sets.shape import Shape
+from sparserob_core.checker.sets.shape import Facet, Shape
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class Parameters:
         if self.shape is None or self.is_box:
             return True
         low, high = np.array(box[0]), np.array(box[1])
-        return all(not _least(normal, low, high) > limit for normal, limit in self.shape.halfspaces((low + high) / 2))
+        return all(not _least(normal, low, high) > limit for normal, limit in halfspaces(self.shape, (low + high) / 2))
 
     def bounds(self, box: Corners, slope: Array) -> list[tuple[Array, Array, float]]:
         """Ways to use the set: normals ``a (k, nu)``, limits ``s (k,)`` with ``a p <= s`` on the set, and weights
@@ -49,13 +49,21 @@ class Parameters:
             return []
         found = [(slope[None], np.array([above(self.shape.support(balls(slope)))]), np.ones(1))]
         low, high = np.array(box[0]), np.array(box[1])
-        near = [(a, s) for a, s in self.shape.halfspaces((low + high) / 2) if not -_least(-a, low, high) <= s]
+        near = [(a, s) for a, s in halfspaces(self.shape, (low + high) / 2) if not -_least(-a, low, high) <= s]
         if near:
             from scipy.optimize import nnls
 
             normals, limits = np.array([a for a, _ in near]), np.array([above(s) for _, s in near])
             found.append((normals, limits, nnls(normals.T, slope)[0]))
         return found  # type: ignore[return-value]
+
+
+def halfspaces(shape: Shape, point: Array) -> list[Facet]:
+    """Half-spaces that hold a set: its facets, or that of a curved one that looks towards a point."""
+    if shape.facets is not None:
+        return shape.facets
+    normal = shape.towards(point - shape.centre)
+    return [(normal, shape.support(balls(normal)))] if normal.any() else []
 
 
 def _least(normal: Array, low: Array, high: Array) -> arb:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls
+from sparserob_core.checker.arithmetic.balls import above, ball, balls
 from sparserob_core.checker.outcome import RESOLVED, Broken, Unchecked
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -139,18 +139,12 @@ class Shape(ABC):
         the width between it and the opposite facet, and what else the kind of set names."""
         assert self.facets is not None
         return [
-            smallest([width, max(self._reach(c), self._reach(-c)), *self._sizes(b)])
+            smallest([width, max(_reach(self, c), _reach(self, -c)), *self._sizes(b)])
             for (c, b), width in zip(self.facets, widths(self.facets), strict=True)
         ]
 
     def _sizes(self, limit: arb) -> list[float]:
         return []
-
-    def _reach(self, direction: Array) -> float:
-        try:
-            return abs(float(self.support(balls(direction)).mid()))
-        except (Broken, Unchecked):  # unbounded there, or nowhere cornered
-            return math.inf
 
     # Curved sets
 
@@ -195,13 +189,6 @@ class Shape(ABC):
         ]
         return -self.support([-t for t in tilt])
 
-    def halfspaces(self, point: Array) -> list[Facet]:
-        """Half-spaces that hold the set: its facets, or that of a curved one that looks towards a point."""
-        if self.facets is not None:
-            return self.facets
-        normal = self.towards(point - self.centre)
-        return [(normal, self.support(balls(normal)))] if normal.any() else []
-
     def towards(self, offset: Array) -> Array:
         """A normal that tells the set from a point outside."""
         return offset
@@ -231,6 +218,13 @@ class Shape(ABC):
             if over > worst:
                 worst, where = over, _named(c, number)
         return worst, where
+
+
+def _reach(shape: Shape, direction: Array) -> float:
+    try:
+        return abs(float(shape.support(balls(direction)).mid()))
+    except (Broken, Unchecked):  # unbounded there, or nowhere cornered
+        return math.inf
 
 
 def _named(normal: Array, number: int) -> str:
@@ -279,9 +273,7 @@ def dot(left: Sequence[float] | Array, right: Sequence[float] | Array) -> arb:
 
 def total(terms: Iterable[arb]) -> arb:
     """The sum of balls, 0 of none."""
-    from flint import arb
-
-    return sum(terms, arb(0))
+    return sum(terms, ball(0))
 
 
 def along(point: Sequence[float] | Array, direction: Sequence[arb]) -> arb:

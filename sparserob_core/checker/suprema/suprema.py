@@ -3,21 +3,22 @@ checker's own."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, balls, below
-from sparserob_core.checker.claims.case import Case, listed, number, numbers
-from sparserob_core.checker.claims.cells import Work, prove
+from sparserob_core.checker.claims.case import Case, listed, number, numbers, shaped
+from sparserob_core.checker.claims.cells import Work
 from sparserob_core.checker.claims.claims import judged, precision_of
-from sparserob_core.checker.claims.constraints import along, beside, covered, divided, followed, parameters_of, tubes
+from sparserob_core.checker.claims.constraints import covered, cut_times, prove_on_cells
+from sparserob_core.checker.claims.followed import FollowedRow
+from sparserob_core.checker.claims.multipliers import admissible
 from sparserob_core.checker.claims.replay import reached
-from sparserob_core.checker.claims.window import Window
+from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
-from sparserob_core.checker.reach.adjoint import Worst
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.sides import Bounded, Sides
@@ -35,10 +36,10 @@ OUTPUT, STATE = "output", "state"  # what rows are called that no constraint ask
 
 @final
 @dataclass(frozen=True, eq=False)
-class Asked:
+class SupremumRow:
     """A row of the problem: ``direction'(x - r, u) <= wall`` in a window."""
 
-    window: Window
+    window: ConstraintWindow
     direction: Array
     wall: arb | None
 
@@ -64,14 +65,14 @@ def check_suprema(case: Case) -> list[Finding]:
         return found
 
 
-def _sense(asked: Asked) -> str:
+def _sense(asked: SupremumRow) -> str:
     return "inf" if asked.direction[np.flatnonzero(asked.direction)[0]] < 0.0 else "sup"
 
 
-def _asked(case: Case) -> list[Asked]:
+def _asked(case: Case) -> list[SupremumRow]:
     """The rows of the problem."""
     found = [
-        Asked(window, direction, b)
+        SupremumRow(window, direction, b)
         for window in case.windows
         if window not in case.returned
         for direction, b in window.seen.facets or []
@@ -81,11 +82,11 @@ def _asked(case: Case) -> list[Asked]:
     d, measured = case.problem.system.states, case.problem.measurements
     name, every = (STATE, np.eye(d)) if measured is None else (OUTPUT, np.asarray(measured.C, dtype=float))
     free = Box(np.full(d, -np.inf), np.full(d, np.inf))
-    window = Window(name, free, 0.0, case.problem.horizon, d)
-    return [Asked(window, sign * direction, None) for direction in every for sign in (1.0, -1.0)]
+    window = ConstraintWindow(name, free, 0.0, case.problem.horizon, d)
+    return [SupremumRow(window, sign * direction, None) for direction in every for sign in (1.0, -1.0)]
 
 
-def _matched(case: Case) -> list[tuple[Asked, Mapping[str, Any]]]:
+def _matched(case: Case) -> list[tuple[SupremumRow, Mapping[str, Any]]]:
     """The rows that are written, each with the one of the problem that it is about."""
     left, found = _asked(case), []
     for entry in listed(case.certificate, "rows"):
@@ -106,7 +107,7 @@ def _matched(case: Case) -> list[tuple[Asked, Mapping[str, Any]]]:
     return found
 
 
-def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any]) -> str:
+def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
     """Both sides of one row; a sentence with the figures."""
     sense = _sense(asked)
     if entry.get("sense") != sense:
@@ -121,8 +122,8 @@ def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any]) -> str:
     low, high = sign * reached_side, None if proven_side is None else sign * proven_side
     _margin(asked, entry, sign, high)
     case.clock.check()
-    worst = _followed(case, asked)
-    value = _witnessed(case, asked, entry, worst)
+    row = FollowedRow(case, asked.window, asked.direction)
+    value = _witnessed(case, asked, entry, row)
     if not value[1] >= low:
         raise Broken(f"{reached_side!r} is written, its witness reaches {sign * value[1]!r}")
     if not value[0] >= low:
@@ -131,15 +132,12 @@ def _enclosed(case: Case, asked: Asked, entry: Mapping[str, Any]) -> str:
         raise Unchecked(f"{reached_side:.9g} is reached, and no bound is written on the other side")
     if value[0] > high:
         raise Broken(f"{proven_side!r} is written, its witness reaches {sign * value[0]!r}")
-    if worst is None:
-        count = _proven_in_cells(case, asked, high)
-    else:
-        count, _ = along(case, asked.window, asked.direction, worst, high)
+    count = row.prove(high)[0] if case.followed.are_possible else _proven_in_cells(case, asked, high)
     side = "above" if sense == "sup" else "below"
     return f"{reached_side:.9g} is reached, nothing is {side} {proven_side:.9g} ({count} cells)"
 
 
-def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
+def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
     """The wall must be the problem's, and what is left to it follow."""
     wall, margin = entry.get("wall"), entry.get("margin")
     if asked.wall is None:
@@ -157,39 +155,25 @@ def _margin(asked: Asked, entry: Mapping[str, Any], sign: float, high: float | N
         raise Broken(f"a margin of {margin!r} is written, {written - high!r} follows")
 
 
-def _followed(case: Case, asked: Asked) -> Worst | None:
-    """The row by its adjoint, where the system is known and does not change; ``None`` elsewhere."""
-    system = case.problem.system
-    if case.still is None or system.parameter_count or not case.alike:
-        return None
-    return followed(case, asked.window.split(asked.direction)[0])
-
-
-def _witnessed(case: Case, asked: Asked, entry: Mapping[str, Any], followed: Worst | None) -> tuple[float, float]:
+def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: FollowedRow) -> tuple[float, float]:
     """The value of the row along its witness, which must be one of the problem's, between bounds."""
     problem, window, time = case.problem, asked.window, number(entry, "time")
-    if not window.start <= time <= window.stop:
-        raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
-    parameter, deviation = (numbers(entry.get(key), key) for key in ("parameter", "deviation"))
-    if parameter.shape != (problem.system.parameter_count,):
-        raise Broken(f"parameter: {parameter.size} numbers where {problem.system.parameter_count} are expected")
-    if problem.system.parameters is not None and not known(problem.system.parameters).contains(parameter):
-        raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
-    if deviation.shape != (problem.system.states,):
-        raise Broken(f"deviation: {deviation.size} numbers where {problem.system.states} are expected")
+    parameter = numbers(entry.get("parameter"), "parameter")
+    deviation = shaped(entry, "deviation", (problem.system.states,))
+    admissible(case, window, time, parameter)
     if problem.initial_set is None and deviation.any():
         raise Broken("a deviation is written, there is one initial state")
     if problem.initial_set is not None and not known(problem.initial_set).contains(deviation):
         raise Broken("the deviation of the initial state is not shown to be in its set")
     changes, signal = _signal(case, entry)
-    low, high = beside(case, window, asked.direction, time, time)
-    delivered = case.delivered_at(parameter.tolist())
+    low, high = row.beside(time, time)
+    delivered = case.sources.delivered_at(parameter.tolist())
     if delivered is not None:  # the worst errors are enclosed, whatever they are
         errors = delivered.added(window.split(asked.direction)[0], time)
         slack = 2.0 * HALF_ULP * (abs(low) + abs(high) + abs(errors[1]))
         low, high = low + errors[0] - slack, high + errors[1] + slack
-    if followed is not None:
-        value = followed.along(time, deviation, changes, signal)
+    if case.followed.are_possible:
+        value = row.worst.along(time, deviation, changes, signal)
         return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
     fine, on_grid = _following(case, changes, signal)
     state = reached(fine, time, parameter, on_grid, entry.get("deviation"))
@@ -210,13 +194,11 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
         if entry.get("disturbance") is not None:
             raise Broken("a disturbance is written, there is none")
         return changes, None
-    signal = numbers(entry.get("disturbance"), "disturbance")
-    if signal.shape != (problem.disturbance.dimension, changes.size - 1):
-        raise Broken(f"disturbance: expected shape {(problem.disturbance.dimension, changes.size - 1)}")
+    signal = shaped(entry, "disturbance", (problem.disturbance.dimension, changes.size - 1))
     held = ~columns_of(problem.disturbance, problem.disturbance_class, "measurable")
     jumps = (signal[:, 1:] != signal[:, :-1]) & held[:, None]
     for time, jumping in zip(changes[1:-1].tolist(), jumps.T, strict=True):
-        if (jumping & ~case.may_jump(time)).any():
+        if (jumping & ~case.disturbances.may_jump(time)).any():
             raise Broken("the disturbance jumps within a piece")
     shape, seen = known(problem.disturbance), set[tuple[float, ...]]()
     for value in case.clock.each(map(tuple, signal.T.tolist())):
@@ -234,11 +216,11 @@ def _following(case: Case, changes: Array, signal: Array | None) -> tuple[Case, 
     if case.measurable:
         problem = replace(case.problem, disturbance_class="piecewise_constant")
         case = replace(case, problem=problem, disturbance=Dictionary.indicators(changes))
-    starts = np.array(case.grid[:-1])
+    starts = np.array(case.timing.grid[:-1])
     return case, signal[:, np.searchsorted(changes, starts, side="right") - 1].tolist()
 
 
-def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
+def _proven_in_cells(case: Case, asked: SupremumRow, limit: float) -> int:
     """As `_proven`, over the parameters and pieces of the system, in cells of times and parameters."""
     window = asked.window
     alone = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))
@@ -252,10 +234,6 @@ def _proven_in_cells(case: Case, asked: Asked, limit: float) -> int:
     ends = ([], []) if box is None else (box.lower.tolist(), box.upper.tolist())
     lower, upper = (np.array([[t, *p]]) for t, p in zip((window.start, window.stop), ends, strict=True))
     covered(case, alone, lower, upper)
-    whole = tuple(ends[0]), tuple(ends[1])
-    parts = divided(case, window, whole, [(window.start, window.stop)])
-    work: Sequence[Work] = [(part, Sides([bounded]), times) for part, times in parts]
-    shown = prove(
-        tubes(case, basis, gains, lower, upper), parameters_of(case), work, case.clock, case.beside(alone, basis, gains)
-    )
-    return shown.cells
+    times = cut_times(case, window, [(window.start, window.stop)])
+    work: list[Work] = [((tuple(ends[0]), tuple(ends[1])), Sides([bounded]), times)]
+    return prove_on_cells(case, alone, (basis, gains), work, (lower, upper)).cells

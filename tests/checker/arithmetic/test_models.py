@@ -29,9 +29,9 @@ SMALL = [
 
 def argument(frame: Frame, width: float = 1.0) -> Model:
     """The time, plus the parameters of the frame; of wide ones ``width`` times as much."""
-    found = Model.time(frame, arb(CENTRES[0]), arb(width * HALVES[0]))
+    found = frame.time(arb(CENTRES[0]), arb(width * HALVES[0]))
     for j in range(frame.monomials.count):
-        found = found + Model.parameter(frame, j, arb(CENTRES[1 + j]), arb(width * HALVES[1 + j]))
+        found = found + frame.parameter(j, arb(CENTRES[1 + j]), arb(width * HALVES[1 + j]))
     return found
 
 
@@ -150,21 +150,21 @@ def test_the_size_of_a_model_is_the_most_that_it_can_be() -> None:
 
 def test_a_parameter_of_no_width_is_a_number() -> None:
     frame = Frame(Monomials(2, 3), 2)
-    found = Model.parameter(frame, 1, arb(2), arb(0))
+    found = frame.parameter(1, arb(2), arb(0))
     assert [part is None for part in found.parts] == [False, *[True] * 9] and found.constant == 2
 
 
 def test_functions_of_balls_hold_those_of_every_number_in_them() -> None:
     for function in (Model.exp, Model.sin, Model.cos, Model.tan, Model.log, Model.sqrt, Model.tanh):
         with ctx.workprec(96):
-            wide = function(Model.number(Frame(NONE, 4), arb(0.7, 0.1))).constant
+            wide = function(Frame(NONE, 4).number(arb(0.7, 0.1))).constant
             for p in (0.6001, 0.65, 0.7, 0.75, 0.7999):
-                assert wide.contains(function(Model.number(Frame(NONE, 0), arb(p))).constant.mid())
+                assert wide.contains(function(Frame(NONE, 0).number(arb(p))).constant.mid())
 
 
 def test_what_has_no_value_is_refused_by_name() -> None:
     with ctx.workprec(96):
-        t = Model.time(Frame(NONE, 4), arb(0.0), arb(0.25))
+        t = Frame(NONE, 4).time(arb(0.0), arb(0.25))
         for function in (t.log, t.sqrt, lambda: 1.0 / t, lambda: t / 0.0, lambda: t**-1, lambda: t**1.5,
                          (t * 20).tan, (t * 1e9).exp().exp):  # fmt: skip
             with pytest.raises(Unchecked, match="not finite"):

@@ -122,7 +122,7 @@ def test_products_and_sums_of_series_are_those_of_polynomials():
     with ctx.workprec(96):
         left, right = (Series(known, [matrix(m) for m in one]) for one in (A, B))
         product, total, less = left * right, left + right, left - right
-        scaled, applied = left.scaled(arb(-0.5)), left.applied(matrix(B[0]))
+        scaled, applied = left.scaled(arb(-0.5)), left.scaled(matrix(B[0]))
         truth = np.zeros_like(A)
         for i, j, k in known.products:
             truth[k] += A[i] @ B[j]

@@ -15,12 +15,13 @@ from flint import arb, ctx, fmpq
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
-from sparserob_core.checker.claims.answers import Answers, _chords, _reach, _segments, _width, answers_of
+from sparserob_core.checker.claims.answers import VerifiedFeedback, feedback_of
 from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.cost.gains import _chords, _segments, _width, reach
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.reach.closed_loop import exactly
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
@@ -137,7 +138,7 @@ def test_a_control_in_an_ellipse_is_as_far_along_every_direction_as_its_answers_
 
 def test_across_the_seam_the_controls_of_two_periods_answer_apart():
     """``u = (0.3, -0.2) - e / 2`` with ``|e| <= 0.2``, one of each period: from one to the next at most 0.7."""
-    answers = answers_of(case_of(gains=gains_of(m00=-0.5, m10=-0.5), initial_set=box(0.2), disturbance=None))
+    answers = feedback_of(case_of(gains=gains_of(m00=-0.5, m10=-0.5), initial_set=box(0.2), disturbance=None))
     (within,) = answers.heights(answers.changes(1), exactly(np.ones((1, 1))))
     (across,) = answers.heights(answers.changes(2), exactly(np.ones((1, 1))))
     assert float(within.mid()) == pytest.approx(-0.5)
@@ -153,40 +154,40 @@ def test_a_step_is_as_large_as_the_answers_of_both_pieces_make_it():
         else:
             with pytest.raises(Broken, match="t = 1"):
                 claims._steps(judged)
-    assert float(answers_of(case_of(control_step=box(1.0))).changes(1)[0][0, 1].mid()) == pytest.approx(-0.5)
-    assert answers_of(case_of(control_step=box(1.0))).changes(1)[0][0, 0].mid() == pytest.approx(-0.5)
+    assert float(feedback_of(case_of(control_step=box(1.0))).changes(1)[0][0, 1].mid()) == pytest.approx(-0.5)
+    assert feedback_of(case_of(control_step=box(1.0))).changes(1)[0][0, 0].mid() == pytest.approx(-0.5)
 
 
 def test_the_costs_of_a_policy_are_by_hand():
-    assert float(answers_of(case_of(cost="nominal")).cost().mid()) == pytest.approx(0.5)
-    assert float(answers_of(case_of(cost="peak")).cost().mid()) == pytest.approx(0.3 + 0.325)
-    assert float(answers_of(case_of(cost="peak", weights=[2.0])).cost().mid()) == pytest.approx(2 * 0.625)
+    assert float(feedback_of(case_of(cost="nominal")).cost().mid()) == pytest.approx(0.5)
+    assert float(feedback_of(case_of(cost="peak")).cost().mid()) == pytest.approx(0.3 + 0.325)
+    assert float(feedback_of(case_of(cost="peak", weights=[2.0])).cost().mid()) == pytest.approx(2 * 0.625)
     peaks = case_of(cost="peak")
     ends = replace(peaks.problem, cost=sr.Cost(final={"Q": [[2.0]]}))  # at 0.6, nominally
-    assert float(answers_of(replace(peaks, problem=ends)).cost().mid()) == pytest.approx(0.625 + 2 * 0.36)
-    assert float(answers_of(case_of(cost="worst", certificate={"cost": 0.625 + 1e-10})).cost().mid()) == pytest.approx(
+    assert float(feedback_of(replace(peaks, problem=ends)).cost().mid()) == pytest.approx(0.625 + 2 * 0.36)
+    assert float(feedback_of(case_of(cost="worst", certificate={"cost": 0.625 + 1e-10})).cost().mid()) == pytest.approx(
         0.625
     )
     for short in (1e-9, 0.125):
         with pytest.raises(Broken):
-            answers_of(case_of(cost="worst", certificate={"cost": 0.625 - short})).cost()
+            feedback_of(case_of(cost="worst", certificate={"cost": 0.625 - short})).cost()
 
 
 def test_answers_to_what_is_not_measured_or_is_forgotten_are_refused():
     for wrong in (gains_of(m01=0.1), gains_of(m00=0.1), gains_of(m10=1e-300)):
         with pytest.raises(Broken, match="not measured"):
-            answers_of(case_of(gains=wrong)).gains  # noqa: B018
+            feedback_of(case_of(gains=wrong)).gains  # noqa: B018
     with pytest.raises(Broken, match="shape"):
-        answers_of(case_of(gains=gains_of(3))).gains  # noqa: B018
+        feedback_of(case_of(gains=gains_of(3))).gains  # noqa: B018
     begun = case_of(gains=gains_of(m10=-0.5), initial_set=box(0.1))
-    assert (answers_of(begun).gains == gains_of(m10=-0.5)).all()
+    assert (feedback_of(begun).gains == gains_of(m10=-0.5)).all()
     for memory, kept in ((1.0, True), (1.0 - 1e-9, False)):
         judged = case_of(gains=gains_of(m10=-0.5), initial_set=box(0.1), policy=AffinePolicy(memory=memory))
         if kept:
-            assert answers_of(judged).gains.any()
+            assert feedback_of(judged).gains.any()
         else:
             with pytest.raises(Broken, match="measured at 0, which its policy does not"):
-                answers_of(judged).gains  # noqa: B018
+                feedback_of(judged).gains  # noqa: B018
 
 
 def test_a_state_is_as_far_as_its_worst_disturbance_takes_it():
@@ -440,10 +441,10 @@ def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
     delayed = judged.problem.system.with_delay(0.5)
     free = replace(judged, problem=replace(judged.problem, system=delayed, disturbance_class="measurable"))
     with pytest.raises(Unchecked, match="undelayed"):
-        Answers(free).loop  # noqa: B018
+        VerifiedFeedback(free).loop  # noqa: B018
     one = LinearSystem(lambda p: p[0] * np.ones((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)), parameters=box(0.1))
     with pytest.raises(Unchecked, match="known systems only"):
-        Answers(replace(judged, problem=replace(judged.problem, system=one))).loop  # noqa: B018
+        VerifiedFeedback(replace(judged, problem=replace(judged.problem, system=one))).loop  # noqa: B018
 
 
 def test_how_far_and_how_wide_a_set_is_along_a_channel():
@@ -453,7 +454,7 @@ def test_how_far_and_how_wide_a_set_is_along_a_channel():
         (NormBall(p=2.0, radius=2.0, centre=[0.5, -1.0]), (4.0, 4.0), (2.5, 3.0)),
     ):
         assert [float(_width(shape, c).mid()) for c in (0, 1)] == pytest.approx(wide)
-        assert [float(_reach(shape, c).mid()) for c in (0, 1)] == pytest.approx(far)
+        assert [float(reach(shape, c).mid()) for c in (0, 1)] == pytest.approx(far)
 
 
 def test_a_direction_of_a_fixed_state_is_that_state_alone_at_the_end():
@@ -468,11 +469,28 @@ def test_the_effort_is_looked_for_where_deviations_go(monkeypatch):
     """How far every entry goes, from the middle of its set, is handed on."""
     told = []
     monkeypatch.setattr("sparserob_core.checker.claims.answers.at_most", lambda *given: told.append(given) or 1)
-    answers_of(case_of(cost="worst", disturbance=Box([-0.1], [0.3])))._effort(arb(9.0))
+    feedback_of(case_of(cost="worst", disturbance=Box([-0.1], [0.3])))._effort(arb(9.0))
     a, A, _, reach, limit, _ = told[0]
     assert reach == pytest.approx([0.2, 0.2]) and float(limit) == 9.0
     assert [float(x.mid()) for x in a] == pytest.approx([0.3, -0.2])
     assert [[float(x.mid()) for x in row] for row in A] == [pytest.approx([0.0, 0.0]), pytest.approx([-0.5, 0.0])]
+
+
+@pytest.mark.parametrize("kind", ["piecewise_constant", "measurable"])
+def test_an_effort_is_bounded_where_its_parts_are_not_largest_together(kind):
+    """``|z_1 + z_2| + |z_1 - z_2|`` is twice the larger of both, and half of what its parts can be each."""
+    gains = np.zeros((3, 3, 2, 1))
+    gains[2, 1], gains[2, 2] = [[1.0], [1.0]], [[1.0], [-1.0]]
+    two = {
+        "system": LinearSystem(np.zeros((1, 1)), np.ones((1, 2)), E=np.ones((1, 1))),
+        "control": Box([-9.0] * 2, [9.0] * 2),
+    }
+    said = {"decision": np.zeros((2, 3)).tolist(), "gains": gains.tolist()}
+    judged = case_of(pieces=3, gains=gains, cost="worst", certificate=said, disturbance_class=kind, **two)
+    most = (2.0 / 3.0) * 2.0 * (2.0 / 3.0) * REACH
+    feedback_of(judged)._effort(arb(most * (1.0 + 1e-9)))
+    with pytest.raises((Broken, Unchecked)):
+        feedback_of(judged)._effort(arb(most * (1.0 - 1e-6)))
 
 
 def test_innovations_of_a_flat_set_are_those_of_differences_of_its_points():
@@ -485,13 +503,13 @@ def test_innovations_of_a_flat_set_are_those_of_differences_of_its_points():
         "gains": np.zeros((2, 2, 1, 2)), "disturbance": flat,
     }  # fmt: skip
     case = case_of(**plane)
-    loop, (shape, about) = answers_of(case).loop_at_rest, answers_of(case).loop_at_rest.sets[0]
-    named = answers_of(case).named({"disturbance": np.tile(flat.support_point(line), (2, 1)).T.tolist()}, "row")
+    loop, (shape, about) = feedback_of(case).loop_at_rest, feedback_of(case).loop_at_rest.deviations.sets[0]
+    named = feedback_of(case).named({"disturbance": np.tile(flat.support_point(line), (2, 1)).T.tolist()}, "row")
     exact = [arb(fmpq(*float(v).as_integer_ratio())) for v in normal]
     with ctx.workprec(96):
         limit = arb(0.1)
         for point in (
-            [arb(float(m)) + r for m, r in zip(about, loop.rests[0], strict=True)],
+            [arb(float(m)) + r for m, r in zip(about, loop.deviations.rests[0], strict=True)],
             [arb(float(m)) + z for m, z in zip(about, named.z[0], strict=True)],
         ):
             assert float(abs(sum(a * x for a, x in zip(exact, point, strict=True)) - limit).upper()) < 1e-26
@@ -499,7 +517,7 @@ def test_innovations_of_a_flat_set_are_those_of_differences_of_its_points():
         seen = named.innovations[1]  # a piece of length 1 after which the state is what the disturbance was
         assert [float(x.mid()) for x in seen] == pytest.approx(flat.support_point(line) - about)
         assert float(abs(sum(a * x for a, x in zip(exact, seen, strict=True))).upper()) < 1e-26
-        calm = answers_of(case).following(named, {}, "row")
+        calm = feedback_of(case).following(named, {}, "row")
         assert all(x.is_zero() for row in calm.innovations for x in row)
 
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from flint import ctx
 
-from sparserob_core.checker.claims.window import Beside, Window
-from sparserob_core.checker.reach.kernels import MissedHere
-from sparserob_core.checker.reach.loop_tube import LoopTube
+from sparserob_core.checker.claims.window import Beside, ConstraintWindow
+from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.reach.measurable import as_enclosed
-from sparserob_core.checker.reach.tube import Polynomial
+from sparserob_core.checker.reach.tube import LoopTube, Polynomial
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid
@@ -23,7 +22,7 @@ from tests.support.undriven import undriven
 FAR = np.array([2.0, 0.5, 3.0])
 
 
-class Erring(MissedHere):
+class Erring(BoundedInputHere):
     """What is added is ``FAR'|c|`` and as much again by a time of 1, and a little more for ``c`` below 0."""
 
     def added(self, c: np.ndarray, time: float) -> tuple[float, float]:
@@ -44,8 +43,8 @@ def precision():
 
 
 def beside(basis: np.ndarray) -> Beside:
-    window = Window("path", Ellipsoid(np.zeros(3), np.eye(3)), 0.0, 1.0, 3)
-    return Beside(window, basis, np.zeros((len(basis), 0)), cast(Any, None), [0.0, 1.0], [], cast(Any, [Erring()]))
+    window = ConstraintWindow("path", Ellipsoid(np.zeros(3), np.eye(3)), 0.0, 1.0, 3)
+    return Beside(window, basis, np.zeros((len(basis), 0)), [0.0, 1.0], [], cast(Any, [Erring()]))
 
 
 def test_a_direction_is_the_nearest_float_and_off_by_what_is_left() -> None:
@@ -69,7 +68,7 @@ def test_what_a_direction_is_off_by_is_added_as_along_the_axes() -> None:
     one = beside(basis)
     c, off = one.directions(z)
     for off_by in (off, np.array([[1e-3, 0.0, 2e-3]])):
-        one._directions[z.tobytes()] = c, off_by
+        one.__dict__["_directions_remembered"] = {z.tobytes(): (c, off_by)}
         for stop in (0.0, 1.0):
             (found,) = one.added([none], 0.0, stop, z)
             top = found.coefficients.sum() + found.error

@@ -15,8 +15,9 @@ from flint import ctx
 import sparserob_core as sr
 from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
-from sparserob_core.checker.claims.answers import answers_of
+from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import Case, written_policy
+from sparserob_core.checker.claims.units import units_of
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.sets.sets import Box
@@ -142,7 +143,7 @@ def test_the_top_of_a_wave_between_breakpoints_counts_to_what_counts_as_none() -
     proof = {"proof": {"path": {"tolerance": 1e-9, "lower": [[t - 0.125]], "upper": [[t + 0.0625]]}}}
     wall = sr.PathConstraint(sr.Polytope(row, [top]), t - 0.125, t + 0.0625)
     plain = case_of("fast", path=[wall])
-    unit = float(plain.units(plain.windows[0]).rows[0])
+    unit = float(units_of(plain, plain.windows[0]).rows[0])
     for share in (NOTHING, 2e-9):
         wall = replace(wall, set=sr.Polytope(row, [top - share * unit]))
         judged = case_of("fast", certificate=proof, path=[wall])
@@ -192,10 +193,10 @@ def test_what_a_policy_costs_is_the_integral_at_its_worst_deviations(name: str) 
     loop, v, _ = driven(name)
     _, _, U = states(name)
     lengths = np.diff(loop.breakpoints)
-    assert float(answers_of(case_of(name)).cost().mid()) == pytest.approx(lengths @ np.abs(v[0]))
+    assert float(feedback_of(case_of(name)).cost().mid()) == pytest.approx(lengths @ np.abs(v[0]))
     peaks = np.maximum(loop.height(U[:, 0]), loop.height(-U[:, 0]))
-    assert float(answers_of(case_of(name, "peak")).cost().mid()) == pytest.approx(lengths @ peaks)
-    assert float(answers_of(case_of(name, "peak", weights=[3.0])).cost().mid()) == pytest.approx(3.0 * lengths @ peaks)
+    assert float(feedback_of(case_of(name, "peak")).cost().mid()) == pytest.approx(lengths @ peaks)
+    assert float(feedback_of(case_of(name, "peak", weights=[3.0])).cost().mid()) == pytest.approx(3.0 * lengths @ peaks)
 
 
 @pytest.mark.parametrize("name", ["box", "fast"])

@@ -14,7 +14,7 @@ from flint import ctx
 import sparserob_core as sr
 from sparserob_core.checker.claims import causal as causal_bounds
 from sparserob_core.checker.claims import claims, multipliers, replay
-from sparserob_core.checker.claims.answers import answers_of
+from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import number
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.control.policies.affine import AffinePolicy
@@ -50,10 +50,14 @@ def moved(case: Any, **change: Any) -> Any:
 
 
 REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
-    "fewer functions": (lambda: moved(case_of(), disturbance=FEWER).changes, Unchecked, "fewer functions than pieces"),
+    "fewer functions": (
+        lambda: moved(case_of(), disturbance=FEWER).disturbances.changes,
+        Unchecked,
+        "fewer functions than pieces",
+    ),
     "outputs of what is pushed at any time": (
         lambda: (
-            answers_of(
+            feedback_of(
                 case_of(
                     policy=AffinePolicy(),
                     disturbance_class="measurable",
@@ -89,7 +93,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
             moved(case_of(), control=FEWER), {"constraints": [], "equalities": [], "pieces": [[1.0]]}
         ),
         Broken,
-        r"pieces have shape \(1, 1\), expected \(1, 2\)",
+        r"pieces: shape \(1, 1\), expected \(1, 2\)",
     ),
     "no tree of all pieces": (
         lambda: claims._tree(moved(case_of(certificate={"tree": {"nodes": []}}), control=FEWER)),
@@ -118,7 +122,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "a deviation of another size": (
         lambda: replay._begun(case_of(initial_set=Box([-0.1], [0.1])), [0.0, 0.0]),
         Broken,
-        "expected 1 numbers",
+        r"deviation: shape \(2,\), expected \(1,\)",
     ),
 }
 

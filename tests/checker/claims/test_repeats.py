@@ -12,7 +12,7 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.claims import claims, multipliers
-from sparserob_core.checker.claims.answers import Named, answers_of
+from sparserob_core.checker.claims.answers import NamedDeviations, feedback_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.claims import ASIDE
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -94,15 +94,15 @@ def test_what_counts_as_no_violation_of_the_return_is_still_an_initial_state() -
 
 def test_the_next_periods_deviation_is_one_of_the_initial_states() -> None:
     case = replace(case_of(**begun(0.25)), policy=sr.AffinePolicy())
-    answers = answers_of(case)
-    now = Named(case, answers.loop_at_rest, [[arb(0.1)]])
+    answers = feedback_of(case)
+    now = NamedDeviations(case, answers.loop_at_rest, [[arb(0.1)]])
     ((inside,),) = answers.following(now, {"following": [0.2]}, "return").z
     assert float(inside.mid()) == pytest.approx(0.2)
     for wrong in ([0.25 + 1e-15], [-0.3], [0.1, 0.1], [], None, "0.1"):
         with pytest.raises(Broken, match=r"following|deviation"):
             answers.following(now, {"following": wrong}, "return")
-    alone = answers_of(replace(case_of(), policy=sr.AffinePolicy()))
-    assert alone.following(Named(alone.case, alone.loop_at_rest, []), {}, "return").z == []
+    alone = feedback_of(replace(case_of(), policy=sr.AffinePolicy()))
+    assert alone.following(NamedDeviations(alone.case, alone.loop_at_rest, []), {}, "return").z == []
 
 
 def test_a_step_across_the_seam_is_the_first_control_of_the_next_period_less_the_last_one() -> None:

@@ -14,7 +14,7 @@ from flint import arb, ctx
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.claims import activity, cells, window
 from sparserob_core.checker.claims.window import _plus
-from sparserob_core.checker.reach.kernels import MissedHere
+from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.reach.tube import Polynomial
 from tests.support.worst_cases import kind, walls
 
@@ -31,7 +31,7 @@ def polynomial(coefficients: Any, error: float = 0.0) -> Polynomial:
 
 
 @dataclass(frozen=True, eq=False)
-class Told(MissedHere):
+class Told(BoundedInputHere):
     """What is told of errors up to a ``start``, and after it."""
 
     low: np.ndarray

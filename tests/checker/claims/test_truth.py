@@ -14,9 +14,11 @@ from flint import arb, ctx
 import sparserob_core as sr
 from sparserob_core.checker.claims import cells, claims, constraints, multipliers, replay, units
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.duality import Duality, Row
-from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.cost.duality import ConstraintRow, Duality
+from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach import followed as followed_rows
+from sparserob_core.checker.reach.followed import FollowedRows
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
@@ -61,9 +63,9 @@ def test_a_row_is_the_worst_case_of_every_control(name: str) -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_row_along_its_adjoint_is_the_one_that_exponentials_give(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(constraints, "FOLLOWED", 1)
+    monkeypatch.setattr(followed_rows, "FOLLOWED", 1)
     case = kind(name).case()
-    if not constraints.follows(case):
+    if not case.followed.are_best:
         return
     cases, problem = [case], case.problem
     if problem.disturbance is not None and problem.system.delay == 0.0:
@@ -73,7 +75,7 @@ def test_a_row_along_its_adjoint_is_the_one_that_exponentials_give(name: str, mo
             row, limit = DIRECTIONS[2], arb(0.375)
             found = multipliers._along_adjoint(one, row, time, limit)
             exact = one.duality.row(row, time, [], limit)
-            strayed = one.strayed
+            strayed = one.sources.strayed
             constant = exact.constant if strayed is None else exact.constant + arb(strayed.added(row, time)[1])
             pairs = [(found.constant, constant)]
             pairs += [
@@ -90,7 +92,7 @@ def test_a_replayed_state_is_that_of_its_disturbance(name: str) -> None:
     case = made.case()
     signal = np.array([[0.2, -0.1, 0.05], [-0.3, 0.1, 0.0]])
     deviation = np.array([0.05, -0.1])
-    at_blocks = np.searchsorted(CHANGES, case.grid[:-1], side="right") - 1
+    at_blocks = np.searchsorted(CHANGES, case.timing.grid[:-1], side="right") - 1
     for time in (0.0, 0.3, 1.0, 1.75, 2.0):
         said = None if made.bound is None else signal[:, at_blocks].tolist()
         found = replay.reached(case, time, np.zeros(0), said, None if made.begun is None else deviation.tolist())
@@ -122,7 +124,7 @@ def test_a_wall_may_be_where_the_worst_case_is_and_no_nearer(
     # no more room is told than there is
     order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in case.windows[0].seen.facets]
     assert -room.min() - 1e-12 <= told[0].bound <= 0.0
-    assert (-room[order] / case.units(case.windows[0]).rows).max() - 1e-12 <= told[0].share <= 0.0
+    assert (-room[order] / units.units_of(case, case.windows[0]).rows).max() - 1e-12 <= told[0].share <= 0.0
     near = highest + 5e-3
     near[i] = highest[i] - 1e-3
     case = made.case(proof, path=[wall(near)])
@@ -133,13 +135,13 @@ def test_a_wall_may_be_where_the_worst_case_is_and_no_nearer(
 @pytest.mark.parametrize("which", ["moving", "mixed"])
 def test_a_wall_is_no_nearer_where_rows_are_followed(which: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """With curved sets it is not told how sharp a bound is."""
-    monkeypatch.setattr(constraints, "FOLLOWED", 2)
+    monkeypatch.setattr(followed_rows, "FOLLOWED", 2)
     made = replace(kind("known"), begun=Box([-0.1, -0.05], [0.15, 0.1]))
     wall, times, heights = walls("known", which, made)
     highest, i = heights.max(axis=0), len(which) % len(DIRECTIONS)
     proof = {"proof": {"path": {"tolerance": 1e-9, "lower": [[times[0]]], "upper": [[times[-1]]]}}}
     case = made.case(proof, path=[wall(highest + 5e-3)])
-    assert constraints.is_followed(case, case.windows[0])
+    assert case.followed.are_best
     assert "margin" in constraints.bounded(case, case.windows[0])
     case = made.case(proof, path=[wall(highest + np.where(np.arange(4) == i, -1e-3, 5e-3))])
     with pytest.raises(Broken, match="exceeded"):
@@ -167,7 +169,7 @@ def test_a_violation_along_rows_is_the_one_of_the_tube(which: str, monkeypatch: 
         for begun in (None, np.array(START) + np.array([0.1, -0.05])):
             found = list[list[float]]()
             for followed in (100, 1):
-                monkeypatch.setattr(constraints, "FOLLOWED", followed)
+                monkeypatch.setattr(followed_rows, "FOLLOWED", followed)
                 over, slack = replay.exceeded(case, said, begun)
                 found.append(over)
                 assert slack < 1e-7
@@ -187,8 +189,8 @@ def test_an_integral_that_begins_later_is_the_one_of_pieces_where_rows_are_follo
     said = {"constraint": window.name, "time": window.start, "violation": 0.0}
     c, begun = np.array([0.3, -0.1, 1.0, -2.0]), np.append(np.array(START) + np.array([0.1, -0.05]), [0.0, 0.0])
     for followed in (100, 1):
-        monkeypatch.setattr(constraints, "FOLLOWED", followed)
-        assert constraints.follows(case) == (followed == 1)
+        monkeypatch.setattr(followed_rows, "FOLLOWED", followed)
+        assert case.followed.are_best == (followed == 1)
         numbers = [x for state in (None, begun) for x in replay.exceeded(case, said, state)[0]]
         derive = multipliers._along_adjoint if followed == 1 else _by_duality
         row = derive(case, c, window.start, arb(0.25))
@@ -208,16 +210,16 @@ def test_measurable_disturbances_of_an_integral_are_those_of_pieces(
     entries = [entry, IntegralConstraint(**other)]
     case = made.case(path=[], integral=entries, disturbance_class="measurable")
     window, found = case.windows[0], list[list[float]]()
-    assert constraints.follows(case)  # whatever its number of states, as all of measurable disturbances are
+    assert case.followed.are_best  # whatever its number of states, as all of measurable disturbances are
     for is_followed in (False, True):
-        monkeypatch.setattr(replay, "follows", lambda case, answer=is_followed: answer)
+        monkeypatch.setattr(FollowedRows, "are_best", is_followed)
         said = {"constraint": window.name, "time": window.start, "violation": 0.0}
         over, slack = replay.exceeded(case, said)
         found.append(over)
         assert slack < 1e-7
     assert found[1] == pytest.approx(found[0], abs=1e-9)
     with pytest.raises(Unchecked, match="one integral at a time"):
-        constraints.followed(case, np.array([0.0, 0.0, 1.0, 1.0])).most(np.array([1.8]))
+        case.followed.worst(np.array([0.0, 0.0, 1.0, 1.0]), case.scene).most(np.array([1.8]))
 
 
 def _by_duality(case: Any, c: np.ndarray, time: float, limit: Any) -> Any:
@@ -299,7 +301,7 @@ def test_a_unit_is_no_more_than_a_row_reaches_however_few_numbers_are_held(
     """The reach: the largest absolute value at the breakpoints within the window, of controls that jump at each."""
     made = kind(name)
     case = made.case(path=[sr.PathConstraint(sr.Polytope(DIRECTIONS, np.full(4, 1e6)), 0.5, 1.75)])
-    nodes = np.array(sorted({*(t for t in case.grid if t < 1.75), 0.5, 1.75}))
+    nodes = np.array(sorted({*(t for t in case.timing.grid if t < 1.75), 0.5, 1.75}))
     fine, waits = replace(made.motion, breakpoints=nodes, delay=0.0), nodes[:-1] < made.motion.delay
     reach = np.zeros(4)
     for t in nodes[nodes >= 0.5]:
@@ -312,11 +314,11 @@ def test_a_unit_is_no_more_than_a_row_reaches_however_few_numbers_are_held(
             reach = np.maximum(reach, np.abs(most))
     facets = case.windows[0].seen.facets
     order = [int(np.abs(DIRECTIONS - c).sum(axis=1).argmin()) for c, _ in facets]
-    found = case.units(case.windows[0])
+    found = units.units_of(case, case.windows[0])
     assert found.rows == pytest.approx(reach[order], rel=1e-12)
     sums = found.sums
     monkeypatch.setattr(units, "MOST_HELD", 1)
-    again = made.case(path=case.problem.path).units(case.windows[0])
+    again = units.units_of(made.case(path=case.problem.path), case.windows[0])
     assert again.rows == pytest.approx(found.rows, rel=1e-12)
     assert again.sums == pytest.approx(sums, rel=1e-12)
     assert claims.precision_of(case) >= claims.PRECISION
@@ -327,10 +329,10 @@ def test_slopes_on_pieces_may_be_moved_as_far_as_every_control_of_few_functions_
     rng, K = np.random.default_rng(7), 4
     problem = replace(kind("alone").case().problem, control=Box([-1.0, -0.25], [0.5, 0.5]))
     for values in (np.ones((1, K)), np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, -1.0, -1.0]])):
-        few, flows = sr.Dictionary(np.linspace(0.0, HORIZON, K + 1), values), Flows.of(problem.system, HORIZON)
+        few, flows = sr.Dictionary(np.linspace(0.0, HORIZON, K + 1), values), VerifiedFlows.of(problem.system, HORIZON)
         duality = Duality(problem, few, None, flows)
         slope, moved = rng.normal(size=(K, 2)), rng.normal(size=(K, 2))
-        row = Row(arb(0.25), [[arb(v) for v in piece] for piece in slope])
+        row = ConstraintRow(arb(0.25), [[arb(v) for v in piece] for piece in slope])
         constant, slopes = duality.summed([(2.0, row)], (-moved.T).tolist())
         assert np.array([[float(x.mid()) for x in piece] for piece in slopes]) == pytest.approx(moved)
         low, high = (end[:, None] for end in (problem.control.lower, problem.control.upper))
@@ -360,7 +362,7 @@ def test_a_bound_is_the_least_of_the_cost_and_of_what_rows_say_of_sizes() -> Non
         rows, constant, slope, sizes = [], 0.0, np.zeros((3, 2)), np.zeros((3, 2))
         for _ in range(count):
             y, c, g, s = rng.uniform(0.2, 1.0), rng.normal(), rng.normal(size=(3, 2)), rng.uniform(size=(3, 2))
-            rows.append((y, Row(arb(c), [[arb(v) for v in piece] for piece in g], s)))
+            rows.append((y, ConstraintRow(arb(c), [[arb(v) for v in piece] for piece in g], s)))
             constant, slope, sizes = constant + y * c, slope + y * g, sizes + y * s
         for price, costs in ((case.price, lengths * np.array([1.0, 0.25])), (None, 0.0 * lengths)):
             ends = [slope * u + (costs + sizes) * np.abs(u) for u in (low, high)]
@@ -377,10 +379,10 @@ def test_what_errors_of_execution_add_beside_a_row_is_near_its_chord() -> None:
     case = made.case(path=[walls("alone", "fixed", made)[0](np.full(4, 9.0))], execution=shares)
     c = np.array([0.5, -1.25])
     beside = case.beside(case.windows[0], c[None], np.zeros((1, 2)))
-    assert beside is not None and case.execution is not None
+    assert beside is not None and case.sources.execution is not None
     for a, b in ((0.125, 0.1875), (0.25, 0.5), (0.75, 1.0), (1.5, 2.0), (1.25, 1.25)):
         none, times = Polynomial(np.zeros((1, 1)), 0.0, 0.0, 0.0), [a] if a == b else [a, b]
-        found = beside._erring(none, case.execution, c, np.zeros(2), times, None)
+        found = beside._erring(none, case.sources.execution, c, np.zeros(2), times, None)
         terms, off = found.coefficients[:, 0], found.error
         truth = []
         for share in (0.0, 0.25, 0.5, 0.75, 1.0):

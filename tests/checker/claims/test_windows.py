@@ -24,8 +24,10 @@ from sparserob_core.checker.claims import claims, constraints, multipliers, repl
 from sparserob_core.checker.claims.case import Case, numbers
 from sparserob_core.checker.claims.causal import _shared, causal_bound
 from sparserob_core.checker.claims.cells import Place, _cut
+from sparserob_core.checker.claims.units import units_of
 from sparserob_core.checker.cost.price import _semidefinite
 from sparserob_core.checker.outcome import RESOLVED, Broken, Clock, Finding, Unchecked
+from sparserob_core.checker.reach import followed as followed_rows
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
@@ -76,16 +78,16 @@ def test_measurable_disturbances_in_time_stray_from_their_middle_by_half_their_w
     plant = sr.VaryingSystem.of([["-t"]], [[1]], 2.0, [[1, "t"]])
     bound = Box([-0.1, 0.05], [0.3, 0.05])
     case = case_of(system=plant, disturbance=bound, disturbance_class="measurable")
-    held, strayed = case.held, case.strayed
+    held, strayed = case.disturbances.held, case.sources.strayed
     assert isinstance(held, Box)
     np.testing.assert_array_equal(held.lower, held.upper)
     np.testing.assert_allclose(held.lower, [0.1, 0.05], rtol=1e-15)
-    assert strayed.shares[1] == 0.0
-    assert strayed.off[1] < 1e-300
-    assert 0.0 < strayed.off[0] < 1e-15
+    assert strayed.input.shares[1] == 0.0
+    assert strayed.input.off[1] < 1e-300
+    assert 0.0 < strayed.input.off[0] < 1e-15
     for end in (bound.upper[0], bound.lower[0]):
         far = abs(Fraction(float(end)) - Fraction(float(held.lower[0])))
-        assert abs(far - Fraction(float(strayed.shares[0]))) <= Fraction(float(strayed.off[0]))
+        assert abs(far - Fraction(float(strayed.input.shares[0]))) <= Fraction(float(strayed.input.off[0]))
 
 
 @pytest.fixture(autouse=True)
@@ -417,11 +419,11 @@ def test_a_status_follows_from_the_claims_under_it():
     assert claims.relative_gap(case_of(certificate={"cost": -1.0}), -1.0, -4.0) == 0.75
 
 
-@pytest.mark.parametrize("followed", [1, constraints.FOLLOWED])
+@pytest.mark.parametrize("followed", [1, followed_rows.FOLLOWED])
 def test_infeasibility_needs_a_sum_that_is_positive(followed, monkeypatch):
     """``x(2) <= -1.1`` and ``|u| <= 1``: at best -1 + 0.5. No decision is written then, also where rows are
     followed."""
-    monkeypatch.setattr(constraints, "FOLLOWED", followed)
+    monkeypatch.setattr(followed_rows, "FOLLOWED", followed)
     entry = {"constraint": "terminal", "time": 2.0, "direction": [1.0], "parameter": [], "multiplier": 1.0}
 
     def judged(goal, **more):
@@ -615,22 +617,22 @@ def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it
         (Box([-np.inf], [0.5]), [0.5]),
     ):
         case = case_of(wall)
-        assert case.units(case.windows[0]).rows == pytest.approx(unit)
+        assert units_of(case, case.windows[0]).rows == pytest.approx(unit)
     early = case_of(sr.PathConstraint(Box([-9.0], [9.0]), 0.0, 1.0))
-    assert early.units(early.windows[0]).rows == pytest.approx([2.25, 2.25])
-    assert early.units(early.windows[0]).sums == pytest.approx([2.25])
+    assert units_of(early, early.windows[0]).rows == pytest.approx([2.25, 2.25])
+    assert units_of(early, early.windows[0]).sums == pytest.approx([2.25])
     late = case_of(sr.PathConstraint(Box([-9.0], [9.0]), 0.5, 2.0))
-    assert late.units(late.windows[0]).rows == pytest.approx([3.5, 3.5])
+    assert units_of(late, late.windows[0]).rows == pytest.approx([3.5, 3.5])
     moving = case_of(sr.PathConstraint(Box([-9.0], [9.0]), relative_to=np.array([[0.0, 1.0], [2.0, 1.0]])))
-    assert moving.units(moving.windows[0]).rows == pytest.approx([2.5, 2.5])
-    assert moving.units(moving.windows[0]).sums == pytest.approx([4.5])
+    assert units_of(moving, moving.windows[0]).rows == pytest.approx([2.5, 2.5])
+    assert units_of(moving, moving.windows[0]).sums == pytest.approx([4.5])
     ball = case_of(NormBall(2.0, 3.0, centre=[0.5]))
     window = ball.windows[0]
-    assert ball.units(window).slack(np.array([2.0]), window.limit(np.array([2.0]), 0.0)) == pytest.approx(
+    assert units_of(ball, window).slack(np.array([2.0]), window.limit(np.array([2.0]), 0.0)) == pytest.approx(
         6e-9 if window.seen.facets is None else 2e-9 * 2.5, rel=0.5
     )
     flat = case_of(Box([-9.0], [2.0]))
-    slack = flat.units(flat.windows[0]).slack
+    slack = units_of(flat, flat.windows[0]).slack
     assert slack(np.array([1.0]), arb(2)) == pytest.approx(2e-9)
     assert slack(np.array([-2.0]), arb(18)) == pytest.approx(7e-9)
 
@@ -790,8 +792,9 @@ def test_numbers_are_looked_at_whatever_they_are_nested_in():
 
 def test_units_know_how_far_each_channel_of_the_decision_goes_at_any_time():
     two = {"system": LinearSystem(np.zeros((1, 1)), np.ones((1, 2)), E=ONE), "control": Box([-9.0] * 2, [9.0] * 2)}
-    assert case_of(decision=((0.5, -2.0), (-3.0, 1.0)), **two)._acting.tolist() == [2.0, 3.0]
-    assert case_of(decision=((0.5, -2.0), (-3.0, 1.0)), certificate={"decision": None}, **two)._acting is None
+    case = case_of(Box([-9.0], [9.0]), decision=((0.5, -2.0), (-3.0, 1.0)), **two)
+    acting = units_of(case, case.windows[0]).acting
+    assert acting is not None and acting.tolist() == [2.0, 3.0]
 
 
 @pytest.mark.first(3)
@@ -821,12 +824,12 @@ def test_a_wall_is_judged_as_a_point_where_it_is_thinner_than_doubles_resolve(sh
     }  # fmt: skip
     half = 0.5 * share * 2.0**-34 * np.array([3.0, 2.5])
     case = case_of(Box(np.array([1.0, 0.5]) - half, np.array([1.0, 0.5]) + half), **plane)
-    told = case.units(case.windows[0])
+    told = units_of(case, case.windows[0])
     reach, floor = np.tile([3.0, 2.5], 2), RESOLVED * np.tile([3.0, 2.5], 2)
     assert told.resolved == pytest.approx(reach if share < 1.0 else floor, rel=1e-6)
     assert told.rows == pytest.approx([1.5, 0.5, 1.5, 0.5] if share < 1.0 else floor, rel=1e-6)
     single = case_of(Polytope(np.array([[1.0, 0.0]]), np.array([share * 2.0**-34 * 3.0])), **plane)
-    bound = single.units(single.windows[0]).resolved  # of a wall by itself the same, next to 0
+    bound = units_of(single, single.windows[0]).resolved  # of a wall by itself the same, next to 0
     assert bound == pytest.approx([3.0 if share < 1.0 else RESOLVED * 3.0], rel=1e-6)
 
 
@@ -839,10 +842,12 @@ def test_a_direction_of_a_curved_wall_is_allowed_a_billionth_of_its_width_or_of_
     wide = case_of(NormBall(2.0, 3.0, centre=[0.5, 0.1]), **plane)
     (window,) = wide.windows
     length = float(np.linalg.norm(direction))
-    assert wide.units(window).slack(direction, window.limit(direction, 0.0)) == pytest.approx(3e-9 * length, rel=1e-12)
+    assert units_of(wide, window).slack(direction, window.limit(direction, 0.0)) == pytest.approx(
+        3e-9 * length, rel=1e-12
+    )
     thin = case_of(NormBall(2.0, 1e-12, centre=[1.0, 0.5]), **plane)
     (window,) = thin.windows
-    told = thin.units(window)
+    told = units_of(thin, window)
     # the initial state, and the range of the control on each of two pieces
     assert told.sums == pytest.approx([3.0, 2.5])
     # beside these a set of 1e-12 is a point, and what is excused of one is a billionth of what the states do
@@ -853,7 +858,7 @@ def test_a_direction_of_a_curved_wall_is_allowed_a_billionth_of_its_width_or_of_
     for width, unit in ((2.0**-34 * 0.99, 0.5), (2.0**-34 * 1.01, RESOLVED * 2.5)):
         near = case_of(NormBall(2.0, 2.5 * width, centre=[1.0, 0.5]), **plane)
         (window,) = near.windows
-        slack = near.units(window).slack(axis, window.limit(axis, 0.0))
+        slack = units_of(near, window).slack(axis, window.limit(axis, 0.0))
         assert slack == pytest.approx(1e-9 * unit, rel=1e-9)
 
 
@@ -873,8 +878,8 @@ def test_a_box_of_parameters_is_looked_at_once_for_all_directions(monkeypatch):
                 a, b = np.array([low, low]), np.array([high, high])
                 a[axis] = b[axis] = sign
                 cells.append(([2.0, -0.1, -1.0, *a], [2.0, 0.1, 1.0, *b]))
-    known_tube = constraints.Tube
-    monkeypatch.setattr(constraints, "Tube", lambda *given: made.append(given[1].middle) or known_tube(*given))
+    known_tube = constraints.VerifiedTube
+    monkeypatch.setattr(constraints, "VerifiedTube", lambda *given: made.append(given[1].middle) or known_tube(*given))
 
     def shown(radius):
         made.clear()

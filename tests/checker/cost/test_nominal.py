@@ -14,11 +14,11 @@ from scipy.integrate import solve_ivp
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import Series, identity, stacked
-from sparserob_core.checker.cost.nominal import Nominal, nominal_states, walked
+from sparserob_core.checker.cost.nominal import NominalMotion, nominal_states, walked
 from sparserob_core.checker.cost.price import Price
-from sparserob_core.checker.flow.flow import Flow, Part
+from sparserob_core.checker.flow.flow import FlowPart, VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.segment import SHARP, Segment
+from sparserob_core.checker.flow.segment import SHARP, VerifiedSegment
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.expression import parse_matrix
@@ -46,10 +46,10 @@ def problem_of(system, until: float, Q=None, r=None, **more) -> sr.OptimalContro
     return sr.OptimalControlProblem(system=system, horizon=until, **{**known, **more})
 
 
-def nominal_of(problem, parameter=(), sharp: float = SHARP) -> Nominal:
-    flow = Flow(Plant.of(problem.system, problem.horizon), problem.horizon).at(parameter)
+def nominal_of(problem, parameter=(), sharp: float = SHARP) -> NominalMotion:
+    flow = VerifiedFlow(Plant.of(problem.system, problem.horizon), problem.horizon).at(parameter)
     flow.sharp = sharp
-    return Nominal(problem, flow)
+    return NominalMotion(problem, flow)
 
 
 def van_loan(A, B, c, Q, r, time) -> tuple[arb_mat, arb_mat]:
@@ -136,8 +136,8 @@ def test_a_law_that_changes_with_time_costs_what_is_integrated_by_hand() -> None
 def test_what_a_polynomial_leaves_out_counts_in_every_product(terms: list[float], off: float) -> None:
     """A flow of ``t``, ``1 - t`` or ``t^2`` may be off by as much all along as it says."""
     problem = problem_of(LinearSystem(np.zeros((1, 1)), np.ones((1, 1))), 8.0, np.array([[3.0]]), [0.0])
-    made = Segment([Series.known(stacked([balls([x, 0.0, 0.0])])) for x in terms], np.array([[off, 0.0, 0.0]]))
-    step, cost = nominal_of(problem)._integrate(Part(made, arb(1), arb(2)))
+    made = VerifiedSegment([Series.known(stacked([balls([x, 0.0, 0.0])])) for x in terms], np.array([[off, 0.0, 0.0]]))
+    step, cost = nominal_of(problem)._integrate(FlowPart(made, arb(1), arb(2)))
     for by in (-off, off):
         true = [terms[0] + by, *terms[1:]]
         squares = sum(a * b / arb(i + j + 1) for i, a in enumerate(true) for j, b in enumerate(true))
@@ -210,7 +210,7 @@ def test_a_cost_without_states_asks_for_no_weight() -> None:
     problem = replace(everything(False), cost=sr.Cost(control={"R": [[0.05]]}))
     nominal = nominal_of(problem, (0.05,))
     assert nominal.weight(0.0, 1.3) == nominal.running * 0
-    assert not nominal._tables
+    assert "_tabulate_remembered" not in nominal.__dict__
 
 
 def test_a_plant_that_grows_is_resolved_by_more_bits_and_by_a_sharper_guess() -> None:
@@ -219,7 +219,7 @@ def test_a_plant_that_grows_is_resolved_by_more_bits_and_by_a_sharper_guess() ->
     for a, resolved in ((10.0, True), (40.0, True), (200.0, False)):
         problem = problem_of(LinearSystem(np.array([[a]]), np.ones((1, 1))), 2.0, np.ones((1, 1)), [0.0])
         with ctx.workprec(BITS):
-            price = Price(problem, dictionary, Flow(Plant.of(problem.system, 2.0), 2.0))
+            price = Price(problem, dictionary, VerifiedFlow(Plant.of(problem.system, 2.0), 2.0))
             pieces = [stacked([balls([-a])])] * 2
             if resolved:
                 assert abs(price.squares(pieces) - 2) < 1e-4
@@ -239,7 +239,9 @@ def test_intervals_of_one_kind_share_what_is_made_of_them() -> None:
 
 def test_what_was_found_serves_the_same_control_and_no_more_bits() -> None:
     problem = problem_of(LinearSystem(-np.ones((1, 1)), np.ones((1, 1))), 2.0, np.ones((1, 1)), [0.0])
-    price = Price(problem, Dictionary.indicators(np.array([0.0, 2.0])), Flow(Plant.of(problem.system, 2.0), 2.0))
+    price = Price(
+        problem, Dictionary.indicators(np.array([0.0, 2.0])), VerifiedFlow(Plant.of(problem.system, 2.0), 2.0)
+    )
     one, other = ([stacked([balls([u])])] for u in (1.0, 0.0))
     radii = []
     for bits in (96, 192, 96):

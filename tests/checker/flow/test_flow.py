@@ -19,11 +19,11 @@ import sparserob_core.checker.flow.flow as flows
 import sparserob_core.checker.flow.law as laws
 import sparserob_core.checker.flow.segment as segments
 from sparserob_core.checker.arithmetic.series import Series, stacked
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.law import Box
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from tests.support.integration import mathieu
@@ -32,8 +32,8 @@ FADING = VaryingSystem.of([["-1/(1 + t)"]], [["t", 1]], 3.0, [["2 - t"]], c=["3*
 BITS = 192
 
 
-def of(system, until, box=None, degree=0) -> Flow:
-    return Flow(Plant.of(system, until), until, box or Box(), degree)
+def of(system, until, box=None, degree=0) -> VerifiedFlow:
+    return VerifiedFlow(Plant.of(system, until), until, box or ParameterBox(), degree)
 
 
 def at(one: Series, point) -> arb_mat:
@@ -58,7 +58,7 @@ def exact(start: float, stop: float) -> list[arb]:
     return [(1 + a) / (1 + b), *(one / (1 + b) for one in driven)]
 
 
-def entries(flow: Flow, start: float, stop: float) -> list[arb]:
+def entries(flow: VerifiedFlow, start: float, stop: float) -> list[arb]:
     Phi, B, E = flow.over(start, stop)
     return Phi.beside(B).beside(E).matrix.entries()
 
@@ -101,10 +101,10 @@ def test_a_chord_of_a_loop_is_missed_by_its_powers_and_twice_what_is_left_of_the
         ),
         state=lambda *_: stacked([[arb(1), arb(0.5)]]),
         drives=[stacked([[arb(7), arb(7)]])],
-        radii=np.array([4.0]),
+        deviations=SimpleNamespace(radii=np.array([4.0])),
     )
     with ctx.workprec(BITS):
-        bound = ClosedLoop.bent(told, 0, 0.0, 1.0, np.array([[1.0]]))
+        bound = VerifiedLoop.bent(told, 0, 0.0, 1.0, np.array([[1.0]]))
     share = np.linspace(0.0, 1.0, 10001)
     chords = [float((share - share**n).max()) for n in (2, 3)]
     expected = (2 * chords[0] + 3 * chords[1] + 2 * 0.5) * (1.0 + 0.5 * 4.0)
@@ -187,8 +187,8 @@ def moving(**more) -> VaryingSystem:
 STIFF = LinearSystem(np.array([[-400.0, 3.0], [1.0, -0.1]]), np.array([[1.0], [0.0]]), np.eye(2))
 APART = LinearSystem(np.array([[0.0, 1e6], [-2e-6, -0.5]]), np.array([[1e5], [1.0]]), np.array([[1e6], [0.0]]))
 FAST = VaryingSystem.of([["-300*(2 + cos(t))", 1], [0, "-t"]], [[1], ["t"]], 2.0)
-NONE, POINT = Box(), Box((0.03, -0.05), (0.0, 0.0))
-ONE, BOTH = Box((0.0, 0.02), (0.05, 0.0)), Box((0.0, 0.0), (0.03, 0.05))
+NONE, POINT = ParameterBox(), ParameterBox((0.03, -0.05), (0.0, 0.0))
+ONE, BOTH = ParameterBox((0.0, 0.02), (0.05, 0.0)), ParameterBox((0.0, 0.0), (0.03, 0.05))
 CASES = {
     "known": (spring(), 2.0, POINT, 0, 1e-24),
     "uncertain": (spring(), 2.0, ONE, 8, 1e-10),
@@ -240,7 +240,7 @@ def integrated(system, start: float, stop: float, p) -> np.ndarray:
     return found
 
 
-def points(box: Box, count: int = 2) -> list[np.ndarray]:
+def points(box: ParameterBox, count: int = 2) -> list[np.ndarray]:
     rng, wide = np.random.default_rng(5), np.array(box.halves) > 0.0
     if not wide.any():
         return [np.zeros(len(box.middle))]

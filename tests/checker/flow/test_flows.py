@@ -11,8 +11,8 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.flow import flows as several
-from sparserob_core.checker.flow.flows import Flows
-from sparserob_core.checker.flow.law import Box
+from sparserob_core.checker.flow.flows import VerifiedFlows
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
@@ -24,9 +24,9 @@ def _precision():
         yield
 
 
-def moving(text: str, low: float, high: float, until: float = 3.0) -> Flows:
+def moving(text: str, low: float, high: float, until: float = 3.0) -> VerifiedFlows:
     system = VaryingSystem.of([[text]], [[1]], until, [[1]], parameters=sr.Box([low], [high]), names=["p"])
-    return Flows(Plant.of(system, until), until, Box.between([low], [high]))
+    return VerifiedFlows(Plant.of(system, until), until, ParameterBox.between([low], [high]))
 
 
 SYSTEM = ("-0.5 - p*sin(2*t)", -0.3, 0.6)
@@ -47,7 +47,7 @@ def transition(flow, p: float, start: float, stop: float) -> arb:
 )
 def test_a_flow_that_holds_a_box_is_right_at_every_parameter_in_it(low: float, high: float) -> None:
     every = moving(*SYSTEM)
-    box = Box.between([low], [high])
+    box = ParameterBox.between([low], [high])
     flow = every.holding(box)
     assert flow.box.holds(box) or flow.box == box
     for p in (low, high, (low + high) / 2):
@@ -60,13 +60,13 @@ def test_a_flow_that_holds_a_box_is_right_at_every_parameter_in_it(low: float, h
 
 def test_larger_boxes_serve_smaller_ones_where_they_are_close() -> None:
     every = moving(*SYSTEM)
-    small = [Box.between([low], [low + 0.01]) for low in (-0.25, 0.1, 0.55)]
+    small = [ParameterBox.between([low], [low + 0.01]) for low in (-0.25, 0.1, 0.55)]
     assert {every.holding(one) for one in small} == {every.holding(every.box)}
 
 
 @pytest.mark.slow
 def test_boxes_are_halved_where_they_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = [Box.between([low], [low + 0.01]) for low in (-0.25, 0.1, 0.55)]
+    small = [ParameterBox.between([low], [low + 0.01]) for low in (-0.25, 0.1, 0.55)]
     monkeypatch.setattr(several, "CLOSE", 1e-25)
     apart = moving(*SYSTEM)
     held = [apart.holding(one) for one in small]
@@ -75,7 +75,7 @@ def test_boxes_are_halved_where_they_are_not(monkeypatch: pytest.MonkeyPatch) ->
         assert flow.box.holds(one)
         assert abs(transition(flow, one.middle[0], 0.0, 3.0) - decay(3.0, one.middle[0])) < 1e-14
     # a box across all that is halved has a flow of its own
-    across = Box.between([0.149], [0.151])
+    across = ParameterBox.between([0.149], [0.151])
     assert apart.holding(across).box.holds(across)
 
 
@@ -85,7 +85,7 @@ def test_what_goes_away_in_the_middle_of_the_parameters_is_followed_elsewhere() 
     assert len(every.timing.stretches) > 8
     assert every.marks([0.0, 3.0]) == every.holding(every.box).marks([0.0, 3.0])
     for low, high in ((-0.1, 0.1), (0.05, 0.06), (0.0, 0.0)):
-        flow = every.holding(Box.between([low], [high]))
+        flow = every.holding(ParameterBox.between([low], [high]))
         for p in (low, high):
             found = transition(flow, p, 0.0, 3.0)
             truth = np.exp(-3.0 + p * (1 - np.cos(36.0)) / 12)
@@ -94,7 +94,7 @@ def test_what_goes_away_in_the_middle_of_the_parameters_is_followed_elsewhere() 
 
 def test_a_parameter_at_which_nothing_changes_with_time_has_a_flow_over_the_stretches_of_all() -> None:
     every = moving("-1 + p*sin(9*t)", 0.0, 0.2)
-    flow = every.over(Box((0.0,), (0.0,)), 4)
+    flow = every.over(ParameterBox((0.0,), (0.0,)), 4)
     assert abs(transition(flow, 0.0, 0.1, 2.9) - (arb("-2.8")).exp()) < 1e-14
     marks = flow.marks([0.0, 3.0])
     for a, b in pairwise(marks):
@@ -104,30 +104,30 @@ def test_a_parameter_at_which_nothing_changes_with_time_has_a_flow_over_the_stre
 def test_what_does_not_change_with_time_has_a_flow_for_every_box() -> None:
     A = parse_matrix("A", [["p1"]], ("p1",))
     system = LinearSystem(A, np.ones((1, 1)), parameters=sr.Box([-1.0], [1.0]))
-    every = Flows(Plant.of(system, 1.0), 1.0, Box((0.0,), (1.0,)))
-    box = Box((0.5,), (0.25,))
+    every = VerifiedFlows(Plant.of(system, 1.0), 1.0, ParameterBox((0.0,), (1.0,)))
+    box = ParameterBox((0.5,), (0.25,))
     flow = every.holding(box)
     assert flow.box == box and flow.monomials.degree == every.degree == 8
     assert every.holding(box) is flow and every.over(box, 3) is not flow
-    known = Flows(Plant.of(LinearSystem(np.eye(1), np.ones((1, 1))), 1.0), 1.0)
-    assert known.holding(Box()) is known.at(()) and known.degree == 0
+    known = VerifiedFlows(Plant.of(LinearSystem(np.eye(1), np.ones((1, 1))), 1.0), 1.0)
+    assert known.holding(ParameterBox()) is known.at(()) and known.degree == 0
 
 
 def test_the_parameter_that_matters_most_is_halved() -> None:
     system = VaryingSystem.of(
         [["-p*(1 + sin(t)) - 0.001*q"]], [[1]], 2.0, [[1]], parameters=sr.Box([0.0, 0.0], [1.0, 9.0]), names=["p", "q"]
     )
-    every = Flows(Plant.of(system, 2.0), 2.0, Box.between([0.0, 0.0], [1.0, 9.0]))
+    every = VerifiedFlows(Plant.of(system, 2.0), 2.0, ParameterBox.between([0.0, 0.0], [1.0, 9.0]))
     assert every._axis(every.box) == 0
-    assert every._axis(Box((0.5, 4.5), (1e-6, 4.5))) == 1
+    assert every._axis(ParameterBox((0.5, 4.5), (1e-6, 4.5))) == 1
 
 
 def test_no_more_flows_are_remembered_than_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(several, "KEPT", 3)
     every = moving(*SYSTEM)
     for k in range(6):
-        every.over(Box((0.1 * k,), (0.01,)), 2)
-    assert len(every._made) == 3
+        every.over(ParameterBox((0.1 * k,), (0.01,)), 2)
+    assert len(every.__dict__["_over_remembered"]) == 3
 
 
 def test_entries_that_are_ever_other_than_0_or_depend_on_parameters_are_links() -> None:
@@ -136,7 +136,7 @@ def test_entries_that_are_ever_other_than_0_or_depend_on_parameters_are_links() 
         [["0*t", "sin(16.755160819145562*t)"], [0, "p^2"]], [[0, "q - q"], ["t", 2]], 3.0, [[0], ["p*t - t*p"]],
         parameters=sr.Box([-0.5, -0.5], [0.5, 0.5]), names=["p", "q"], c=["q*sin(t)", 0],
     )  # fmt: skip
-    there, moved = Flows(Plant.of(system, 3.0), 3.0, Box((0.0, 0.0), (0.5, 0.5))).links
+    there, moved = VerifiedFlows(Plant.of(system, 3.0), 3.0, ParameterBox((0.0, 0.0), (0.5, 0.5))).links
     assert there.astype(int).tolist()[0] == [0, 1, 0, 0, 1, 0]
     assert there.astype(int).tolist()[1][:5] == [0, 1, 1, 1, 0]
     assert moved.astype(int).tolist()[0] == [0, 0, 0, 0, 1, 0]
@@ -145,11 +145,11 @@ def test_entries_that_are_ever_other_than_0_or_depend_on_parameters_are_links() 
 
 def test_at_one_parameter_or_none_nothing_depends_on_it() -> None:
     system = VaryingSystem.of([["-t", "sin(3*t)"], [0, 0]], [[0], [1]], 2.0)
-    there, moved = Flows(Plant.of(system, 2.0), 2.0).links
+    there, moved = VerifiedFlows(Plant.of(system, 2.0), 2.0).links
     assert there.astype(int).tolist()[0][:3] == [1, 1, 0] and not moved.any()
     A = parse_matrix("A", [["p1**3", "1"], ["0", "exp(p1)"]], ("p1",))
     still = LinearSystem(A, np.array([[0.0], [1.0]]), parameters=sr.Box([-1.0], [1.0]))
-    there, moved = Flows(Plant.of(still, 1.0), 1.0, Box((0.0,), (1.0,))).links
+    there, moved = VerifiedFlows(Plant.of(still, 1.0), 1.0, ParameterBox((0.0,), (1.0,))).links
     assert there[:, :2].astype(int).tolist() == [[1, 1], [0, 1]] and moved[:, :2].astype(int).tolist() == [
         [1, 0],
         [0, 1],

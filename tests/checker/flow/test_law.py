@@ -12,7 +12,7 @@ from flint import arb, arb_mat, ctx
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.flow import law as laws
-from sparserob_core.checker.flow.law import LONG, Box, Law, Stretch
+from sparserob_core.checker.flow.law import LONG, Law, ParameterBox, Stretch
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.expression import parse_matrix
@@ -71,7 +71,7 @@ def holds(law: Law, points, function, near: float) -> None:
 def test_numbers_at_every_time_are_in_narrow_balls_where_parameters_are_known(text: str) -> None:
     system = VaryingSystem.of([[text]], [["1"]], 2.0, [[1]], parameters=sr.Box([-0.3], [0.4]), names=["p"])
     entry = system.phases[0].entry("A")
-    law = Law(Plant.of(system, 2.0), 2.0, Box((0.15,), (0.0,)))
+    law = Law(Plant.of(system, 2.0), 2.0, ParameterBox((0.15,), (0.0,)))
     holds(law, [()], lambda t, p: [[float(entry(np.array([t, 0.15], dtype=object))[0, 0]), 1.0, 1.0]], 1e-25)
 
 
@@ -80,7 +80,7 @@ def test_numbers_at_every_time_are_in_narrow_balls_where_parameters_are_known(te
 def test_numbers_at_every_time_and_parameter_are_in_balls_that_narrow_with_the_degree(text: str, degree: int) -> None:
     system = VaryingSystem.of([[text]], [["1"]], 2.0, [[1]], parameters=sr.Box([-0.3], [0.4]), names=["p"])
     entry = system.phases[0].entry("A")
-    law = Law(Plant.of(system, 2.0), 2.0, Box.between([-0.1], [0.2]), degree)
+    law = Law(Plant.of(system, 2.0), 2.0, ParameterBox.between([-0.1], [0.2]), degree)
     points = [(-1.0,), (1.0,)]
     near = 1.0 if degree == 1 else 0.1
     holds(law, points, lambda t, p: [[float(entry(np.array([t, p[0]], dtype=object))[0, 0]), 1.0, 1.0]], near)
@@ -95,7 +95,7 @@ def test_phases_hold_their_own_laws_with_drifts_and_disturbances() -> None:
     second = LinearSystem(other, np.array([[2.0], [0.0]]), np.array([[0.0], [3.0]]), box, names, drift)
     plant = Plant.of(SwitchedSystem([(0.75, first), (2.0, second)]), 2.0)
     assert (plant.states, plant.driven, len(plant.phases)) == (2, 2, 2)
-    law = Law(plant, 2.0, Box.between([-0.1, 0.2], [0.1, 0.3]), 6)
+    law = Law(plant, 2.0, ParameterBox.between([-0.1, 0.2], [0.1, 0.3]), 6)
 
     def truth(number, p):
         if not number:
@@ -118,14 +118,14 @@ def test_laws_in_turns_that_change_with_time_begin_and_end_where_they_do() -> No
     system = VaryingSystem.taking_turns(
         [(0.7, ([["t"]], [[1]], None, None)), (2.0, ([["-1/(1 + t)"]], [[0]], None, None))]
     )
-    law = Law(Plant.of(system, 2.0), 2.0, Box())
+    law = Law(Plant.of(system, 2.0), 2.0, ParameterBox())
     assert 0.7 in [one.stop for one in law.stretches]
     for stretch in law.stretches:
         middle = (stretch.start + stretch.stop) / 2
         ((A, B, *_),) = seen(law, stretch, stretch.start, stretch.stop, 0.5, ())
         assert abs(float(A) - (middle if middle < 0.7 else -1 / (1 + middle))) < 1e-15
         assert (middle < 0.7) == B
-    shorter = Law(Plant.of(system, 2.0), 0.5, Box())
+    shorter = Law(Plant.of(system, 2.0), 0.5, ParameterBox())
     assert shorter.stretches[-1].stop == 0.5 and all(one.start < 0.7 for one in shorter.stretches)
 
 
@@ -143,10 +143,10 @@ def test_laws_in_turns_that_change_with_time_begin_and_end_where_they_do() -> No
 def test_what_changes_with_time_is_not_taken_for_what_does_not(rows, still: bool) -> None:
     """Not even where a number so wide that it holds all of that were allowed."""
     system = VaryingSystem.of(rows, [[1], [0]], 3.0)
-    law = Law(Plant.of(system, 3.0), 3.0, Box())
+    law = Law(Plant.of(system, 3.0), 3.0, ParameterBox())
     assert [one.is_still for one in law.stretches] == [True] if still else len(law.stretches) > 1
     entering = VaryingSystem.of([[0, 1], [0, 0]], [row[:1] for row in rows], 3.0)
-    pushed = Law(Plant.of(entering, 3.0), 3.0, Box())
+    pushed = Law(Plant.of(entering, 3.0), 3.0, ParameterBox())
     assert len(pushed.stretches) == 1 if still else len(pushed.stretches) > 1
     for one in (*law.stretches, *pushed.stretches):
         radii = [float(c.rad()) for row in one.table[0] for entry in row for c in entry.coeffs()]
@@ -155,14 +155,14 @@ def test_what_changes_with_time_is_not_taken_for_what_does_not(rows, still: bool
 
 def test_strides_of_what_does_not_change_are_powers_of_two_that_move_states_by_little() -> None:
     for rate, longest in ((0.0, 4.0), (1e-3, 4.0), (3.0, 0.5), (1e5, 2.0**-16)):
-        (one,) = Law(Plant.of(LinearSystem(np.array([[-rate]]), np.ones((1, 1))), 2.5), 2.5, Box()).stretches
+        (one,) = Law(Plant.of(LinearSystem(np.array([[-rate]]), np.ones((1, 1))), 2.5), 2.5, ParameterBox()).stretches
         assert one.is_still and one.stride == longest
         assert one.stride >= 2.5 or rate * one.stride <= LONG < 2 * rate * one.stride
 
 
 def test_stretches_of_what_changes_move_states_by_little_each() -> None:
     system = VaryingSystem.of([[0, 1], ["-(400 + 100*sin(20*t))", "-0.1"]], [[0], [1]], 3.0)
-    law = Law(Plant.of(system, 3.0), 3.0, Box())
+    law = Law(Plant.of(system, 3.0), 3.0, ParameterBox())
     for one in law.stretches:
         most, slope = one.sizes
         A = most[:, :2] * one.units / one.units[:, None] * (one.stop - one.start)
@@ -184,23 +184,23 @@ def test_stretches_of_what_changes_move_states_by_little_each() -> None:
 def test_a_pole_is_refused_with_its_time(rows, where: str) -> None:
     system = VaryingSystem.of(rows, [[1]], 2.0)
     with pytest.raises(Unchecked, match=f"near t = {where}.*not enclosed"):
-        _ = Law(Plant.of(system, 2.0), 2.0, Box()).stretches
+        _ = Law(Plant.of(system, 2.0), 2.0, ParameterBox()).stretches
 
 
 @pytest.mark.parametrize("text", ["1 / p1", "log(p1)", "sqrt(p1)", "tan(p1 + pi/2)", "p1**-1"])
 def test_a_pole_in_the_box_of_parameters_is_refused(text: str) -> None:
     system = LinearSystem(parse_matrix("A", [[text]], ("p1",)), np.ones((1, 1)), parameters=sr.Box([0.6], [0.8]))
-    fine = Law(Plant.of(system, 1.0), 1.0, Box.between([0.6], [0.8]), 4)
+    fine = Law(Plant.of(system, 1.0), 1.0, ParameterBox.between([0.6], [0.8]), 4)
     assert len(fine.stretches) == 1
     with pytest.raises(Unchecked):
-        _ = Law(Plant.of(system, 1.0), 1.0, Box.between([-0.1], [0.3]), 4).stretches
+        _ = Law(Plant.of(system, 1.0), 1.0, ParameterBox.between([-0.1], [0.3]), 4).stretches
 
 
 def test_an_entry_that_is_no_arithmetic_is_left_unchecked() -> None:
     system = LinearSystem(lambda p: np.array([[p[0] * 1.0]]), np.ones((1, 1)), parameters=sr.Box([0.6], [0.8]))
     object.__setattr__(system.phases[0], "A", lambda p: np.array([[float(p[0])]]))
     with pytest.raises(Unchecked):
-        _ = Law(Plant.of(system, 1.0), 1.0, Box((0.7,), (0.1,)), 2).stretches
+        _ = Law(Plant.of(system, 1.0), 1.0, ParameterBox((0.7,), (0.1,)), 2).stretches
 
 
 def test_stretches_of_boxes_are_those_of_a_timing() -> None:
@@ -208,18 +208,18 @@ def test_stretches_of_boxes_are_those_of_a_timing() -> None:
         [["-p*(1 + sin(3*t))"]], [["1/(4 - t)"]], 3.0, [[1]], parameters=sr.Box([0.0], [30.0]), names=["p"]
     )
     plant = Plant.of(system, 3.0)
-    timing = Law(plant, 3.0, Box((15.0,), (0.0,)))
-    law = Law(plant, 3.0, Box((28.0,), (2.0,)), 3, timing)
+    timing = Law(plant, 3.0, ParameterBox((15.0,), (0.0,)))
+    law = Law(plant, 3.0, ParameterBox((28.0,), (2.0,)), 3, timing)
     assert [(one.start, one.stop) for one in law.stretches] == [(one.start, one.stop) for one in timing.stretches]
     holds(law, [(-1.0,), (1.0,)], lambda t, p: [[-p[0] * (1 + np.sin(3 * t)), 1 / (4 - t), 1]], 1e-12)
-    own = Law(plant, 3.0, Box((28.0,), (2.0,)), 3)
+    own = Law(plant, 3.0, ParameterBox((28.0,), (2.0,)), 3)
     assert len(own.stretches) > len(law.stretches)
 
 
 def test_boxes_hold_their_corners_whatever_is_rounded() -> None:
     for low, high in RNG.uniform(-1.0, 1.0, (200, 2)):
         low, high = min(low, high), max(low, high)
-        box = Box.between([low, 0.3], [high, 0.3])
+        box = ParameterBox.between([low, 0.3], [high, 0.3])
         with ctx.workprec(200):
             ends = [arb(box.middle[0]) + sign * arb(box.halves[0]) for sign in (-1, 1)]
             assert ends[0] <= low and high <= ends[1] and box.halves[1] == 0.0
@@ -233,12 +233,14 @@ def test_boxes_hold_their_corners_whatever_is_rounded() -> None:
 
 
 def test_a_box_holds_another_exactly() -> None:
-    whole = Box((0.1,), (0.2,))
-    assert whole.holds(whole) and whole.holds(Box((0.1,), (0.0,)))
+    whole = ParameterBox((0.1,), (0.2,))
+    assert whole.holds(whole) and whole.holds(ParameterBox((0.1,), (0.0,)))
     up = float(np.nextafter(0.2, 1.0))
-    assert not whole.holds(Box((0.1,), (up,))) and not whole.holds(Box((float(np.nextafter(0.1, 1.0)),), (0.2,)))
-    assert whole.holds(Box((0.1 + 2.0**-56,), (0.2 - 2.0**-54,)))
-    assert not Box((0.0, 0.0), (1.0, 1.0)).holds(Box((0.0, 0.5), (1.0, 0.75)))
+    assert not whole.holds(ParameterBox((0.1,), (up,))) and not whole.holds(
+        ParameterBox((float(np.nextafter(0.1, 1.0)),), (0.2,))
+    )
+    assert whole.holds(ParameterBox((0.1 + 2.0**-56,), (0.2 - 2.0**-54,)))
+    assert not ParameterBox((0.0, 0.0), (1.0, 1.0)).holds(ParameterBox((0.0, 0.5), (1.0, 0.75)))
 
 
 def test_units_of_slow_parts_make_them_small_enough_or_there_are_none() -> None:
@@ -261,7 +263,7 @@ def test_powers_of_the_time_that_are_left_out_are_in_the_balls_of_the_first() ->
 
 def test_units_are_not_those_of_times_at_which_a_wave_is_0() -> None:
     system = VaryingSystem.of([[0, "sin(2*pi*t)"], [0, "-0.04"]], [[0], [1]], 8.0)
-    assert len(Law(Plant.of(system, 8.0), 8.0, Box()).stretches) < 200
+    assert len(Law(Plant.of(system, 8.0), 8.0, ParameterBox()).stretches) < 200
 
 
 def test_a_plant_is_looked_at_where_it_is_finite() -> None:

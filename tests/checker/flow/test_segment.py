@@ -12,7 +12,7 @@ from flint import arb, arb_mat, ctx
 import sparserob_core.checker.flow.segment as segments
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.arithmetic.series import Series, middles
-from sparserob_core.checker.flow.segment import Equation, Segment, guess, shifted, solve, verify
+from sparserob_core.checker.flow.segment import Equation, VerifiedSegment, guess, shifted, solve, verify
 from sparserob_core.checker.outcome import Unchecked
 
 BITS = 192
@@ -238,7 +238,7 @@ def test_the_end_and_the_first_terms_hold_the_flow_with_what_they_are_off_by(cou
         for point in corners(count):
             for share in (0.3, 1.0):
                 assert (missed(terms, equation, point, share) <= off).all()
-    wide = Segment(one.terms, one.off + 1e-3)
+    wide = VerifiedSegment(one.terms, one.off + 1e-3)
     assert (radii_of(wide.end.parts[0]) >= radii_of(one.end.parts[0]) + 1e-3 * (1.0 - 1e-4)).all()
 
 

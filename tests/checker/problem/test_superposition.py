@@ -12,7 +12,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.problem.superposition import Parts, parted
+from sparserob_core.checker.problem.superposition import ParameterExpansion, parted
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.sets.sets import Box, NormBall
@@ -37,9 +37,9 @@ def problem_of(system: sr.VaryingSystem, **more: Any) -> sr.OptimalControlProble
     )
 
 
-def plant() -> tuple[sr.VaryingSystem, Parts]:
+def plant() -> tuple[sr.VaryingSystem, ParameterExpansion]:
     system = sr.VaryingSystem.of(A, B, 2.0, E, C, parameters=BOX, names=NAMES)
-    return system, Parts(system, tuple(BOX.interior_point().tolist()))
+    return system, ParameterExpansion(system, tuple(BOX.interior_point().tolist()))
 
 
 def matrix(law: Any, name: str, p: list[float]) -> np.ndarray:
@@ -72,7 +72,7 @@ def test_corners_hold_the_box_exactly_and_no_more_than_rounding() -> None:
     for _ in range(20):
         low, high = -rng.uniform(size=2) * 10.0 ** rng.integers(-9, 1, 2), rng.uniform(1.0, 2.0, size=2)
         system = sr.VaryingSystem.of([["0"]], [["p + q"]], 2.0, parameters=Box(low, high), names=("p", "q"))
-        parts = Parts(system, tuple(rng.uniform(0.3, 0.9, size=2).tolist()))
+        parts = ParameterExpansion(system, tuple(rng.uniform(0.3, 0.9, size=2).tolist()))
         corners = list(parts.corners())
         assert len(corners) == 4 == len({*corners})
         for j, (least, most) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
@@ -154,7 +154,9 @@ def test_rows_are_those_of_every_corner_and_what_begins_is_certain_of_the_new_co
 def test_entries_that_are_not_affine_are_refused(entry: str) -> None:
     system, _ = plant()
     with pytest.raises(Unchecked, match="affinely"):
-        Parts(system, tuple(BOX.interior_point().tolist())).tables(parse_matrix("B", [[entry]], ("t", *NAMES)), 1.5)
+        ParameterExpansion(system, tuple(BOX.interior_point().tolist())).tables(
+            parse_matrix("B", [[entry]], ("t", *NAMES)), 1.5
+        )
 
 
 @pytest.mark.parametrize(
@@ -169,7 +171,7 @@ def test_a_parameter_that_meets_a_state_that_depends_on_one_is_refused(place: tu
     made = object.__new__(sr.System)
     made.__dict__.update(system.__dict__ | {"phases": (other,)})
     with pytest.raises(Unchecked, match="affinely"):
-        assert Parts(made, tuple(BOX.interior_point().tolist())).moved
+        assert ParameterExpansion(made, tuple(BOX.interior_point().tolist())).moved
 
 
 @pytest.mark.parametrize("name", ["A", "B", "E", "c"])
@@ -198,7 +200,7 @@ def test_all_that_is_downstream_of_an_entry_with_a_parameter_depends_on_it(name:
             parameters=Box([-1.0, -1.0], [1.0, 1.0]),
             names=("p", "q"),
         )
-        assert Parts(system, (0.0, 0.0)).moved == [[1, 2, 3, 4], [2, 3, 4] if other != name else []]
+        assert ParameterExpansion(system, (0.0, 0.0)).moved == [[1, 2, 3, 4], [2, 3, 4] if other != name else []]
 
 
 @pytest.mark.parametrize(
@@ -219,7 +221,7 @@ def test_entries_are_split_into_what_is_steady_and_what_a_parameter_multiplies(
     entry: str, steady: float, slope: float
 ) -> None:
     system, _ = plant()
-    parts = Parts(system, (0.25, 0.5, 2.0))
+    parts = ParameterExpansion(system, (0.25, 0.5, 2.0))
     first, by_p, *rest = (float(one[0, 0]) for one in parts.tables(parse_matrix("B", [[entry]], ("t", *NAMES)), 1.5))
     assert first == pytest.approx(steady + 0.25 * slope, rel=1e-14)
     assert by_p == pytest.approx(0.45 * slope, rel=1e-14)  # from 0.25 to 0.7, the farther end

@@ -13,10 +13,10 @@ import pytest
 from flint import arb, arb_mat, ctx
 from scipy.integrate import quad
 
-from sparserob_core.checker.flow.segment import Segment
+from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.checker.outcome import Clock, Unchecked
 from sparserob_core.checker.reach import adjoint as module
-from sparserob_core.checker.reach.adjoint import DEAR, Adjoint, Motion, SupportIntegrals, Worst
+from sparserob_core.checker.reach.adjoint import DEAR, AdjointFlow, AdjointRow, SupportIntegrals, Worst
 from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Box, Polytope
@@ -28,8 +28,8 @@ GRID = np.array([0.0, 0.7, 1.9, 3.1, 4.0])
 TIMES = np.array([0.0, 0.3, 1.0, 2.2, 3.99, 4.0])
 
 
-def adjoint() -> Adjoint:
-    return Adjoint.of(Motion.of(arb_mat(A), arb_mat(F), HORIZON, Clock()), C)
+def adjoint() -> AdjointRow:
+    return AdjointRow.of(AdjointFlow.of(arb_mat(A), arb_mat(F), HORIZON, Clock()), C)
 
 
 def worst(kind: str) -> Worst:
@@ -129,7 +129,7 @@ def test_products_of_many_terms_hold_the_truth_and_round_as_sums_of_sums() -> No
 
 def test_a_system_that_is_too_fast_is_not_followed() -> None:
     with pytest.raises(Unchecked):
-        Motion.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), 1.0, Clock())
+        AdjointFlow.of(arb_mat([[-1e9]]), arb_mat([[1.0]]), 1.0, Clock())
 
 
 @pytest.mark.parametrize("order", [3, 5])
@@ -137,9 +137,9 @@ def test_terms_that_are_left_out_are_in_what_rows_and_inputs_are_off_by(
     order: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With so few terms that what is left out shows: it is added to no more than a few times what it is."""
-    motion = Motion.of(arb_mat(A), arb_mat(F), HORIZON, Clock())
+    motion = AdjointFlow.of(arb_mat(A), arb_mat(F), HORIZON, Clock())
     monkeypatch.setattr(module, "ORDER", order)
-    known, times = Adjoint.of(motion, C), np.arange(1, 64) * motion.step - motion.step / 1024
+    known, times = AdjointRow.of(motion, C), np.arange(1, 64) * motion.step - motion.step / 1024
     rows, (sums, rounded) = known.at(times), known.integrals(times)
     truth = [exact(t) for t in times.tolist()]
     missed = np.array([np.abs(rows.mid[i] - row) for i, (row, _) in enumerate(truth)])
@@ -153,7 +153,9 @@ def test_terms_that_are_left_out_are_in_what_rows_and_inputs_are_off_by(
 
 def test_rows_of_a_system_whose_series_ends_are_exact() -> None:
     """``l = (1, s)``, and what an input of 1 adds grows as ``s^2 / 2``."""
-    known = Adjoint.of(Motion.of(arb_mat([[0.0, 1.0], [0.0, 0.0]]), arb_mat([[0.0], [1.0]]), HORIZON, Clock()), C[:2])
+    known = AdjointRow.of(
+        AdjointFlow.of(arb_mat([[0.0, 1.0], [0.0, 0.0]]), arb_mat([[0.0], [1.0]]), HORIZON, Clock()), C[:2]
+    )
     rows, (sums, rounded) = known.at(TIMES), known.integrals(TIMES)
     truth = np.stack([np.full(6, 1.0), TIMES + 0.3], axis=1)
     assert (np.abs(rows.mid - truth) <= rows.rad + 1e-16 * truth).all() and rows.rad.max() < 1e-13
@@ -162,8 +164,8 @@ def test_rows_of_a_system_whose_series_ends_are_exact() -> None:
 
 
 def test_what_the_flow_is_off_by_on_a_step_is_in_the_terms_of_rows_and_in_those_after_it() -> None:
-    motion, off = Motion.of(arb_mat(A), arb_mat(F), HORIZON, Clock()), np.array([[1.0, 2.0, 3.0]] * 3) * 1e-3
-    wide = replace(motion, segment=Segment(motion.segment.terms, motion.segment.off + off))
+    motion, off = AdjointFlow.of(arb_mat(A), arb_mat(F), HORIZON, Clock()), np.array([[1.0, 2.0, 3.0]] * 3) * 1e-3
+    wide = replace(motion, segment=VerifiedSegment(motion.segment.terms, motion.segment.off + off))
     for terms, of_wide, columns in (
         (motion.rows, wide.rows, np.eye(3)),
         (motion.inputs, wide.inputs, np.array(F)),
@@ -184,7 +186,7 @@ def test_steps_are_as_long_as_powers_of_the_system_allow_and_not_its_norm() -> N
     assert module.choose_step(np.array([[0.0, 1e6], [0.0, 0.0]]), 64.0) * 1e6 <= module.LONGEST
     for matrix, speed in (([[-1.0, 40.0], [0.0, -2.0]], 1.0), ([[0.0, 1.0], [-9.0, 0.0]], 3.0)):
         step = module.choose_step(np.array(matrix), 1e3)
-        motion = Motion.of(arb_mat(matrix), arb_mat([[0.0], [speed]]), 1e3, Clock())
+        motion = AdjointFlow.of(arb_mat(matrix), arb_mat([[0.0], [speed]]), 1e3, Clock())
         left = motion.segment.first(module.ORDER + 1)[1]
         assert motion.step == step or motion.step >= step / 4.0
         assert left.max() <= 40.0 * 8.0 * module.REST
@@ -213,7 +215,7 @@ def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
             return Enclosed(part.mid + of_input * sign, part.rad + wide)
 
         stub = SimpleNamespace(at=at, between=between, step=known.step, count=known.count)
-        return replace(plain, adjoint=cast(Adjoint, stub))
+        return replace(plain, adjoint=cast(AdjointRow, stub))
 
     sides = np.sign(plain.centre)
     up, down = (moved(side * off * sides, side * off * np.ones(2), 0.0) for side in (1.0, -1.0))
@@ -335,7 +337,7 @@ def test_every_radius_is_enlarged_by_what_its_own_sum_may_round(kind: str, monke
 def test_what_is_left_of_the_expansion_of_a_bend_is_in_its_bound(rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """``l = e^{a s}`` grows on every step, so that its bend is largest at the end; one term is expanded."""
     monkeypatch.setattr(module, "BENDING", 0)
-    known = Adjoint.of(Motion.of(arb_mat([[rate]]), arb_mat([[1.0]]), HORIZON, Clock()), np.ones(1))
+    known = AdjointRow.of(AdjointFlow.of(arb_mat([[rate]]), arb_mat([[1.0]]), HORIZON, Clock()), np.ones(1))
     ends = known.nodes.mid[1:, 0]
     rows, once, twice = (part[:, 0] for part in known.bends)
     for bound, power in ((rows, 2), (once, 1), (twice, 2)):
@@ -351,9 +353,9 @@ def swept(mid: list[list[float]], rad: float, sides: list[list[float]], step: fl
     off = np.zeros_like(table)
     off[:, 0, 1] = rad
     row = SimpleNamespace(driven=Enclosed(table, off), count=len(mid), step=step)
-    row.placed = lambda times: Adjoint.placed(cast(Adjoint, row), times)
+    row.placed = lambda times: AdjointRow.placed(cast(AdjointRow, row), times)
     every = [Side(np.array(side)[:, None], np.zeros((len(side), 1))) for side in sides]
-    return SupportIntegrals(cast(Adjoint, row), slice(1, None), every)
+    return SupportIntegrals(cast(AdjointRow, row), slice(1, None), every)
 
 
 TERMS = [[-1.0, 3.0, 0.5], [2.0, -0.5, -4.0], [0.3, 1.0, 0.0]]
@@ -451,7 +453,7 @@ def test_integrals_are_off_by_what_all_steps_are_and_by_what_their_sum_is_rounde
 def test_a_measurable_worst_is_off_by_what_its_integrals_are(monkeypatch: pytest.MonkeyPatch) -> None:
     linear = Enclosed(np.array([[9.0, 2.0]]), np.array([[9.0, 0.3]]))
     stub = SimpleNamespace(integrals=lambda times: (linear, np.array([[9.0, 0.05]])))
-    row = replace(worst("measurable"), adjoint=cast(Adjoint, stub))
+    row = replace(worst("measurable"), adjoint=cast(AdjointRow, stub))
     integrals = (np.array([[1.0, 2.0]]), np.array([[1.5, 2.25]]))
     row.__dict__["_swept"] = SimpleNamespace(at=lambda times: integrals, sides=[None, None])
     about = 0.15  # the middle of the set

@@ -13,12 +13,13 @@ import pytest
 from flint import arb_mat, ctx
 
 import sparserob_core.checker.reach.closed_loop as loops
+from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.claims.cells import prove
 from sparserob_core.checker.outcome import Broken, Clock
-from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly
-from sparserob_core.checker.reach.loop_tube import LoopTube, Still
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed
+from sparserob_core.checker.reach.tube import LoopTube, Still
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.polynomials import Enclosed, rounding
@@ -35,7 +36,7 @@ def made(name):
     """The loop in balls, and the one that is stepped, with its control and gains."""
     case = LOOPS[name]
     v, M = gains(np.random.default_rng(3), case)
-    kind = MeasurableLoop if case.measurable else ClosedLoop
+    kind = MeasurableLoop if case.measurable else VerifiedLoop
     loop = kind(
         case.system,
         case.start.tolist(),
@@ -84,8 +85,8 @@ def test_the_state_in_balls_is_that_of_a_loop_that_measures(name):
             assert [float(h.mid()) for h in heights] == pytest.approx(case.height(H @ truth).tolist(), abs=1e-10)
         for k, truth in enumerate(controls):
             assert table(loop.inputs(k)) == pytest.approx(truth, abs=1e-10)
-        assert (loop.radii >= case.radii).all()
-        assert loop.radii == pytest.approx(
+        assert (loop.deviations.radii >= case.radii).all()
+        assert loop.deviations.radii == pytest.approx(
             np.concatenate([np.zeros(0), *(np.array(known(s).radius) + np.abs(m) for s, m in case.sets)]), rel=1e-9
         )
         assert [loop.on(piece) for piece in range(case.grid.size - 1)] == [
@@ -98,7 +99,7 @@ def test_what_a_short_cell_adds_is_an_eighth_of_its_square_times_the_curvature_o
     """Hardly more than sampled second derivatives say; that it is enough is held beside."""
     case, loop, v, M = made(name)
     rng = np.random.default_rng(2)
-    sizes = np.concatenate([[1.0], loop.radii])
+    sizes = np.concatenate([[1.0], loop.deviations.radii])
     with ctx.workprec(192):
         for piece, a, b in parts(loop):
             length = min(b - a, 0.05 / np.linalg.norm(case.A, 2))
@@ -131,7 +132,7 @@ def test_a_parabola_is_an_eighth_of_its_acceleration_above_its_chord_and_no_more
         for piece, (low, high) in ((0, (0.25, 0.5)), (1, (0.75, 1.0))):
             (bent,) = loop.bent(piece, low, high, np.array([[1.0, 0.0]]))
             answers = np.array([[float(x.mid()) for x in row] for row in loop.inputs(piece).tolist()])[0]
-            owed = 0.0625 / 8.0 * (np.abs(answers) @ np.concatenate([[1.0], loop.radii]))
+            owed = 0.0625 / 8.0 * (np.abs(answers) @ np.concatenate([[1.0], loop.deviations.radii]))
             assert bent == pytest.approx(owed, rel=1e-9)
             assert bent >= owed
 
@@ -149,8 +150,8 @@ def test_what_a_power_series_on_a_cell_leaves_out_is_added(monkeypatch):
             # of a term of the third power, which is left out, a chord leaves this much at most
             terms, _ = loop.flow.within(low, high, low, high, 4)
             both = arb_mat([*loop.state(piece, low).tolist(), *loop.drives[piece].tolist()])
-            third = np.abs(H @ table(terms[3].matrix * both)) @ np.concatenate([[1.0], loop.radii])
-            second = np.abs(H @ table(terms[2].matrix * both)) @ np.concatenate([[1.0], loop.radii])
+            third = np.abs(H @ table(terms[3].matrix * both)) @ np.concatenate([[1.0], loop.deviations.radii])
+            second = np.abs(H @ table(terms[2].matrix * both)) @ np.concatenate([[1.0], loop.deviations.radii])
             bent = loop.bent(piece, low, high, H)
             assert (bent >= second / 4.0 + third * 2.0 / 3.0**1.5).all()
             most = max(most, float(third.max()))
@@ -195,9 +196,10 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
         for piece in (0, len(case.grid) - 2):
             begin, length = float(case.grid[piece]), float(case.grid[piece + 1] - case.grid[piece])
             for share in (1.0, 0.37):
-                kernel = loop.kernel(piece) if share == 1.0 else loop._way(begin, begin + share * length)
-                found = kernel.most(Enclosed(a, np.zeros_like(a)), loop.sides)
-                wide = kernel.most(Enclosed(a, np.full_like(a, 1e-3)), loop.sides)
+                pushed = loop.deviations
+                kernel = pushed.kernel(piece) if share == 1.0 else pushed.way(begin, begin + share * length)
+                found = kernel.most(Enclosed(a, np.zeros_like(a)), loop.deviations.sides)
+                wide = kernel.most(Enclosed(a, np.full_like(a, 1e-3)), loop.deviations.sides)
                 parts = 120
                 ends = np.linspace(0.0, share * length, parts + 1)
                 r = ((ends[:-1] + ends[1:])[:, None] / 2 + np.diff(ends)[:, None] / 2 * nodes).ravel()
@@ -209,13 +211,14 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
                 if share == 1.0:  # how far a piece pushes every state, either way
                     tops = [case.bound.support(s * K.reshape(-1, K.shape[2])).reshape(K.shape[:2]) for s in (1.0, -1.0)]
                     sides = np.array([w @ (top - s * K @ middle) for s, top in zip((1.0, -1.0), tops, strict=True)])
-                    far, own = sides.max(axis=0), loop.radii[loop.starts[piece] : loop.starts[piece] + 2]
+                    far, first = sides.max(axis=0), loop.deviations.starts[piece]
+                    own = loop.deviations.radii[first : first + 2]
                     assert (own >= far - 2e-5).all()
                     assert (own <= far + 2e-5).all()
                 assert (np.abs(found.mid - truth) <= found.rad + 2e-5).all()
                 assert (found.rad < 1e-11).all()
                 for offset in 1e-3 * rng.uniform(-1, 1, size=(3, *a.shape)):
-                    moved = kernel.most(Enclosed(a + offset, np.zeros_like(a)), loop.sides)
+                    moved = kernel.most(Enclosed(a + offset, np.zeros_like(a)), loop.deviations.sides)
                     assert (moved.mid + moved.rad <= wide.mid + wide.rad + 1e-12).all()
                     assert (moved.mid - moved.rad >= wide.mid - wide.rad - 1e-12).all()
                 assert (wide.rad < 0.1).all()
@@ -300,7 +303,7 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
             ([0.0, 0.5, 1.5], [{}, {0: 0.5, 1: 0.5}, {1: 0.5, 2: 0.5}]),
             ([0.0], [{}, {0: 1.0}, {0: 1.0}]),
         ):
-            loop = ClosedLoop(
+            loop = VerifiedLoop(
                 plant,
                 [0.0],
                 [arb_mat(1, 1)] * 3,

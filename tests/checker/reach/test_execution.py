@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.reach.execution import Execution
+from sparserob_core.checker.reach.execution import FollowedExecution
 
 A = np.array([[0.0, 1.0], [-4.0, -0.3]])
 B = np.array([[0.2, 0.0], [1.0, -0.7]])
@@ -23,7 +23,7 @@ C = np.array([1.0, -0.4])
 
 
 @pytest.fixture(scope="module")
-def execution() -> Execution:
+def execution() -> FollowedExecution:
     from flint import arb, ctx
 
     problem = sr.OptimalControlProblem(
@@ -31,7 +31,7 @@ def execution() -> Execution:
     )
     with ctx.workprec(128):
         pieces = [stacked([[arb(float(v))] for v in u]) for u in CONTROL.T]
-        found = Execution(problem, SHARES, POINTS, pieces)
+        found = FollowedExecution(problem, SHARES, POINTS, pieces)
         _ = found.motion
     return found
 
@@ -53,14 +53,14 @@ def _height(age: float, j: int) -> float:
 
 
 @pytest.mark.parametrize("age", [0.0, 1e-9, 0.41, 1.5])
-def test_integrals_are_enclosed_closely(execution: Execution, age: float) -> None:
+def test_integrals_are_enclosed_closely(execution: FollowedExecution, age: float) -> None:
     ((low,),), ((high,),) = execution.integrals(C, np.array([age]), np.zeros(1))
     for j in range(2):
         assert low[j] - 1e-12 <= weight(j, 0.0, age) <= high[j] + 1e-12  # what quadrature is worth
         assert 0.0 <= high[j] - low[j] <= 2e-13 * max(high[j], 1e-3)
 
 
-def test_what_a_command_adds_at_least_is_hardly_less_than_it_adds(execution: Execution) -> None:
+def test_what_a_command_adds_at_least_is_hardly_less_than_it_adds(execution: FollowedExecution) -> None:
     least = execution.least(C, 1.7)
     for k in range(6):
         for j in range(2):
@@ -70,7 +70,7 @@ def test_what_a_command_adds_at_least_is_hardly_less_than_it_adds(execution: Exe
 
 
 @pytest.mark.parametrize("time", [0.0, 0.5, 1.7, 3.0])
-def test_the_errors_of_a_control_add_up(execution: Execution, time: float) -> None:
+def test_the_errors_of_a_control_add_up(execution: FollowedExecution, time: float) -> None:
     low, high = execution.added(C, time)
     true = sum(
         SHARES[j] * abs(CONTROL[j, k]) * weight(j, max(time - POINTS[k + 1], 0.0), max(time - POINTS[k], 0.0))
@@ -80,7 +80,7 @@ def test_the_errors_of_a_control_add_up(execution: Execution, time: float) -> No
     assert low - 1e-9 <= true <= high + 1e-9
 
 
-def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(execution: Execution) -> None:
+def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(execution: FollowedExecution) -> None:
     ratios = []
     for start, stop in [(0.0, 0.5), (0.6, 0.8), (1.0, 1.1), (2.05, 2.45), (2.5, 2.51)]:
         share = np.linspace(0.0, 1.0, 41)
@@ -99,7 +99,7 @@ def test_a_chord_is_missed_by_no_more_wherever_it_begins_among_the_parts(rate: f
         system=sr.LinearSystem([[rate]], [[1.0]]), horizon=3.0, initial_state=[0.0], control=sr.Box([-1.0], [1.0])
     )
     with ctx.workprec(128):
-        one = Execution(problem, np.array([0.5]), np.array([0.0, 3.0]), [stacked([[arb(0.25)]])])
+        one = FollowedExecution(problem, np.array([0.5]), np.array([0.0, 3.0]), [stacked([[arb(0.25)]])])
         part, length = one.motion.step, one.motion.step / 64
         for number in range(1, one.motion.count - 1):
             for begin in (number * part + 1e-9, (number + 1) * part - length - 1e-9):
@@ -123,7 +123,7 @@ def test_integrals_of_fast_modes_are_enclosed_closely(rate: float) -> None:
     )
     times, points = np.array([0.3, 1.1, 2.0]), np.array([0.0, 0.1, 0.3 - 1e-3 / rate, 0.7, 1.1 - 0.2 / rate])
     with ctx.workprec(128):
-        one = Execution(problem, np.array([0.5]), np.array([0.0, 2.0]), [stacked([[arb(0.25)]])])
+        one = FollowedExecution(problem, np.array([0.5]), np.array([0.0, 2.0]), [stacked([[arb(0.25)]])])
         low, high = one.integrals(np.array([0.0, 1.0]), times, points)
         for i, time in enumerate(times.tolist()):
             for k, point in enumerate(points.tolist()):
@@ -133,11 +133,11 @@ def test_integrals_of_fast_modes_are_enclosed_closely(rate: float) -> None:
                 assert high[i, k, 0] - low[i, k, 0] <= 1e-13
 
 
-def test_rows_and_their_opposites_are_made_once(execution: Execution) -> None:
+def test_rows_and_their_opposites_are_made_once(execution: FollowedExecution) -> None:
     assert execution.absolute(C) is execution.absolute(-C)
 
 
-def test_many_intervals_are_bounded_as_each_alone(execution: Execution) -> None:
+def test_many_intervals_are_bounded_as_each_alone(execution: FollowedExecution) -> None:
     start, stop = np.array([0.0, 0.6, 2.05]), np.array([0.5, 0.8, 2.45])
     each = [execution.bent(C, a, b) for a, b in zip(start, stop, strict=True)]
     np.testing.assert_array_equal(execution.bent_over(C, start, stop), each)
@@ -145,12 +145,12 @@ def test_many_intervals_are_bounded_as_each_alone(execution: Execution) -> None:
     assert [(a, b) for a, b in zip(low, high, strict=True)] == [execution.added(C, t) for t in stop]
 
 
-def test_what_is_added_at_least_counts_only_what_is_sure(execution: Execution) -> None:
+def test_what_is_added_at_least_counts_only_what_is_sure(execution: FollowedExecution) -> None:
     (low,), (high,) = execution.integrals(C, np.array([1.7]), POINTS)
     assert (execution.least(C, 1.7) <= np.maximum(SHARES * (low[:-1] - high[1:]), 0.0)).all()
 
 
-def test_sums_and_jumps_are_off_by_what_is_rounded(execution: Execution) -> None:
+def test_sums_and_jumps_are_off_by_what_is_rounded(execution: FollowedExecution) -> None:
     which, change, off = execution.jumps
     (low,), (high,) = execution.integrals(C, np.array([2.9]), POINTS[which])
     up, down = np.maximum(change, 0.0), np.minimum(change, 0.0)
@@ -164,7 +164,9 @@ def test_sums_and_jumps_are_off_by_what_is_rounded(execution: Execution) -> None
     ).all()
 
 
-def test_an_age_that_is_rounded_is_so_in_its_integral(execution: Execution, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_age_that_is_rounded_is_so_in_its_integral(
+    execution: FollowedExecution, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plain = execution.integrals(C, np.array([2.0]), np.zeros(1))
     coarse = lambda times, points: (times - points, np.full((times - points).shape, 1e-3))  # noqa: E731
     monkeypatch.setattr("sparserob_core.checker.reach.execution.subtract_times", coarse)

@@ -91,7 +91,7 @@ def kernel_of(A, E, length):
     bound = Box(-np.ones(plant.disturbances), np.ones(plant.disturbances))
     ends = [0.0, 1.0]
     loop = MeasurableLoop(plant, [0.0] * plant.states, still, none, ends, ends, [], bound)
-    return loop._way(0.0, length)
+    return loop.deviations.way(0.0, length)
 
 
 @pytest.mark.parametrize("rate", [-1.5, 0.0, 2.0])

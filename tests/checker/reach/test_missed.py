@@ -19,12 +19,12 @@ import sparserob_core.checker.flow.flow as flows
 import sparserob_core.checker.flow.law as laws
 import sparserob_core.checker.flow.segment as segments
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.reach.closed_loop import middle
-from sparserob_core.checker.reach.execution import Execution
+from sparserob_core.checker.reach.execution import FollowedExecution
 from sparserob_core.checker.reach.measurable import Side, Together
-from sparserob_core.checker.reach.missed import MissedAt
+from sparserob_core.checker.reach.missed import BoundedInputAt, SizedInput
+from sparserob_core.checker.sets.known import middle
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
 
@@ -38,9 +38,9 @@ WILD = VaryingSystem.of([["-t", 2], [-1, "t"]], [["t^2", 0], ["cos(9*t)", 1]], 3
 C = np.array([1.0, -0.4])
 
 
-def made(system: VaryingSystem, control: Array = CONTROL) -> MissedAt:
+def made(system: VaryingSystem, control: Array = CONTROL) -> BoundedInputAt:
     pieces = [stacked([[arb(float(v))] for v in u]) for u in control.T]
-    return MissedAt(Flow(Plant.of(system, 3.0), 3.0), SHARES, POINTS, pieces)
+    return BoundedInputAt(VerifiedFlow(Plant.of(system, 3.0), 3.0), SizedInput(SHARES, POINTS, pieces))
 
 
 def test_a_constant_that_is_dressed_is_the_constant() -> None:
@@ -50,7 +50,7 @@ def test_a_constant_that_is_dressed_is_the_constant() -> None:
         )
         system = VaryingSystem.of(*([[f"{x} + 0*t" for x in row] for row in part] for part in (A, B)), 3.0)
         found = made(system)
-        plain = Execution(known, SHARES, POINTS, found.pieces)
+        plain = FollowedExecution(known, SHARES, POINTS, found.input.pieces)
         for time in (0.0, 0.3, 1.7, 3.0):
             one, other = found.added(C, time), plain.added(C, time)
             assert one[0] <= other[1] and other[0] <= one[1] <= one[0] + 1e-12
@@ -87,7 +87,9 @@ def test_what_is_large_is_not_enclosed_more_coarsely_than_rounding_does(side: sr
         found = made(ROCKET)
         if side is not None:
             (form,), one = Side.of(side), [stacked([[arb(1)]])] * 6
-            found = MissedAt(Flow(Plant.of(ROCKET, 3.0), 3.0), np.ones(1), POINTS, one, side=form)
+            found = BoundedInputAt(
+                VerifiedFlow(Plant.of(ROCKET, 3.0), 3.0), SizedInput(np.ones(1), POINTS, one, side=form)
+            )
         low, high = found.added(np.array([1.0, 0.0]), 3.0)
     assert 0.0 < high - low <= 3e-13 * high
 
@@ -105,11 +107,11 @@ def test_balls_of_a_kernel_hold_the_closed_form(
     module: ModuleType | None, name: str, value: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ctx.workprec(192):
-        flow, widest = Flow(Plant.of(FADING, 3.0), 3.0), 0.0
+        flow, widest = VerifiedFlow(Plant.of(FADING, 3.0), 3.0), 0.0
         stretches = flow.law.stretches
         if module is models:
             monkeypatch.setattr(laws, "SHARP", 1e-6)
-            flow = Flow(Plant.of(FADING, 3.0), 3.0)
+            flow = VerifiedFlow(Plant.of(FADING, 3.0), 3.0)
         if module is not None:
             monkeypatch.setattr(module, name, value)
         for part in stretches:
@@ -126,7 +128,7 @@ def test_balls_of_a_kernel_hold_the_closed_form(
 
 def test_what_the_system_is_at_most_and_how_fast_it_changes_is_not_exceeded() -> None:
     with ctx.workprec(192):
-        flow = Flow(Plant.of(WILD, 3.0), 3.0)
+        flow = VerifiedFlow(Plant.of(WILD, 3.0), 3.0)
         for part in flow.law.stretches:
             most, slope, _ = flow.sizes(part.start, part.stop)
             t = np.linspace(part.start, part.stop, 9)
@@ -172,18 +174,19 @@ def test_bounds_allow_for_what_is_rounded_and_for_the_size_of_the_control() -> N
         low, high = found.added(C, 2.9)
         assert high - low >= 1e-15 * high
         ball = arb(0.5, 1e-3)
-        wide = MissedAt(found.law, SHARES, POINTS, [stacked([[ball], [arb(0)]])] * 6)
+        wide = BoundedInputAt(found.law, SizedInput(SHARES, POINTS, [stacked([[ball], [arb(0)]])] * 6))
         fixed = made(ROCKET, np.tile([[0.501], [0.0]], (1, 6)))
         thin = made(ROCKET, np.tile([[0.499], [0.0]], (1, 6)))
         assert wide.added(C, 2.9)[1] >= fixed.added(C, 2.9)[0]
         assert wide.added(C, 2.9)[0] <= thin.added(C, 2.9)[1]
 
 
-def entering(system: VaryingSystem, off: float = 0.0) -> MissedAt:
+def entering(system: VaryingSystem, off: float = 0.0) -> BoundedInputAt:
     """A command of 1 through ``E`` that is missed by 0.25."""
     one, ends = [stacked([[arb(1)]])], np.array([0.0, 3.0])
     lost = np.array([off])
-    return MissedAt(Flow(Plant.of(system, 3.0), 3.0), np.array([0.25]), ends, one, system.controls, lost)
+    entering = SizedInput(np.array([0.25]), ends, one, system.controls, lost)
+    return BoundedInputAt(VerifiedFlow(Plant.of(system, 3.0), 3.0), entering)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.7, 3.0])
@@ -214,15 +217,14 @@ def test_what_enters_by_the_last_columns_bends_as_it_does() -> None:
 
 
 def test_sizes_are_those_of_absolute_values_and_what_shares_are_off_by_counts_for_either_sign() -> None:
-    law = Flow(Plant.of(VaryingSystem.of([["0*t"]], [["1", "1"]], 2.0), 2.0), 2.0)
     pieces = [arb_mat([[arb(-1.5, 1e-3)], [arb(0.5, 1e-3)]]), arb_mat([[arb(2.0, 1e-3)], [arb(-4.0, 1e-3)]])]
     shares, off = np.array([0.1, 0.25]), np.array([1e-4, 1e-5])
-    found = MissedAt(law, shares, np.array([0.0, 1.0, 2.0]), pieces, off=off).sizes
+    found = SizedInput(shares, np.array([0.0, 1.0, 2.0]), pieces, off=off).sizes
     values = np.array([[1.5, 0.5], [2.0, 4.0]])
     assert found.mid == pytest.approx(shares * values, rel=1e-14)
     exact = shares * 1e-3 + off * (values + 1e-3)
     assert (exact <= found.rad).all() and found.rad == pytest.approx(exact, rel=1e-8)
-    plain = MissedAt(law, shares, np.array([0.0, 1.0, 2.0]), pieces).sizes
+    plain = SizedInput(shares, np.array([0.0, 1.0, 2.0]), pieces).sizes
     assert plain.rad == pytest.approx(np.broadcast_to(shares * 1e-3, (2, 2)), rel=1e-8)
 
 
@@ -232,7 +234,8 @@ def test_a_thin_set_whose_middle_is_rounded_adds_no_less_than_nothing() -> None:
     still = sr.LinearSystem(np.zeros((2, 2)), np.array([[0.0], [1.0]]), np.eye(2))
     with ctx.workprec(192):
         one, ends = [stacked([[arb(1)]])], np.array([0.0, 1.0])
-        found = MissedAt(Flow(Plant.of(still, 1.0), 1.0), np.ones(1), ends, one, 1, side=Together(Side.of(thin)))
+        entering = SizedInput(np.ones(1), ends, one, 1, side=Together(Side.of(thin)))
+        found = BoundedInputAt(VerifiedFlow(Plant.of(still, 1.0), 1.0), entering)
         about = middle(thin)
         for c in (np.array([-1.0, 3.0]), np.array([1.0, -3.0])):
             exact = sum(Fraction(float(a)) * Fraction(float(m)) for a, m in zip(c, about, strict=True))

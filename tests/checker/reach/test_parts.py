@@ -16,16 +16,15 @@ import sparserob_core as sr
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims.cells import _to_blame
-from sparserob_core.checker.claims.duality import Duality
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.flows import Flows
-from sparserob_core.checker.flow.law import Box as ParameterBox
+from sparserob_core.checker.cost.duality import Duality
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.flows import VerifiedFlows
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import LOOKED, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.kernels import pushes
-from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube
+from sparserob_core.checker.reach.states import Scene, States
+from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -215,8 +214,8 @@ def tube_of(system, control, disturbance, bound, degree, theta, start, initial_s
         disturbance.breakpoints[:-1].tolist(),
         initial_set,
     )
-    flow = Flow(Plant.of(system, until), until, around, degree if around.middle else 0)
-    tube = Tube(Rows(States(flow, scene), np.eye(system.states)), flow.box)
+    flow = VerifiedFlow(Plant.of(system, until), until, around, degree if around.middle else 0)
+    tube = VerifiedTube(ProjectedStates(States(flow, scene), np.eye(system.states)), flow.box)
     return tube, np.array(around.middle), np.array(around.halves)
 
 
@@ -307,7 +306,7 @@ def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor)
     A, E = turn @ [[0.0, 1.0], [-2.0, -0.5]] @ np.linalg.inv(turn), turn @ [[0.3], [1.0]]
     size, plant = np.array([1.0, factor]), LinearSystem(A, np.zeros((2, 1)), E=E)
     with ctx.workprec(160):
-        found = pushes(Flow(Plant.of(plant, 5.0), 5.0), 1.0, 1.25, slice(1, 2))
+        found = pushes(VerifiedFlow(Plant.of(plant, 5.0), 5.0), 1.0, 1.25, slice(1, 2))
     value, off = found.mid[:, 0], found.rad[:, 0].sum(axis=0)
     assert (off <= 1e-14 * size[:, None]).all()
     for at in (-1.0, -0.3, 0.5, 1.0):
@@ -325,7 +324,7 @@ def test_what_a_row_is_made_of_is_known_as_well_on_many_pieces_as_on_one() -> No
         system=stiff, horizon=float(ends[-1]), initial_state=[1.0, 0.0], control=Box(-np.ones(2), np.ones(2))
     )
     with ctx.workprec(96):
-        flows, c, time = Flows.of(stiff, float(ends[-1])), np.array([1.0, 2.0]), float(ends[-3])
+        flows, c, time = VerifiedFlows.of(stiff, float(ends[-1])), np.array([1.0, 2.0]), float(ends[-3])
         duality = Duality(problem, sr.Dictionary.indicators(ends), None, flows)
         row = duality.row(c, time, (), arb(0), disturbed=False)
         pushed = duality.pushed(c, time, ends[:-1].tolist())
@@ -401,7 +400,9 @@ def test_rows_of_the_dual_are_those_of_the_transcription(nu):
         path=[PathConstraint(Ellipsoid(np.zeros(2), np.eye(2)), 0.1, 1.9), PathConstraint(SETS["box"], 0.0, 2.0)],
     )
     family = prepare(problem, control, disturbance).program.families[1]
-    dual = Duality(problem, control, disturbance.breakpoints[:-1].tolist(), Flows.of(problem.system, 2.0), TRIANGLE)
+    dual = Duality(
+        problem, control, disturbance.breakpoints[:-1].tolist(), VerifiedFlows.of(problem.system, 2.0), TRIANGLE
+    )
     for time in (0.0, 0.3, 0.7, 2.0):
         parameter = rng.uniform(-0.1, 0.1, size=nu)
         G, h = family.rows(np.concatenate([[time], parameter])[None])

@@ -9,12 +9,12 @@ import pytest
 from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.closed_loop import ClosedLoop
-from sparserob_core.checker.reach.preimages import Pushed, Seen
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
+from sparserob_core.checker.reach.preimages import Pushed, SeenDeviations
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box
 
@@ -33,12 +33,12 @@ GRIDS = {
 }
 
 
-def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> Seen:
+def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> SeenDeviations:
     """What all innovations at 1, 2 and 3 see of a disturbance that may jump at these times."""
     d, mw = E.shape
     system = LinearSystem(A, np.ones((d, 1)), E)
     ends = [0.0, 1.0, 2.0, 3.0, 4.0]
-    loop = ClosedLoop(
+    loop = VerifiedLoop(
         system,
         [0.0] * d,
         [arb_mat(1, 1)] * 4,
@@ -60,7 +60,7 @@ def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> Seen:
                 table[where], pattern[where] = np.array(loop.seen[j][block].tolist(), dtype=object), pushed.pattern
     rows = [(d * j, pushed.states) for j in (1, 2, 3)]
     columns = [(mw * (k + 1), pushed.entries) for k in range(len(blocks))]
-    return Seen(arb_mat(table.tolist()), pattern, rows, columns)
+    return SeenDeviations(arb_mat(table.tolist()), pattern, rows, columns)
 
 
 def floats(matrix: arb_mat) -> np.ndarray:
@@ -106,7 +106,7 @@ def test_no_rank_is_above_the_bound_whatever_the_numbers_are() -> None:
             list(zip(np.cumsum(sizes).tolist(), most.tolist(), strict=True))
             for sizes, most in ((r, most_r), (c, most_c))
         ]
-        seen = Seen(arb_mat(D.tolist()), pattern, *ends)
+        seen = SeenDeviations(arb_mat(D.tolist()), pattern, *ends)
         assert np.linalg.matrix_rank(D, tol=1e-9) <= seen.most <= min(most_r.sum(), most_c.sum(), r.sum(), c.sum())
 
 
@@ -114,7 +114,7 @@ def test_of_all_deviations_that_are_seen_alike_those_of_least_squares_are_told()
     """Whatever the sizes of the columns: how far each reaches is its unit."""
     for sizes in ([1.0, 1000.0], [1.0, 1.0], [0.01, 3.0]):
         D = np.array([sizes])
-        seen = Seen(arb_mat(D.tolist()), np.ones((1, 2), dtype=bool), [(1, 1)], [(1, 1), (2, 1)], np.ones(2))
+        seen = SeenDeviations(arb_mat(D.tolist()), np.ones((1, 2), dtype=bool), [(1, 1)], [(1, 1), (2, 1)], np.ones(2))
         found = np.array([[float(x.mid()) for x in row] for row in seen.inverse().tolist()])
         np.testing.assert_allclose(found, np.linalg.pinv(D), rtol=1e-12)
 
@@ -168,13 +168,13 @@ def test_rows_that_are_nothing_but_rounding_do_not_hide_the_others() -> None:
     told, left = [[3.0, -8.0], [-1e-5, -2e-5]], [[-9e-16, -9e-15], [-6e-32, -7e-31]]
     with ctx.workprec(96):
         table = [[arb(v) for v in row] for row in told] + [[arb(v, 1e-28) for v in row] for row in left]
-        seen = Seen(arb_mat(table), np.ones((4, 2), dtype=bool), [(2, 2), (4, 2)], [(2, 2)])
+        seen = SeenDeviations(arb_mat(table), np.ones((4, 2), dtype=bool), [(2, 2), (4, 2)], [(2, 2)])
         X = seen.inverse()
         assert np.abs(floats(X * seen.matrix) - np.eye(2)).max() < 1e-15
         assert not floats(X)[:, 2:].any()
         assert max(float(x.rad()) for x in (X * seen.matrix).entries()) < 1e-20
         with pytest.raises(Unchecked):
-            Seen(arb_mat(table[2:]), np.ones((2, 2), dtype=bool), [(2, 2)], [(2, 2)]).inverse()
+            SeenDeviations(arb_mat(table[2:]), np.ones((2, 2), dtype=bool), [(2, 2)], [(2, 2)]).inverse()
 
 
 def test_of_deviations_that_are_seen_alike_those_are_taken_that_reach_farthest() -> None:
@@ -182,7 +182,9 @@ def test_of_deviations_that_are_seen_alike_those_are_taken_that_reach_farthest()
     one = [(1, 1)]
     with ctx.workprec(96):
         for reach in ([1.0, 1.0, 1e-9], [1e-9, 1.0, 1e-12], [1.0, 2.0, 1e-3]):
-            X = Seen(arb_mat([[1.0, 1.0, 1e3]]), np.ones((1, 3), dtype=bool), one, [(3, 3)], np.array(reach)).inverse()
+            X = SeenDeviations(
+                arb_mat([[1.0, 1.0, 1e3]]), np.ones((1, 3), dtype=bool), one, [(3, 3)], np.array(reach)
+            ).inverse()
             share = np.abs(floats(X)[:, 0]) / reach
             best = np.array([1.0, 1.0, 1e3]) * reach
             assert floats(X)[:, 0] @ [1.0, 1.0, 1e3] == pytest.approx(1.0, abs=1e-12)
@@ -193,8 +195,8 @@ def test_what_may_change_with_time_is_not_taken_for_exact_where_it_seems_still()
     """Columns that differ by 1e-17 are two: floats of one time would call them one."""
     system = VaryingSystem.of([["0", "0"], ["0", "0"]], [["1"], ["0"]], 1.0, [["1", "1"], ["1", "exp(1e-17 + 0*t)"]])
     with ctx.workprec(192):
-        law, ends = Flow(Plant.of(system, 1.0), 1.0), [0.0, 0.5, 1.0]
+        law, ends = VerifiedFlow(Plant.of(system, 1.0), 1.0), [0.0, 0.5, 1.0]
         still, none = [arb_mat(1, 1)] * 2, np.zeros((2, 2, 1, 2))
-        loop = ClosedLoop(system, [0.0, 0.0], still, none, ends, ends, ends[:2], Box([-1, -1], [1, 1]), law=law)
+        loop = VerifiedLoop(system, [0.0, 0.0], still, none, ends, ends, ends[:2], Box([-1, -1], [1, 1]), law=law)
         found = loop.pushed([[Fraction(1), Fraction(0)], [Fraction(0), Fraction(1)]])
     assert law.law.is_still and (found.states, found.entries) == (2, 2)

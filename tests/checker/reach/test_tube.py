@@ -17,14 +17,13 @@ import sparserob_core.checker.flow.segment as segments
 import sparserob_core.checker.reach.tube as tubes
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import Series
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.law import Box as ParameterBox
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.segment import Segment
+from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.checker.problem.lasting import Lasting
-from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.states import Lines, States, _blocks, enclosed, ring
-from sparserob_core.checker.reach.tube import Polynomial, Rows, Tube
+from sparserob_core.checker.reach.states import Lines, Scene, States, _blocks, enclosed, ring
+from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall
@@ -61,14 +60,14 @@ def worst(times: Array, noise: ConvexSet) -> Array:
     return found / (1.0 + times)
 
 
-def fading(noise: ConvexSet) -> Tube:
+def fading(noise: ConvexSet) -> VerifiedTube:
     inputs = [arb_mat([[u], [1]]) for u in CONTROL]
     deviations = Box([-WIDTH], [WIDTH])
     scene = Scene(GRID, inputs, [CENTRE], noise, CHANGES, deviations)
-    return Tube(Rows(States(Flow(Plant.of(FADING, 3.0), 3.0), scene), np.ones((1, 1))), NONE)
+    return VerifiedTube(ProjectedStates(States(VerifiedFlow(Plant.of(FADING, 3.0), 3.0), scene), np.ones((1, 1))), NONE)
 
 
-def until(seen: Tube, start: float, stop: float) -> float:
+def until(seen: VerifiedTube, start: float, stop: float) -> float:
     """The end of a cell from ``start`` that is within one segment."""
     return min([stop, *(end for end in seen.rows.states.marks if end > start)])
 
@@ -135,11 +134,11 @@ def test_polynomials_on_boxes_hold_what_the_closed_form_gives_there(degree: int)
     nearly all of it."""
     rng, whole, lost = np.random.default_rng(30), ParameterBox.between([-0.3], [0.6]), []
     with ctx.workprec(192):
-        flow = Flow(Plant.of(SYSTEM, 3.0), 3.0, whole, degree)
+        flow = VerifiedFlow(Plant.of(SYSTEM, 3.0), 3.0, whole, degree)
         scene = Scene([0.0, 1.5, 3.0], [arb_mat([[0]])] * 2, [1.0], None, [], sr.Box([-0.1], [0.2]))
-        rows = Rows(States(flow, scene), np.ones((1, 1)))
+        rows = ProjectedStates(States(flow, scene), np.ones((1, 1)))
         for box in (whole, *(ParameterBox.between([a], [b]) for a, b in ((0.1, 0.2), (-0.3, -0.3), (-0.29, 0.1)))):
-            tube = Tube(rows, box)
+            tube = VerifiedTube(rows, box)
             assert (tube.flow.centre, tube.flow.radius) == (box.middle, box.halves)
             for start, stop in ((0.0, 0.4), (2.0, 3.0), (3.0, 3.0)):
                 stop = until(tube, start, stop)
@@ -205,11 +204,11 @@ def test_cells_are_above_the_worst_case_of_an_integrator_and_not_far_above(
     small = ParameterBox(tuple(m + 0.4 * h for m, h in zip(box.middle, box.halves, strict=True)),
                          tuple(0.5 * h for h in box.halves)) if part else box  # fmt: skip
     with ctx.workprec(192):
-        flow = Flow(Plant.of(system, 2.0), 2.0, box, degree)
+        flow = VerifiedFlow(Plant.of(system, 2.0), 2.0, box, degree)
         inputs = [arb_mat([[u], [1]]) for u in PUSHES]
         lasts = LASTS if lasting else None
         scene = Scene(EVENTS, inputs, START.tolist(), bound, BREAKS if bound else [], BEGUN, lasts)
-        tube = Tube(Rows(States(flow, scene), np.eye(2)), small)
+        tube = VerifiedTube(ProjectedStates(States(flow, scene), np.eye(2)), small)
         assert tube.rows.states.last.shape == (2, 1)
         for piece, (a, b) in list(enumerate(pairwise([*EVENTS, 2.0])))[1::2]:
             start = a + 0.4 * (b - a)
@@ -237,9 +236,11 @@ def test_beyond_the_degree_all_is_in_the_error_of_a_state_that_cancels() -> None
     )
     for bound, begun in ((None, None), (Box([-1.0], [1.0]), None), (None, Box([-1.0], [1.0]))):
         with ctx.workprec(96):
-            flow = Flow(Plant.of(system, 1.0), 1.0, ParameterBox((0.0,), (1.0,)), 2)
+            flow = VerifiedFlow(Plant.of(system, 1.0), 1.0, ParameterBox((0.0,), (1.0,)), 2)
             scene = Scene([0.0, 1.0], [arb_mat([[0]])], [1.0], bound, [0.0] if bound else [], begun)
-            (poly,) = Tube(Rows(States(flow, scene), np.eye(1)), flow.box).cells(0, 1.0, 1.0, np.eye(1))
+            (poly,) = VerifiedTube(ProjectedStates(States(flow, scene), np.eye(1)), flow.box).cells(
+                0, 1.0, 1.0, np.eye(1)
+            )
         for p in (-1.0, 1.0):
             truth = np.exp(p) * (2.0 if begun else 1.0) + (np.expm1(p) / p if bound else 0.0)
             told = float(poly.coefficients[0] @ np.array([1.0, p, p * p]))
@@ -256,7 +257,7 @@ def test_blocks_of_intervals_are_all_those_before_a_mark() -> None:
 def test_effects_are_those_of_every_interval_carried_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """By blocks or one by one: ``Phi(t, t_k) Gamma_k`` by an integrator."""
     with ctx.workprec(192):
-        flow = Flow(Plant.of(spring(), 2.0), 2.0, POINT)
+        flow = VerifiedFlow(Plant.of(spring(), 2.0), 2.0, POINT)
         scene = Scene(EVENTS, [arb_mat([[u], [1]]) for u in PUSHES], START.tolist(), SETS["box"], BREAKS, BEGUN)
         states = States(flow, scene)
         marks = states.marks
@@ -303,7 +304,7 @@ def test_rows_of_a_segment_are_off_by_what_it_is_and_by_the_terms_that_are_not_k
     tables, off, basis = rng.uniform(0.1, 1.0, (6, 2, 3)), rng.uniform(0.1, 1.0, (2, 3)), rng.uniform(0.5, 1.0, (3, 2))
     with ctx.workprec(96):
         terms = [Series.known(arb_mat([[arb(float(x)) for x in row] for row in one])) for one in tables]
-        lines = Lines.of(Segment(terms, off), basis)
+        lines = Lines.of(VerifiedSegment(terms, off), basis)
         for first, width in ((0.0, 1.0), (0.3, 0.5), (0.9, 0.0)):
             found = lines.shifted(first, width, order)
             assert len(found.mid) == min(order, len(tables))

@@ -11,12 +11,11 @@ from flint import arb, ctx
 from scipy.linalg import expm
 
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.flow.flow import Flow
-from sparserob_core.checker.flow.law import Box as ParameterBox
+from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.reach.scene import Scene
-from sparserob_core.checker.reach.states import States
-from sparserob_core.checker.reach.tube import Rows, Tube
+from sparserob_core.checker.reach.states import Scene, States
+from sparserob_core.checker.reach.tube import ProjectedStates, VerifiedTube
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.sets.sets import ConvexSet, NormBall
@@ -73,9 +72,9 @@ def test_tubes_of_systems_that_take_turns_are_above_the_worst_case_and_not_far_a
     with ctx.workprec(96):
         scene = Scene(GRID, held, START.tolist(), bound, CHANGES, INITIAL)
         around = ParameterBox((0.1,), (spread,)) if unknown else ParameterBox()
-        flow = Flow(Plant.of(system, HORIZON), HORIZON, around, degree)
+        flow = VerifiedFlow(Plant.of(system, HORIZON), HORIZON, around, degree)
         states = States(flow, scene)
-        tube = Tube(Rows(states, np.eye(2)), around)
+        tube = VerifiedTube(ProjectedStates(states, np.eye(2)), around)
         for piece, (a, b) in list(enumerate(itertools.pairwise(GRID)))[2::2]:
             start, stop = a + 0.1 * (b - a) * (piece % 4 // 2), b - 0.6 * (b - a)
             stop = min([stop, *(mark for mark in states.marks if mark > start)])
@@ -102,6 +101,8 @@ def test_what_the_degree_leaves_out_is_enough_beyond_every_switch() -> None:
     ):
         scene = Scene([0.0, 1.0, 2.0], [stacked([[arb(0)]])] * 2, [1.0], bound, [0.0] if bound else [])
         with ctx.workprec(96):
-            flow = Flow(Plant.of(system, 2.0), 2.0, ParameterBox((0.0,), (0.5,)), 2)
-            (poly,) = Tube(Rows(States(flow, scene), np.eye(1)), flow.box).cells(1, 2.0, 2.0, np.eye(1))
+            flow = VerifiedFlow(Plant.of(system, 2.0), 2.0, ParameterBox((0.0,), (0.5,)), 2)
+            (poly,) = VerifiedTube(ProjectedStates(States(flow, scene), np.eye(1)), flow.box).cells(
+                1, 2.0, 2.0, np.eye(1)
+            )
         assert left_out <= poly.error - poly.kinks <= 10 * left_out

@@ -1,4 +1,4 @@
-"""Guards checker/reach/supports: bounds of the support at weights that are off by what is told."""
+"""Guards checker/reach/tube: bounds of the support at weights that are off by what is told."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sparserob_core.checker.arithmetic.monomials import Monomials
-from sparserob_core.checker.reach.supports import bounded
+from sparserob_core.checker.reach.tube import bound_supports
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
 
@@ -30,7 +30,7 @@ def test_a_bound_holds_for_every_weight_that_is_off_by_no_more_than_is_told(name
     errors[:, :, :, channel] = rng.uniform(0.01, 0.03, size=errors[:, :, :, channel].shape)
     z = np.array([[1.0], [-0.5]])
     shape = known(SETS[name])
-    moved, error, kinks, _ = bounded(shape, monomials, every, errors, z, sharp)
+    moved, error, kinks, _ = bound_supports(shape, monomials, every, errors, z, sharp)
     exponents = np.array(monomials.exponents).reshape(-1)
     tight = np.inf
     for t in (0.0, 0.4, 1.0):

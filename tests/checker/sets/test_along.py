@@ -10,9 +10,8 @@ from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.closed_loop import middle
-from sparserob_core.checker.sets.along import LEFT, NODES, Curve, _heights, _most, rule
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.along import LEFT, NODES, CurvedSide, _heights, _most, rule
+from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope, product
 
@@ -30,8 +29,8 @@ SETS: dict[str, ConvexSet] = {
 }
 
 
-def curve(bound: ConvexSet) -> Curve:
-    return Curve(known(bound), middle(bound))
+def curve(bound: ConvexSet) -> CurvedSide:
+    return CurvedSide(known(bound), middle(bound))
 
 
 @pytest.mark.first(2)

@@ -16,7 +16,7 @@ import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.parameters import Parameters
+from sparserob_core.checker.sets.parameters import Parameters, halfspaces
 from sparserob_core.checker.sets.shape import facet, widths
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.control.sets.sets import Box, Cylinder, Ellipsoid, NormBall, Polytope, Product
@@ -119,7 +119,7 @@ def test_half_spaces_hold_the_set_and_leave_a_point_outside_out(name):
     for direction in rng.normal(size=(10, 2)):
         outside = middle + 1.5 * (SETS[name].support_point(direction[None])[0] - middle)
         with ctx.workprec(96):
-            spaces = [(c, float(b.mid())) for c, b in known(SETS[name]).halfspaces(outside)]
+            spaces = [(c, float(b.mid())) for c, b in halfspaces(known(SETS[name]), outside)]
         assert all((inside @ c <= b + 1e-12).all() for c, b in spaces)
         assert any(outside @ c > b for c, b in spaces)
 

@@ -51,7 +51,7 @@ def witness(made: Kind, row: Array, time: float) -> dict[str, Any]:
     inwards = 1.0 - 1e-9  # a support point of an ellipsoid is on its boundary but for rounding
     middle = (made.begun.support_point(np.eye(2)) + made.begun.support_point(-np.eye(2))).mean(axis=0) / 2.0
     deviation = middle + inwards * (made.begun.support_point(w.free)[0] - middle)
-    grid = sorted({*made.case().grid, *made.motion.changes.tolist()})  # systems in pieces want all of their own
+    grid = sorted({*made.case().timing.grid, *made.motion.changes.tolist()})  # systems in pieces want all of their own
     signal = made.bound.support_point(w.blocks[0])[np.searchsorted(made.motion.changes, grid[:-1], side="right") - 1].T
     return {**said, "deviation": deviation.tolist(), "changes": grid, "disturbance": signal.tolist()}
 
@@ -157,7 +157,7 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         lambda row: row.update(deviation=OUTSIDE.tolist()),
         "the deviation of the initial state is not shown",
     ),
-    "a deviation of three": (lambda row: row.update(deviation=[0.0] * 3), "deviation: 3 numbers where 2"),
+    "a deviation of three": (lambda row: row.update(deviation=[0.0] * 3), "deviation: shape (3,), expected (2,)"),
     "changes that end early": (
         lambda row: row.update(changes=[*CHANGES, HORIZON - 0.1]),
         "changes: expected times from 0 to 2",
@@ -170,12 +170,12 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         lambda row: row.update(changes=[0.0, 1.5, 1.5, HORIZON]),
         "changes: expected increasing times",
     ),
-    "changes of its own": (lambda row: row.update(changes=[0.0, 0.7, 1.5, HORIZON]), "disturbance: expected shape"),
+    "changes of its own": (lambda row: row.update(changes=[0.0, 0.7, 1.5, HORIZON]), "disturbance: shape"),
     "a disturbance outside": (
         lambda row: row.update(disturbance=(1.001 * np.array(row["disturbance"])).tolist()),
         "is not shown to be in its set",
     ),
-    "another shape": (lambda row: row.update(disturbance=row["disturbance"][:1]), "disturbance: expected shape"),
+    "another shape": (lambda row: row.update(disturbance=row["disturbance"][:1]), "disturbance: shape"),
     "a jump within a piece": (
         lambda row: row.update(
             changes=[0.0, 0.3, *row["changes"][1:]], disturbance=[[0.0, *one] for one in row["disturbance"]]

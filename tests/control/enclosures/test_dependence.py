@@ -43,7 +43,7 @@ def _to_many_digits() -> Iterator[None]:
 
 def around(centre: float, length: int) -> Model:
     """A number about ``centre``, of whose functions so many powers are known."""
-    return Model.time(Frame(NONE, length - 1), flint.arb(centre), flint.arb(HALF))
+    return Frame(NONE, length - 1).time(flint.arb(centre), flint.arb(HALF))
 
 
 def powers(model: Model, length: int) -> list[flint.arb]:

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
-from sparserob_core.checker.flow.flow import Flow
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.polynomials import Enclosed
@@ -187,7 +187,7 @@ def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_
 
     with ctx.workprec(192):
         still, none = [arb_mat(1, 1)] * 2, np.zeros((2, 2, 1, 2))
-        law = Flow(Plant.of(system, 2.0), 2.0)
+        law = VerifiedFlow(Plant.of(system, 2.0), 2.0)
         both = MeasurableLoop(system, [0.0, 0.0], still, none, grid, grid, [], bound, law=law)
         assert len(law.marks([0.0, 1.1])) > 4
         for piece, (low, high) in enumerate(pairwise(grid)):
@@ -198,7 +198,8 @@ def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_
                 reached = float(a @ state)
                 np.testing.assert_allclose(outward @ zonoid.reached(arc), state, atol=1e-9)
                 assert float(zonoid.support(a @ outward)) == pytest.approx(reached, abs=1e-9)
-                told = both.kernel(piece).most(Enclosed(a[None], np.zeros((1, 2))), both.sides)
+                pushed = both.deviations
+                told = pushed.kernel(piece).most(Enclosed(a[None], np.zeros((1, 2))), pushed.sides)
                 assert told.mid[0] == pytest.approx(reached, abs=1e-9) and told.rad[0] < 1e-12
                 time = 0.3 * low + 0.7 * high
                 ends, signal = pieces.signal(np.zeros(pieces.size), time, a, piece)

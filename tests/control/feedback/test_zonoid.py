@@ -171,7 +171,7 @@ def test_the_support_function_is_that_of_the_checker_to_all_digits(name: str) ->
             system=system, horizon=length, initial_state=np.zeros(len(A)), control=Box([0.0], [0.0]),
             disturbance=bound, disturbance_class="measurable",
         )  # fmt: skip
-        kernel = undriven(problem, [0.0, length]).kernel(0)
+        kernel = undriven(problem, [0.0, length]).deviations.kernel(0)
         rows = a @ found.into
         truth = kernel.most(Enclosed(rows, np.zeros_like(rows)), Side.of(bound))
     sizes = np.abs(found.support(a)).max()

@@ -22,7 +22,6 @@ PLACES = (
 # how few pieces can act is claimed of a control that answers nothing, whose families have rows of the decision
 # and the checker's loops of what does not change with time do not go through its flow yet
 ALONE = {
-    "checker.claims.case.Case._states",
     "checker.claims.case.Case.flows",
     "checker.claims.case.Case.states",
     "checker.claims.activity.",
@@ -30,7 +29,6 @@ ALONE = {
     "checker.claims.claims._fewest",
     "checker.claims.claims._other",
     "checker.claims.constraints.tubes",
-    "checker.claims.duality.Duality.nothing",
     "control.transcription.program.OpenLoop.",
     "control.transcription.program._block_units",
     "control.transcription.program._reduced",
@@ -41,14 +39,12 @@ ALONE = {
 ANSWERING = {
     "checker.claims.answers.",
     "checker.claims.case.Case.answers",
-    "checker.claims.case.Case.unloaded",
     "checker.claims.case.written_policy",
     "checker.claims.causal.",
     "checker.claims.claims._causal",
     "checker.claims.claims._policy",
     "checker.claims.claims._without_nominal",
     "checker.claims.claims.derived_causal_bound",
-    "checker.claims.duality.Duality.pushed",
     "control.transcription.feedback.",
     "control.transcription.program.held_nominally",
     "control.transcription.record.Transcription.",

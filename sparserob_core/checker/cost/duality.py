@@ -11,16 +11,18 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.arithmetic.balls import ball, largest
+from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.cost.price import Price, Tangent
-from sparserob_core.checker.flow.flows import Flows
+from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.problem.lasting import Lasting, summed
+from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -36,7 +38,7 @@ EFFORT = "effort"
 
 @final
 @dataclass(frozen=True, eq=False)
-class Row:
+class ConstraintRow:
     """``constant + sum_k slope_k u_k + sizes_k |u_k| <= charged`` for every feasible control; ``slope`` is a list of
     ``m`` balls per piece of the control, ``sizes (K, m)`` are numbers that are not negative, or there are none.
 
@@ -62,28 +64,23 @@ class Duality:
     problem: OptimalControlProblem
     control: Dictionary
     changes: list[float] | None
-    flows: Flows
+    flows: VerifiedFlows
     held: ConvexSet | None = None
     lasting: Lasting | None = None
-
-    @property
-    def nothing(self) -> arb:
-        """0."""
-        return _exact(0.0)
 
     def control_piece(self, time: float) -> int:
         """The piece of the control that is commanded at a time."""
         place = int(np.searchsorted(self.control.breakpoints, time, side="right")) - 1
         return min(max(place, 0), self.control.pieces - 1)
 
-    def control_row(self, direction: Array, time: float) -> Row:
+    def control_row(self, direction: Array, time: float) -> ConstraintRow:
         """``c'u(t) <= h(c)`` for the set of controls."""
         piece = self.control_piece(time)
-        slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
-        slope[piece] = [_exact(c) for c in direction]
-        return Row(-known(self.problem.control).limit(direction), slope)
+        slope = [[ball(0.0)] * direction.size for _ in range(self.control.pieces)]
+        slope[piece] = [ball(c) for c in direction]
+        return ConstraintRow(-known(self.problem.control).limit(direction), slope)
 
-    def step_row(self, direction: Array, time: float) -> Row:
+    def step_row(self, direction: Array, time: float) -> ConstraintRow:
         """``c'(u_k - u_{k-1}) <= h(c)`` for the step at a breakpoint, ``u_{-1}`` the control before time 0."""
         if self.problem.control_step is None:
             raise Broken("the problem has no constraint 'control_step'")
@@ -91,19 +88,20 @@ class Duality:
         if not found:
             raise Broken(f"control_step: there is no step at t = {time!r}")
         (k,) = found
-        slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
+        slope = [[ball(0.0)] * direction.size for _ in range(self.control.pieces)]
         after = k % self.control.pieces  # after the last piece comes the first one
-        slope[after] = [_exact(c) for c in direction]
+        slope[after] = [ball(c) for c in direction]
         constant = -known(self.problem.control_step).limit(direction)
         if k > 0:
-            slope[k - 1] = [a - _exact(c) for a, c in zip(slope[k - 1], direction, strict=True)]
+            slope[k - 1] = [a - ball(c) for a, c in zip(slope[k - 1], direction, strict=True)]
         else:
-            constant -= sum(
-                (_exact(c) * u for c, u in zip(direction, map(_exact, before(self.problem)), strict=True)), _exact(0.0)
-            )
-        return Row(constant, slope)
+            early = zip(direction, before(self.problem), strict=True)
+            constant -= sum((ball(c) * ball(u) for c, u in early), ball(0.0))
+        return ConstraintRow(constant, slope)
 
-    def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
+    def row(
+        self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True
+    ) -> ConstraintRow:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
         it."""
         m, problem = self.problem.system.controls, self.problem
@@ -111,15 +109,15 @@ class Duality:
         breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
         begins = sorted({0.0, *(s for s in (*breaks, *jumps) if s < time)})
         weights = self.flows.at(parameter).weights([*begins, time])
-        row, start = stacked([[_exact(c) for c in direction]]), np.asarray(problem.initial_state)
+        row, start = exactly(direction[None]), np.asarray(problem.initial_state)
         free = (row * weights.free).entries()
-        constant = sum((w * _exact(x) for w, x in zip(free, start, strict=True)), _exact(0.0)) - limit
-        slope = [[_exact(0.0)] * m for _ in range(self.control.pieces)]
-        pushes = [[_exact(0.0)] * problem.system.disturbances for _ in jumps]
+        constant = sum((w * ball(x) for w, x in zip(free, start, strict=True)), ball(0.0)) - limit
+        slope = [[ball(0.0)] * m for _ in range(self.control.pieces)]
+        pushes = [[ball(0.0)] * problem.system.disturbances for _ in jumps]
         for begin, part, pushed in zip(begins, weights.control, weights.disturbance, strict=True):
             every, k = (row * part).entries(), bisect_right(breaks, begin) - 1
             if k < 0:
-                constant = sum((w * _exact(u) for w, u in zip(every[:m], before(problem), strict=True)), constant)
+                constant = sum((w * ball(u) for w, u in zip(every[:m], before(problem), strict=True)), constant)
             else:
                 slope[k] = [a + b for a, b in zip(slope[k], every[:m], strict=True)]
             constant = sum(every[m:], constant)  # a drift, whose input is 1
@@ -131,7 +129,7 @@ class Duality:
         if disturbed and self.held is not None:
             for one in summed(self.lasting, pushes):
                 constant = constant + known(self.held).support(one)
-        return Row(constant, slope)
+        return ConstraintRow(constant, slope)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:
         """What every block of the disturbance gives to ``c'x(t)`` of a known system, ``(mw,)`` each; the blocks begin
@@ -140,19 +138,19 @@ class Duality:
         if not jumps:
             return []
         begins = sorted({0.0, *(s for s in jumps if s < time)})
-        weights, row = self.flows.at(()).weights([*begins, time]), stacked([[_exact(c) for c in direction]])
+        weights, row = self.flows.at(()).weights([*begins, time]), exactly(direction[None])
         given = {s: (row * one).entries() for s, one in zip(begins, weights.disturbance, strict=True)}
-        late = [_exact(0.0)] * self.problem.system.disturbances
+        late = [ball(0.0)] * self.problem.system.disturbances
         return [given[s] if s < time else late for s in jumps]
 
     def carried(self, direction: Array, time: float) -> list[arb]:
         """What the initial state of a known system gives to ``c'x(t)``, ``(d,)``."""
-        row = stacked([[_exact(c) for c in direction]])
+        row = exactly(direction[None])
         return list((row * self.flows.at(()).weights([0.0, time]).free).entries())
 
     def bound(
         self,
-        rows: Sequence[tuple[float, Row]],
+        rows: Sequence[tuple[float, ConstraintRow]],
         pieces: Sequence[Sequence[float]] | None,
         price: Price | None,
         touched: Sequence[arb_mat] | None = None,
@@ -167,12 +165,12 @@ class Duality:
         constant, slopes = self.summed(rows, pieces, tangent)
         charges = price if lengths else None
         groups = [] if charges is None else [block for block in charges.blocks if len(block) > 1]
-        free = [[_exact(0.0)] * self.problem.system.controls] * len(slopes)
+        free = [[ball(0.0)] * self.problem.system.controls] * len(slopes)
         costs = free if charges is None else charges.costs
         sizes = self.charged(rows, free)
         for k, (cost, size, slope) in enumerate(zip(costs, sizes, slopes, strict=True)):
             if groups and touched is not None:
-                offered = None if norms is None else [_exact(v) for v in norms[:, k]]
+                offered = None if norms is None else [ball(v) for v in norms[:, k]]
                 constant = constant + self._least_of_groups(cost, size, slope, groups, touched[k].entries(), offered)
             else:
                 every = [a + b for a, b in zip(cost, size, strict=True)]
@@ -196,7 +194,7 @@ class Duality:
         In a corner of slanted sides the one that bounds most is between these two: the multipliers of the sides take a
         part of what the slope asks for, and a tangent at a control that is off by a little tilts the corner.
         """
-        asked = _shrunk([_exact(-float(s)) for s in slope], sizes)
+        asked = _shrunk([ball(-float(s)) for s in slope], sizes)
         given = [] if offered is None else [(_within, _shrunk(offered, sizes))]
         offers = []
         for chosen, wanted in ((_within, asked), (_lengthened, at), *given):
@@ -208,28 +206,28 @@ class Duality:
             offers.append((left, tilted))
         shape = known(self.problem.control)
         if not isinstance(shape, Boxed):
-            return _most([shape.least(left, left, tilted) for left, tilted in offers])
+            return largest([shape.least(left, left, tilted) for left, tilted in offers])
         alone = [[c] for c in range(len(slope)) if not any(c in block for block in groups)]
         parts = [shape.shares_of_least(left, left, tilted) for left, tilted in offers]
-        found = _exact(0.0)
+        found = ball(0.0)
         for block in (*groups, *alone):
-            values = [sum((part[c] for c in block), _exact(0.0)) for part in parts]
-            found = found + _most(values)
+            values = [sum((part[c] for c in block), ball(0.0)) for part in parts]
+            found = found + largest(values)
         return found
 
     def summed(
         self,
-        rows: Sequence[tuple[float, Row]],
+        rows: Sequence[tuple[float, ConstraintRow]],
         pieces: Sequence[Sequence[float]] | None,
         tangent: Tangent | None = None,
     ) -> tuple[arb, list[list[arb]]]:
         """The sum of ``rows`` times their multipliers ``y``, and of a ``tangent``: its constant, and its slopes on
         every piece; with fewer functions than ``pieces``, in the slopes of these."""
-        constant = sum((_exact(y) * row.constant for y, row in rows), _exact(0.0))
+        constant = sum((ball(y) * row.constant for y, row in rows), ball(0.0))
         m, K = self.problem.system.controls, self.control.pieces
         slopes = [
             [
-                sum((_exact(y) * row.slope[k][c] for y, row in rows if not row.slope[k][c].is_zero()), _exact(0.0))
+                sum((ball(y) * row.slope[k][c] for y, row in rows if not row.slope[k][c].is_zero()), ball(0.0))
                 for c in range(m)
             ]
             for k in range(K)
@@ -244,14 +242,14 @@ class Duality:
             constant = constant - slip
         return constant, slopes
 
-    def charged(self, rows: Sequence[tuple[float, Row]], costs: list[list[arb]]) -> list[list[arb]]:
+    def charged(self, rows: Sequence[tuple[float, ConstraintRow]], costs: list[list[arb]]) -> list[list[arb]]:
         """What absolute values cost on every piece, ``m`` balls each, with what ``rows`` times their multipliers say of
         them."""
         found = costs
         for y, row in rows:
             if row.sizes is not None:
                 pairs = zip(found, row.sizes.tolist(), strict=True)
-                found = [[c + _exact(y) * _exact(v) for c, v in zip(one, two, strict=True)] for one, two in pairs]
+                found = [[c + ball(y) * ball(v) for c, v in zip(one, two, strict=True)] for one, two in pairs]
         return found
 
     def _moved(self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]) -> tuple[list[list[arb]], arb]:
@@ -261,28 +259,28 @@ class Duality:
         What they act differently is bounded by the largest coefficients.
         """
         m, K, N = self.problem.system.controls, self.control.pieces, self.control.functions
-        mine = [[-_exact(pieces[c][k]) for c in range(m)] for k in range(K)]
-        slip = _exact(0.0)
+        mine = [[-ball(pieces[c][k]) for c in range(m)] for k in range(K)]
+        slip = ball(0.0)
         for c in range(m):
             largest = self._largest_coefficients(c)
             for n in range(N):
                 off = sum(
-                    ((mine[k][c] - slopes[k][c]) * _exact(v) for k, v in enumerate(self.control.values[n]) if v),
-                    _exact(0.0),
+                    ((mine[k][c] - slopes[k][c]) * ball(v) for k, v in enumerate(self.control.values[n]) if v),
+                    ball(0.0),
                 )
                 slip = slip + abs(off) * largest[n]
         return mine, slip
 
     def _largest_coefficients(self, channel: int) -> list[arb]:
-        axis = [_exact(float(i == channel)) for i in range(self.problem.system.controls)]
+        axis = [ball(float(i == channel)) for i in range(self.problem.system.controls)]
         shape = known(self.problem.control)
         reach = shape.support(axis).max(shape.support([-a for a in axis]))
-        return [sum((abs(x) for x in row), _exact(0.0)) * reach for row in self._pseudoinverse]
+        return [sum((abs(x) for x in row), ball(0.0)) * reach for row in self._pseudoinverse]
 
     @cached_property
     def _pseudoinverse(self) -> list[list[arb]]:
         """``(V V')^-1 V``: the coefficients of a control in the span of the dictionary."""
-        V = stacked([[_exact(v) for v in row] for row in self.control.values])
+        V = exactly(self.control.values)
         table: list[list[arb]] = ((V * V.transpose()).inv() * V).tolist()
         return table
 
@@ -293,21 +291,10 @@ def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
     return range(0 if problem.initial_control is not None else 1, control.pieces + bool(problem.repeat))
 
 
-def before(problem: OptimalControlProblem) -> list[float]:
-    """The control that acts until the first one of a delayed system does, ``(m,)``."""
-    given = problem.initial_control
-    return [0.0] * problem.system.controls if given is None else [float(u) for u in np.asarray(given)]
-
-
-def _most(values: Sequence[arb]) -> arb:
-    """The largest of what is proven in several ways."""
-    return reduce(lambda one, other: one.max(other), values)
-
-
 def _shrunk(vector: Sequence[arb], sizes: Sequence[arb]) -> list[arb]:
     """Exact numbers, each nearer to 0 by a size, or 0."""
     about = [(float(v), float(size)) for v, size in zip(vector, sizes, strict=True)]
-    return [_exact(np.sign(v) * max(abs(v) - size, 0.0)) for v, size in about]
+    return [ball(np.sign(v) * max(abs(v) - size, 0.0)) for v, size in about]
 
 
 def _within(vector: Sequence[arb], length: arb) -> Sequence[arb]:
@@ -317,16 +304,10 @@ def _within(vector: Sequence[arb], length: arb) -> Sequence[arb]:
 
 def _lengthened(vector: Sequence[arb], length: arb) -> list[arb]:
     """The vector in a direction, of its middle, that is as long as that; 0 where the direction is 0."""
-    vector = [_exact(float(v)) for v in vector]
+    vector = [ball(float(v)) for v in vector]
     size = _squares(vector)
-    return [length * v / size.sqrt() for v in vector] if size > 0 else [_exact(0.0) for _ in vector]
+    return [length * v / size.sqrt() for v in vector] if size > 0 else [ball(0.0) for _ in vector]
 
 
 def _squares(vector: Sequence[arb]) -> arb:
-    return sum((v * v for v in vector), _exact(0.0))
-
-
-def _exact(value: float) -> arb:
-    from flint import arb
-
-    return arb(float(value))
+    return sum((v * v for v in vector), ball(0.0))

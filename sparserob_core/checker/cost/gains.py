@@ -1,0 +1,203 @@
+"""How far all gains of a control that answers can lower a weighted sum of constraints together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import ball, balls, largest, rational, smallest
+from sparserob_core.checker.arithmetic.series import exactly, stacked
+from sparserob_core.checker.cost.duality import ConstraintRow
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
+from sparserob_core.checker.reach.preimages import Pushed, SeenDeviations
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import NEAR, along
+from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class GainsBound:
+    """The gains with which a control in a set answers, ``answers (K, K)``, what is measured of a ``loop`` at rest."""
+
+    loop: VerifiedLoop
+    answers: np.ndarray
+    control: ConvexSet
+    _inverses: dict[tuple[int, ...], tuple[arb_mat, list[int]]] = field(default_factory=dict, repr=False)
+    _pushes: dict[tuple[tuple[Fraction, ...], ...], Pushed] = field(default_factory=dict, repr=False)
+
+    def of(self, rows: Sequence[tuple[float, ConstraintRow]]) -> arb:
+        """How much the gains can lower the sum of ``rows`` times their multipliers, at most."""
+        total = ball(0)
+        rows = [(y, row) for y, row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
+        if not rows:
+            return total
+        K, m, d = len(self.answers), self.control.dimension, self.loop.outputs
+        left = stacked([[ball(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
+        right = stacked([[x for part in row.innovations for x in part] for _, row in rows])
+        product = (left * right).tolist()
+        width = [_width(self.control, i) for i in range(m)]
+        for k in range(K):
+            clusters = self._clusters(k)
+            for i in range(m):
+                sizes = [ball(0)]
+                for members, inverse, blocks in clusters:
+                    z = (
+                        inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])
+                    ).entries()
+                    shares = iter(z)
+                    sizes += [
+                        sum((abs(next(shares)) / length for _, length in self._segments[block]), ball(0))
+                        for block in blocks
+                    ]
+                total = total + width[i] * largest(sizes)
+        return total
+
+    def _clusters(self, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
+        """The breakpoints that the control on a piece answers, those that see a block in common together; for each what
+        gives, from a combination of the states seen there, a combination of the blocks, ``(q, J d)``."""
+        groups: list[tuple[list[int], set[int]]] = []
+        for j in np.flatnonzero(self.answers[k, : k + 1]).tolist():
+            seen = {block for block in self.loop.seen[j] if self._segments[block]}
+            if not seen:
+                continue
+            mine, rest = ([j], seen), []
+            for members, blocks in groups:
+                if blocks & mine[1]:
+                    mine = (members + mine[0], mine[1] | blocks)
+                else:
+                    rest.append((members, blocks))
+            groups = [*rest, mine]
+        return [(sorted(members), *self._inverse(tuple(sorted(members)))) for members, _ in groups]
+
+    def _inverse(self, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
+        """What gives, of any combination of the states seen at these breakpoints, one of the blocks that is seen so."""
+        if members not in self._inverses:
+            blocks = sorted({block for j in members for block in self.loop.seen[j] if self._segments[block]})
+            d = self.loop.outputs
+            table: list[list[arb]] = []
+            for j in members:
+                seen = self.loop.seen[j]
+                lists = {block: _onto(push, self._segments[block]) for block, push in seen.items() if block in blocks}
+                table += [
+                    [x for block in blocks for x in (lists[block][s] if block in lists else self._none_of(block))]
+                    for s in range(d)
+                ]
+            groups = [self._pushed(block) for block in blocks]
+            pattern = np.vstack(
+                [np.hstack([g.pattern & (b in self.loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
+                 for j in members]
+            )  # fmt: skip
+            most = max(group.states for group in groups)
+            rows = [(d * (k + 1), most) for k in range(len(members))]
+            ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
+            columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
+            reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
+            self._inverses[members] = SeenDeviations(stacked(table), pattern, rows, columns, reach).inverse(), blocks
+        return self._inverses[members]
+
+    def _none_of(self, block: int) -> list[arb]:
+        """Nothing of any of the segments of a block."""
+        return [balls([0.0])[0]] * len(self._segments[block])
+
+    def _pushed(self, block: int) -> Pushed:
+        """Who can see the deviations of a block; of the initial state everyone sees its own."""
+        loop, vectors = self.loop, [vector for vector, _ in self._segments[block]]
+        if loop.measured is not None:  # outputs see what the observer makes of everything: as many as there are
+            return Pushed(np.ones((loop.outputs, len(vectors)), dtype=bool), loop.outputs, len(vectors))
+        if loop.initial is not None and block == loop.deviations.begun:
+            return Pushed(np.array([[bool(v) for v in row] for row in vectors]).T, len(vectors), len(vectors))
+        key = tuple(map(tuple, vectors))
+        if key not in self._pushes:
+            self._pushes[key] = loop.pushed(vectors)
+        return self._pushes[key]
+
+    @cached_property
+    def _segments(self) -> list[list[tuple[list[Fraction], arb]]]:
+        """Of every block the directions along which its set is long, and how long; none of what cannot deviate, which
+        is never seen."""
+        loop = self.loop
+        found = {id(shape): _segments(shape, about) for shape, about in loop.deviations.sets}
+        return [found[id(shape)] for shape, _ in loop.deviations.sets]
+
+
+def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
+    return known(shape).support(balls(sign * np.eye(shape.dimension)[channel]))
+
+
+def _width(shape: ConvexSet, channel: int) -> arb:
+    return _axis(shape, channel, 1.0) + _axis(shape, channel, -1.0)
+
+
+def reach(shape: ConvexSet, channel: int) -> arb:
+    """How far a set goes from 0 along a channel, to either side."""
+    return _axis(shape, channel, 1.0).max(_axis(shape, channel, -1.0)).max(_axis(shape, channel, 1.0) * 0)
+
+
+def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb]]:
+    """Vectors ``v (d,)`` that span the directions along which points of a set differ, and numbers ``c > 0`` such that
+    its width along any ``a`` is at least ``c |a'v|``: along the axes, but of a set without an interior."""
+    if isinstance(shape, Product):
+        return [
+            ([*[Fraction(0)] * place.start, *vector, *[Fraction(0)] * (shape.dimension - place.stop)], length)
+            for part, own, place in _parts(shape, middle)
+            for vector, length in _segments(part, own)
+        ]
+    chords, axes = _chords(shape, middle), np.eye(shape.dimension)
+    wide = [_width(shape, channel) for channel in range(shape.dimension)]
+    if all(wide[b].is_zero() or chord > NEAR * wide[b] for b, chord in enumerate(chords)):
+        kept = [b for b, width in enumerate(wide) if not width.is_zero()]
+        return [([Fraction(float(v)) for v in axes[b]], chords[b]) for b in kept]
+    along = known(shape).segments
+    if along is None:
+        raise Unchecked(f"the checker does not know how long the {shape.kind} is along the axes")
+    return [(vector, rational(length)) for vector, length in along]
+
+
+def _parts(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]]:
+    """Every part of a product with its part of a point, and its place."""
+    ends = np.cumsum([0, *(part.dimension for part in shape.parts)]).tolist()
+    places = [slice(begin, end) for begin, end in pairwise(ends)]
+    return [(part, middle[place], place) for part, place in zip(shape.parts, places, strict=True)]
+
+
+def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
+    """Numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: how long it is along the
+    axes through its middle."""
+    if isinstance(shape, Product):
+        return [chord for part, own in shape.split(middle) for chord in _chords(part, own)]
+    if isinstance(shape, NormBall):
+        return [2 * ball(shape.radius)] * shape.dimension
+    if isinstance(shape, Ellipsoid):
+        inverse = exactly(shape.shape).inv()
+        return [2 / inverse[b, b].sqrt() for b in range(shape.dimension)]
+    flat = known(shape).facets
+    if flat is None:
+        raise Unchecked("the checker does not know how long the disturbance's set is along the axes")
+    found = []
+    for axis in range(shape.dimension):
+        reach = []
+        for sign in (1.0, -1.0):
+            ends = [(b - along(c, balls(middle))) / ball(abs(c[axis])) for c, b in flat if sign * c[axis] > 0]
+            reach.append(smallest(ends))
+        found.append(reach[0] + reach[1])
+    return found
+
+
+def _onto(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
+    """What every entry is of some segments of a block, that is this of its coordinates."""
+    rows, columns = push.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
+    return [
+        [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in one), ball(0)) for one in columns] for row in rows
+    ]

@@ -1,0 +1,99 @@
+"""The disturbances of a problem: where each may jump, and which of them stay the same between these times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.problem.lasting import Lasting
+from sparserob_core.checker.problem.timing import Timing
+from sparserob_core.checker.sets.known import middle
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.sets.sets import Box, ConvexSet, Product, product
+from sparserob_core.sip.convex_set import Array
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Disturbances:
+    """The disturbances of a ``problem`` on the pieces of a ``dictionary``."""
+
+    problem: OptimalControlProblem
+    dictionary: Dictionary
+    timing: Timing
+
+    @cached_property
+    def lasting(self) -> Lasting | None:
+        """Which components of the disturbance stay what they are for several of its pieces, ``None`` where none do."""
+        return Lasting.of(self.problem, self.changes or [])
+
+    @property
+    def alike(self) -> bool:
+        """Whether all disturbances are of one class, and constant on the same pieces where they are on pieces."""
+        return not self.several and self.lasting is None
+
+    def may_jump(self, time: float) -> np.ndarray:
+        """Which components of the disturbance ``(mw,)`` may have another value from a time on, of those that are
+        constant on pieces."""
+        assert self.problem.disturbance is not None
+        if self.lasting is not None:
+            return self.lasting.may_jump(time)
+        return np.full(self.problem.disturbance.dimension, time in (self.changes or ()))
+
+    @property
+    def several(self) -> bool:
+        """Whether there are others beside measurable ones, which are constant on pieces."""
+        return not isinstance(self.problem.disturbance_class, str)
+
+    @cached_property
+    def changes(self) -> list[float] | None:
+        """Where the disturbance may jump; ``None`` when there is none. Other classes than piecewise constant ones are
+        not checked; of measurable ones, where those jump by which rows are measured."""
+        if self.problem.disturbance is None:
+            return None
+        if self.problem.measurable is not None and not self.several:
+            return self.timing.grid[:-1]
+        jumps = np.flatnonzero(self.dictionary.changes) + 1
+        if not self.several and self.problem.disturbance_class != "piecewise_constant":
+            raise Unchecked(
+                "the checker knows piecewise constant and measurable disturbances, not those of the class"
+                f" {self.problem.disturbance_class}"
+            )
+        if self.dictionary.functions != jumps.size + 1:
+            raise Unchecked(
+                "the checker knows disturbances that take any value on each piece, this dictionary has fewer functions"
+                " than pieces"
+            )
+        return [0.0, *(float(self.dictionary.breakpoints[j]) for j in jumps)]
+
+    @cached_property
+    def middle(self) -> Array:
+        """The middle of the set of the disturbances, ``(mw,)``; 0 where there are none."""
+        bound = self.problem.disturbance
+        return np.zeros(self.problem.system.disturbances) if bound is None else middle(bound)
+
+    @cached_property
+    def held(self) -> ConvexSet | None:
+        """The set of the disturbances of which every one stays the same between `changes`: where nothing answers
+        them, measurable ones are in the middle of their set, and bounded inputs say how far they may be from that."""
+        bound, classes = self.problem.disturbance, self.problem.disturbance_class
+        if self.timing.answering or self.problem.measurable is None or bound is None:
+            return bound
+        parts, kinds = ((bound,), (classes,)) if isinstance(classes, str) else (_parts(bound), classes)
+        middles = [
+            one if kind != "measurable" else Box(*2 * (middle(one),)) for one, kind in zip(parts, kinds, strict=True)
+        ]
+        found = product(middles)
+        return None if isinstance(classes, str) and not middle(found).any() else found
+
+
+def _parts(bound: ConvexSet) -> Sequence[ConvexSet]:
+    if not isinstance(bound, Product):
+        raise Unchecked("of disturbances of several classes, the checker knows lists of sets only")
+    return bound.parts

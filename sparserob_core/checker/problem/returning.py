@@ -1,0 +1,47 @@
+"""Plans that begin again: every final state must be one of the initial states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.sets.known import known
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.terms.repeat import Return
+from sparserob_core.control.sets.sets import Box
+
+RETURN = "return"
+INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: ten times what counts as no violation, so
+# that none is handed on from period to period
+
+
+def returning(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem with, of a plan that repeats, one constraint more: that every final state is one of the initial
+    states, and inside their set by more than what counts as no violation; none where there is but one of each
+    coordinate. Derived from the initial states alone, whatever the problem's records say of it."""
+    bound, end, alone = problem.initial_set, problem.horizon, single(problem)
+    path = [entry for entry in problem.windows if not isinstance(entry, Return)]
+    if not problem.repeat or bound is None or len(alone) == problem.system.states:
+        return replace(problem, path=path) if len(path) < len(problem.path) else problem
+    free = np.isin(np.arange(bound.dimension), alone)
+    if free.any():
+        if not isinstance(bound, Box):
+            raise Unchecked("of a flat set of initial states, the checker knows boxes only")
+        bound = Box(np.where(free, -np.inf, bound.lower), np.where(free, np.inf, bound.upper))
+    centre = np.asarray(problem.initial_state, dtype=float)
+    moved = np.column_stack([[0.0, end], np.vstack([centre, centre])]) if centre.any() else None
+    back = Return(bound.scaled(1.0 - INSIDE), end, end, RETURN, moved)
+    return replace(problem, path=[*path, back])
+
+
+def single(problem: OptimalControlProblem) -> list[int]:
+    """The coordinates of the state in which all initial ones are alike."""
+    bound, d = problem.initial_set, problem.system.states
+    if bound is None:
+        return list(range(d))
+    axes = np.eye(d).tolist()
+    both = ((known(bound).support(balls(c)), known(bound).support(balls([-v for v in c]))) for c in axes)
+    return [i for i, (up, down) in enumerate(both) if (up + down).is_zero()]

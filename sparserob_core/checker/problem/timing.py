@@ -1,0 +1,57 @@
+"""When the control of a problem acts, and one grid of all times at which an input may jump."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Clock
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.sip.convex_set import Array
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """The times of a ``problem`` whose ``control`` and ``disturbance`` have these breakpoints. Where the control is
+    ``answering``, it measures at its breakpoints."""
+
+    problem: OptimalControlProblem
+    control: Array
+    disturbance: Array
+    answering: bool
+    clock: Clock
+
+    @cached_property
+    def acting(self) -> list[float]:
+        """When every piece of the control begins to act; from 0 on."""
+        later: list[float] = np.unique([0.0, *(self.control[:-1] + self.problem.system.delay)]).tolist()
+        return later
+
+    @property
+    def until(self) -> float:
+        """The last time that anything is said of."""
+        return max(float(self.control[-1]), float(self.disturbance[-1]), self.problem.horizon)
+
+    @cached_property
+    def grid(self) -> list[float]:
+        """Every breakpoint of either dictionary, those of the control as late as it acts."""
+        self.clock.check()
+        ends, last = (self.control[-1], self.disturbance[-1]), self.until
+        measured = self.control.tolist() if self.answering else []
+        every = np.unique([*self.acting, *measured, *self.disturbance.tolist(), *self.problem.system.switches])
+        return [*every[(every < last) & ~np.isin(every, ends)].tolist(), last]
+
+    def piece_at(self, time: float) -> int:
+        """The piece of the `grid` that holds a time from 0 on; the last one holds the end too."""
+        return min(bisect_right(self.grid, time) - 1, len(self.grid) - 2)
+
+
+def before(problem: OptimalControlProblem) -> list[float]:
+    """The control that acts until the first one of a delayed system does, ``(m,)``."""
+    given = problem.initial_control
+    return [0.0] * problem.system.controls if given is None else [float(u) for u in np.asarray(given)]

@@ -1,0 +1,136 @@
+"""What a control that answers may have to answer: deviations from the middles of their sets, block by block."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.sets.known import known, middle
+from sparserob_core.checker.sets.polynomials import OUTWARD
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from flint import arb
+
+
+@dataclass(frozen=True, eq=False)
+class Deviations(ABC):
+    """The deviations of a disturbance with ``width`` entries in ``shape``, and last that of the initial state, in
+    ``initial``, where there are any."""
+
+    shape: ConvexSet | None
+    width: int
+    initial: ConvexSet | None
+
+    @property
+    @abstractmethod
+    def blocks(self) -> int:
+        """How many blocks the disturbance has."""
+
+    @property
+    @abstractmethod
+    def begun(self) -> int:
+        """The place of the block of the initial state, where there is one: the last."""
+
+    @property
+    @abstractmethod
+    def sets(self) -> list[tuple[ConvexSet, Array]]:
+        """The set and the middle of every block that is in a set of its own, that of the initial state last."""
+
+    @property
+    @abstractmethod
+    def starts(self) -> list[int]:
+        """Where the entries of every block begin, and how many there are."""
+
+    @property
+    @abstractmethod
+    def radii(self) -> Array:
+        """How far each entry of a deviation comes from 0, ``(Q,)``, rounded up."""
+
+    @abstractmethod
+    def supports(self, every: Sequence[list[arb]]) -> list[arb]:
+        """``max z'a`` over all deviations, for every ``a (Q,)`` in balls."""
+
+    def support(self, a: list[arb]) -> arb:
+        """`supports` of one."""
+        return self.supports([a])[0]
+
+    @cached_property
+    def middle(self) -> Array:
+        """What deviations of the disturbance are counted from, ``(mw,)``."""
+        return np.zeros(self.width) if self.shape is None else middle(self.shape)
+
+    @cached_property
+    def rests(self) -> list[list[arb]]:
+        """Of each of these the deviation from its middle to a point that is in its set whatever was rounded: 0 where
+        the middle is."""
+        found: dict[int, list[arb]] = {}
+        for shape, about in self.sets:
+            if id(shape) not in found:
+                point = known(shape).member(about)
+                assert point is not None
+                found[id(shape)] = [x - m for x, m in zip(point, balls(about), strict=True)]
+        return [found[id(shape)] for shape, _ in self.sets]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class HeldDeviations(Deviations):
+    """The deviations of a disturbance that stays the same on each of ``held`` blocks, and of the ``noise`` of as many
+    measurements as there are ``noises``."""
+
+    held: int
+    noise: ConvexSet | None
+    noises: int
+
+    @property
+    def blocks(self) -> int:
+        return 0 if self.shape is None else self.held
+
+    @property
+    def begun(self) -> int:
+        return self.blocks + self.noises
+
+    @cached_property
+    def sets(self) -> list[tuple[ConvexSet, Array]]:
+        held = [] if self.shape is None else [(self.shape, self.middle)] * self.blocks
+        held += [] if self.noise is None else [(self.noise, middle(self.noise))] * self.noises
+        return held if self.initial is None else [*held, (self.initial, middle(self.initial))]
+
+    @cached_property
+    def starts(self) -> list[int]:
+        return [0, *accumulate(shape.dimension for shape, _ in self.sets)]
+
+    @cached_property
+    def radii(self) -> Array:
+        return rounded_radii([], self.sets)
+
+    def supports(self, every: Sequence[list[arb]]) -> list[arb]:
+        return [self._support(a) for a in every]
+
+    def _support(self, a: list[arb]) -> arb:
+        blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
+        return sum((of_block(*one, block) for one, block in zip(self.sets, blocks, strict=True)), ball(0))
+
+
+def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
+    """The support function of a set less a point, 0 at 0."""
+    total = a[0] * 0
+    if any(not x.is_zero() for x in a):
+        total = total + known(shape).support(a)
+        for x, m in zip(a, balls(about), strict=True):
+            total = total if m.is_zero() else total - x * m
+    return total
+
+
+def rounded_radii(first: list[Array], sets: Sequence[tuple[ConvexSet, Array]]) -> Array:
+    """Radii ``(Q,)`` of some blocks, and of others from their sets, rounded up."""
+    far = [np.array(known(shape).radius) + np.abs(about) for shape, about in sets]
+    return np.asarray(np.nextafter(np.concatenate([np.zeros(0), *first, *far]) * OUTWARD, np.inf))

@@ -1,0 +1,110 @@
+"""What enters a problem at any time and is known by its size alone: measurable disturbances, errors of execution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.flows import VerifiedFlows
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.problem.timing import Timing, before
+from sparserob_core.checker.reach.execution import FollowedExecution
+from sparserob_core.checker.reach.kernels import BoundedInput, BoundedInputHere
+from sparserob_core.checker.reach.measurable import Side, Together
+from sparserob_core.checker.reach.missed import BoundedInputAt, BoundedInputOver, SizedInput
+from sparserob_core.checker.sets.known import middle
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Sources:
+    """The bounded inputs of a ``problem``. ``pieces``: what makes the control, of which there may be none;
+    ``is_still``: one system acts all along."""
+
+    problem: OptimalControlProblem
+    timing: Timing
+    flows: VerifiedFlows
+    pieces: Callable[[], Sequence[arb_mat]]
+    is_still: bool
+
+    @cached_property
+    def strayed(self) -> BoundedInput | None:
+        """What measurable disturbances do beside the middle of their box, where nothing answers them: a command
+        of 1 through the columns of ``E`` that is missed by half the widths; of a polytope all of it at once, counted
+        from its middle. ``None`` where there are none."""
+        bound = self.problem.measurable
+        if bound is None or self.timing.answering:
+            return None
+        ends, system = np.array([0.0, self.timing.grid[-1]]), self.problem.system
+        first = system.controls + system.drifts
+        if not bound.is_box:
+            side = Together(Side.of(bound))
+            return self._missing(np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
+        box, about = bound.bounding_box(), middle(bound)
+        sides, single = np.stack([box.upper - about, about - box.lower]), box.upper == box.lower
+        most = np.where(single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
+        least = np.where(single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
+        half = least + (most - least) / 2.0
+        off = np.nextafter(np.maximum(most - half, half - least), np.inf)
+        return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off)
+
+    def _missing(self, *errors: Any, **more: Any) -> BoundedInput:
+        """What is missed at every parameter of the system."""
+        entering = SizedInput(*errors, **more)
+        if self.flows.box.middle:
+            return BoundedInputOver(self.flows, entering)
+        return BoundedInputAt(self.flows.at(()), entering)
+
+    def strayed_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
+        """`strayed` at one parameter."""
+        return None if self.strayed is None else self.strayed.at(parameter)
+
+    @cached_property
+    def execution(self) -> BoundedInput | None:
+        """How exactly the control is delivered, ``None`` where that is as it is commanded; of no control where the
+        certificate has none."""
+        shares, system = self.problem.execution, self.problem.system
+        if shares is None:
+            return None
+        if self.timing.answering:
+            raise Unchecked("the checker knows errors of execution without feedback")
+        shares, acts, pieces = np.asarray(shares, dtype=float), self.timing.control, self.pieces()
+        if self.is_still:
+            return FollowedExecution(self.problem, shares, acts, pieces, self.timing.clock)
+        if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
+            begins = acts[:-1] + system.delay
+            acts = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
+            pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][: acts.size - 1 if pieces else 0]
+        return self._missing(shares, acts, pieces, numb=self.problem.commanded)
+
+    def delivered_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
+        """`execution` at one parameter."""
+        return None if self.execution is None else self.execution.at(parameter)
+
+    def entering(self, parameter: Sequence[float] | None) -> list[BoundedInput]:
+        """All of them, at one parameter where it is given."""
+        both = (self.execution, self.strayed)
+        return [one if parameter is None else one.at(parameter) for one in both if one is not None]
+
+    def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
+        """What errors of execution add to ``c'x(t)`` at least, at a parameter: of a command of size 1 on every piece,
+        ``(K, m)``, ``None`` where there are none; and of what was commanded before."""
+        delivered = self.delivered_at(parameter)
+        found, none = None if delivered is None else delivered.least(c, time), ball(0)
+        if found is None or not self.problem.system.delay > 0.0:
+            return found, none
+        sizes: Array = np.zeros((self.timing.control.size - 1, found.shape[1]))
+        sizes[: len(found) - 1] = found[1:]
+        known = zip(balls(found[0]), balls(before(self.problem)), strict=True)
+        return sizes, sum((size * abs(u) for size, u in known), none)
