@@ -7,6 +7,8 @@ from functools import lru_cache
 from itertools import product
 from typing import final
 
+import numpy as np
+
 
 @final
 @dataclass(frozen=True)
@@ -35,6 +37,12 @@ class Monomials:
     def products_with(self) -> list[list[tuple[int, int]]]:
         """The same for every monomial ``i``: all ``(j, k)``."""
         return _products_with(self.count, self.degree)
+
+    @property
+    def quotients(self) -> np.ndarray:
+        """By which monomial a first one has to be multiplied for a second one, ``(size, size)``: its number; -1: by
+        none."""
+        return _quotients(self.count, self.degree)
 
     @property
     def size(self) -> int:
@@ -98,3 +106,13 @@ def _products(count: int, degree: int) -> list[tuple[int, int, int]]:
         if sum(e) + sum(f) <= degree
         for g in [tuple(a + b for a, b in zip(e, f, strict=True))]
     ]
+
+
+@lru_cache(maxsize=64)
+def _quotients(count: int, degree: int) -> np.ndarray:
+    size = len(_exponents(count, degree))
+    found = np.full((size, size), -1)
+    for i, j, k in _products(count, degree):
+        found[i, k] = j
+    found.flags.writeable = False
+    return found

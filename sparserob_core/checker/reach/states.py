@@ -288,13 +288,12 @@ def single(series: Series) -> Enclosed:
 def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
     """Products of polynomials in the parameters ``(..., M, a, d)`` with others ``(M, d, n)``, what is beyond the degree
     in the radii of the constants."""
-    shape = (*left.mid.shape[:-1], right.mid.shape[-1])
-    mid, rad = np.zeros(shape), np.zeros(shape)
     size, there = np.abs(left.mid), np.abs(right.mid)
     wide = right.rad + rounding(left.mid.shape[-1] * monomials.size) * there
-    for i, j, k in monomials.products:
-        mid[..., k, :, :] += left.mid[..., i, :, :] @ right.mid[j]
-        rad[..., k, :, :] += size[..., i, :, :] @ wide[j] + left.rad[..., i, :, :] @ (there[j] + right.rad[j])
+    mid = _multiplied(monomials, left.mid, right.mid)
+    with np.errstate(invalid="ignore"):
+        rad = _multiplied(monomials, size, wide) + _multiplied(monomials, left.rad, there + right.rad)
+    rad = np.where(np.isnan(rad), np.inf, rad)  # 0 times no bound
     if monomials.degree:
         degrees = np.array(monomials.degrees)
         sums = [
@@ -304,3 +303,13 @@ def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
         later = np.cumsum(sums[1][:0:-1], axis=0)
         rad[..., 0, :, :] += sum(sums[0][n] @ later[n - 1] for n in range(1, monomials.degree + 1))
     return Enclosed(mid, rad * OUTWARD)
+
+
+def _multiplied(monomials: Monomials, left: Array, right: Array) -> Array:
+    """The coefficients of products up to the degree, as one product of matrices: what is a matrix ``(M d, M n)`` of
+    those of ``right (M, d, n)``, of monomials of the left factor and of the product."""
+    (M, d, n), place = right.shape, monomials.quotients
+    table = np.concatenate([right, np.zeros((1, d, n))])[place]  # (M, M, d, n)
+    rows = np.swapaxes(left, -3, -2)
+    found = rows.reshape(*rows.shape[:-2], M * d) @ table.transpose(0, 2, 1, 3).reshape(M * d, M * n)
+    return np.swapaxes(found.reshape(*rows.shape[:-2], M, n), -3, -2)

@@ -25,6 +25,8 @@ def test_monomials_are_all_of_their_degree_and_products_all_that_are_kept(count,
         assert known.exponents[k] == tuple(a + b for a, b in zip(known.exponents[i], known.exponents[j], strict=True))
         assert known.number[known.exponents[k]] == k
     assert {(i, j, k) for i, pairs in enumerate(known.products_with) for j, k in pairs} == set(known.products)
+    places = product(range(known.size), repeat=2)
+    assert {(i, int(known.quotients[i, k]), k) for i, k in places if known.quotients[i, k] >= 0} == set(known.products)
 
 
 def test_the_first_of_every_degree_and_variables_alone_are_in_their_places():
