@@ -11,7 +11,7 @@ from typing import TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.brief import noun, phrase
+from sparserob_core.brief import noun
 from sparserob_core.control.enclosures.dependence import Dependence, Spread, Superposed, dependence
 from sparserob_core.control.problem.expression import parse_column, parse_definitions, parse_matrix
 from sparserob_core.control.problem.phase import PARTS, TIME, Matrix, Phase, PhaseInUnits, and_time, boxed
@@ -65,12 +65,21 @@ class System:
             object.__setattr__(self, "phases", tuple(phase.drifting() for phase in self.phases))
         _ = self._depends
 
-    def __repr__(self) -> str:
-        if self.horizon < np.inf:
-            return noun(self)
-        every = {**vars(self.phases[0]), **vars(self)}
-        shown = [(name, every[name]) for name in ("A", "B", "E", "parameters", "names", "c", "delay")]
-        return phrase("LinearSystem", shown)
+    __repr__ = noun
+
+    @property
+    def noun_of(self) -> tuple[str, list[tuple[str, object]]]:
+        """The name under which it is shown, and the fields that are."""
+        every, own = {**vars(self.phases[0]), **vars(self)}, ("phases", "parameters", "delay")
+        names = ("A", "B", "E", "parameters", "names", "c", "delay") if self.kind == "LinearSystem" else own
+        return self.kind, [(name, every[name]) for name in names]
+
+    @property
+    def kind(self) -> str:
+        """The constructor that makes such a system."""
+        if self.varies:
+            return "VaryingSystem"
+        return "LinearSystem" if self.horizon == np.inf else "SwitchedSystem"
 
     @property
     def states(self) -> int:
@@ -486,9 +495,9 @@ def _check_piece(i: int, pair: object, before: float) -> None:
         raise InputError(path=f"system.pieces.{i}.until", expected="a time", got=f"{until!r}")
     if not before < until < np.inf:
         raise InputError(path=f"system.pieces.{i}.until", expected=f"a time after {before:g}", got=f"{until:g}")
-    plain = isinstance(system, System) and system.horizon == np.inf
-    if not plain or system.delay:
-        said = "a delay of its own" if plain else type(system).__name__
+    kind = system.kind if isinstance(system, System) else type(system).__name__
+    if kind != "LinearSystem" or system.delay:
+        said = "a delay of its own" if kind == "LinearSystem" else kind
         raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=said)
 
 

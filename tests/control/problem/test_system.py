@@ -629,6 +629,13 @@ def test_a_plant_at_fault_is_one_sentence_that_begins_with_its_key(build, said):
     assert len(str(caught.value).splitlines()) == 1
 
 
+def test_what_is_no_piece_is_called_by_what_made_it():
+    undriven = VaryingSystem.of([["t"]], [[1.0]], 2.0)
+    for plant, kind in ((varying(), "Varying"), (undriven, "Varying"), (switched(), "Switched")):
+        with pytest.raises(InputError, match=f"^system.pieces.0: expected .* without delay, got {kind}System$"):
+            SwitchedSystem([(1.0, plant)])
+
+
 @pytest.mark.parametrize("delay", [-1.0, np.nan, np.inf, True, "1", None])
 def test_a_delay_is_a_finite_time(delay):
     for build in (lambda: OSCILLATOR.with_delay(delay), lambda: SwitchedSystem([(1.0, OSCILLATOR)], delay)):
@@ -656,6 +663,19 @@ def test_parameters_beside_the_time_are_p1_and_so_on_unless_they_are_named():
         matrices_at(defined, 0.5, np.zeros(0)),
         {"A": [[-0.5]], "B": [[1.0]], "E": [[1.0]], "c": np.zeros((1, 0))},
     )
+
+
+def test_a_system_is_shown_by_what_makes_it():
+    plain = LinearSystem([[0.5]], [[1.0]])
+    assert repr(plain) == "LinearSystem(A=[[0.5]], B=[[1.]], E=[[1.]], delay=0)"
+    assert repr(plain.with_delay(0.5)) == "LinearSystem(A=[[0.5]], B=[[1.]], E=[[1.]], delay=0.5)"
+    bounded = plain.with_parameters(Box([0.0], [1.0]))
+    assert repr(bounded).splitlines()[0] == "LinearSystem"
+    assert "  parameters: Box(lower=[0.], upper=[1.])" in repr(bounded).splitlines()
+    assert repr(switched(0.5)).splitlines()[:2] == ["SwitchedSystem", "  phases: [Phase, Phase, Phase]"]
+    assert repr(varying(0.5)).startswith("VaryingSystem(phases=[Phase, Phase, Phase], parameters=Box(")
+    problem = OptimalControlProblem(system=plain, horizon=1.0, initial_state=[1.0], control=Box([-1.0], [1.0]))
+    assert "  system: LinearSystem(A=[[0.5]], B=[[1.]], E=[[1.]], delay=0)" in repr(problem).splitlines()
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
