@@ -210,7 +210,7 @@ class System:
 
     def check_horizon(self, horizon: float) -> None:
         """Raise `InputError` where the phases do not fill the horizon."""
-        if self.horizon < np.inf:
+        if self.varies or self.horizon < np.inf:
             _check_ends([phase.until for phase in self.phases], horizon, self.varies and len(self.phases) == 1)
 
     def check_period(self) -> None:
@@ -469,7 +469,7 @@ def _check_ends(ends: Sequence[float], horizon: float, whole: bool) -> None:
     """Raise `InputError` where the systems, or laws, that end at these times do not fill the horizon; ``whole``: it is
     one law, of which no piece is named."""
     last, begin = len(ends) - 1, 0.0
-    if abs(ends[last] - horizon) > SAME_TIME * horizon:
+    if not abs(ends[last] - horizon) <= SAME_TIME * horizon:
         raise InputError(
             path="system" if whole else f"system.pieces.{last}.until",
             expected=f"a law up to {horizon:g}, the horizon"

@@ -629,6 +629,15 @@ def test_a_plant_at_fault_is_one_sentence_that_begins_with_its_key(build, said):
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize("horizon", [np.inf, np.nan])
+def test_laws_end_at_a_time_that_is_a_number(horizon):
+    endless = VaryingSystem(laws()[0], horizon)
+    with pytest.raises(InputError, match=f"^system: expected a law up to 2, the horizon, got up to {horizon}$"):
+        endless.check_horizon(2.0)
+    with pytest.raises(InputError, match=r"^system.pieces.0: expected a LinearSystem without delay, got "):
+        SwitchedSystem([(1.0, endless)])
+
+
 def test_what_is_no_piece_is_called_by_what_made_it():
     undriven = VaryingSystem.of([["t"]], [[1.0]], 2.0)
     for plant, kind in ((varying(), "Varying"), (undriven, "Varying"), (switched(), "Switched")):
