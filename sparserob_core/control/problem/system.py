@@ -191,12 +191,13 @@ class System:
         if self.horizon == np.inf:
             return self
         left = [
-            (max(0.0, phase.begin - begin), phase)
+            phase
             for phase in self.phases
-            if not over(phase.until, begin, horizon) and (self.varies or not over(begin + horizon, phase.begin))
+            if not over(phase.until, begin, horizon) and not over(begin + horizon, phase.begin)
         ]
-        ends = [*(start for start, _ in left[1:]), horizon if self.varies or len(left) > 1 else np.inf]
-        phases = tuple(phase.later(start, end, begin) for (start, phase), end in zip(left, ends, strict=True))
+        switches = [phase.begin - begin for phase in left[1:]]
+        times = [0.0, *switches, horizon if self.varies or len(left) > 1 else np.inf]
+        phases = tuple(phase.later(*during, begin) for phase, during in zip(left, pairwise(times), strict=True))
         return System(phases, self.parameters, self.delay)
 
     def in_time(self, horizon: float) -> System:

@@ -280,6 +280,42 @@ def test_a_drift_that_is_forced_takes_the_state_where_it_was():
     assert len(wanted) == len(LATE)
 
 
+@pytest.mark.parametrize("begin", [0.0, 0.4, 1.0, 1.0 - 1e-13, 1.0 + 1e-13, 1.3, 1.75, 2.0])
+@pytest.mark.parametrize("delay", [0.0, 0.25])
+def test_what_is_left_goes_on_where_the_whole_is(begin, delay):
+    system = switched(delay)
+    left = system.remaining(begin, ENDS[-1] - begin)
+    assert left.phases[0].begin == 0.0 and left.delay == delay and left.parameters is BOX
+    assert [phase.until for phase in left.phases[:-1]] == [phase.begin for phase in left.phases[1:]]
+    several = [switch for switch in ENDS[:-1] if switch > begin + 1e-9]
+    assert left.switches == pytest.approx([switch - begin for switch in several], abs=1e-15)
+    assert left.horizon == (pytest.approx(ENDS[-1] - begin) if several else np.inf)
+    later = [time for time in LATE if time > begin + 1e-9]
+    whole = reached(system, [begin, *later] if begin else later, P, START)
+    before = whole[0] if begin else START
+    found = reached(left, [time - begin for time in later], P, before)
+    np.testing.assert_allclose(found, whole[1:] if begin else whole, rtol=1e-9)
+
+
+def test_of_a_shorter_horizon_no_phase_is_left_that_begins_after_it():
+    assert [phase.until for phase in switched().remaining(0.5, 1.0).phases] == [0.5, 1.0]
+    assert [phase.until for phase in switched().remaining(0.5, 0.5 + 1e-13).phases] == [np.inf]
+    assert [phase.until for phase in varying().remaining(0.5, 1.0).phases] == [0.5, 1.0]
+    assert [phase.until for phase in varying().remaining(0.5, 0.5).phases] == [0.5]
+
+
+@pytest.mark.parametrize("begin", [0.0, 0.4, 1.0, 1.0 - 1e-13, 1.0 + 1e-13, 1.3, 2.0])
+def test_what_is_left_of_a_system_in_time_has_the_matrices_of_later_times(begin):
+    system, parameter = varying(0.25), np.array([0.3])
+    left = system.remaining(begin, ENDS[-1] - begin)
+    assert left.varies and left.phases[0].begin == 0.0 and left.delay == 0.25 and left.horizon == ENDS[-1] - begin
+    left.check_horizon(ENDS[-1] - begin)
+    for time in (begin + 1e-6, 1.2, 1.74, 1.76, 2.99):
+        if time > begin:
+            alike(matrices_at(left, time - begin, parameter), law_of(time, 0.3))
+    assert left.parameters is system.parameters and tuple(left.names) == ("k",)
+
+
 def test_a_system_in_time_has_its_matrices_and_is_known_at_a_parameter():
     system, parameter = varying(0.25), np.array([0.3])
     assert system.varies and system.switches == () and system.horizon == ENDS[-1] and system.drifts
