@@ -110,7 +110,7 @@ class Phase:
         """The same, its uncertain parameters in this set and with these names."""
         if self.timed:
             box = None if parameters is None else boxed(parameters)
-            return replace(self, domain=and_time(self.begin, self.until, box), names=(TIME, *names))
+            return replace(self, domain=and_time(self.begin, self.until, box), names=(*self.names[:1], *names))
         return self if parameters is self.domain else replace(self, domain=parameters, names=tuple(names))
 
     def later(self, begin: float, until: float, later: float) -> Phase:

@@ -389,6 +389,19 @@ def test_in_time_its_matrices_stay_the_same():
         Phase([[0.0]], [[1.0]], domain=NormBall(2.0, 1.0, dimension=2)).in_time(2.0)
 
 
+def test_within_other_parameters_it_keeps_the_name_of_the_time():
+    box = Box([0.0], [0.1])
+    phase = Phase(A, B, E, BOX, ("s", "k"), None, 0.5, 1.5, True)
+    smaller = phase.within(box, ("k",))
+    assert smaller.names == ("s", "k") and isinstance(smaller.domain, Box)
+    np.testing.assert_array_equal(smaller.domain.lower, [0.5, 0.0])
+    np.testing.assert_array_equal(smaller.domain.upper, [1.5, 0.1])
+    still = phases()[0]
+    assert still.within(BOX, ("p1", "p2")) is still
+    other = still.within(Box([0.6, 0.0], [0.7, 0.1]), ("a", "b"))
+    assert other.names == ("a", "b") and other.describe(np.array([0.6, 0.0])) == "a = 0.6, b = 0"
+
+
 def test_a_set_beside_the_time_is_a_bounded_box():
     box = Box([-0.5, -0.5], [0.5, 0.5])
     assert boxed(box) is box

@@ -396,6 +396,13 @@ def test_other_parameters_are_those_of_every_phase():
         varying().with_parameters(NormBall(2.0, 1.0, dimension=1))
 
 
+def test_a_law_may_call_its_time_as_it_likes():
+    A = parse_matrix("A", [["-s*k"]], ("s", "k"))
+    law = LinearSystem(A, [[1.0]], parameters=Box([0.0, 1.0], [2.0, 3.0]), names=("s", "k"))
+    system = VaryingSystem(law, 2.0, parameters=Box([1.0], [3.0])).with_parameters(Box([1.0], [2.0]))
+    assert tuple(system.phases[0].names) == ("s", "k") and tuple(system.names) == ("k",)
+
+
 def test_other_phases_last_as_long_as_the_system():
     system = switched(0.25)
     cut = [phase.between(phase.begin, phase.until) for phase in system.until(3.0)]
