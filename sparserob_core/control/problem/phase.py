@@ -536,6 +536,24 @@ class PhaseInUnits(Phase):
         joined = {"A": factors["A"], "B": np.hstack([factors["B"], factors["c"]]), "E": factors["E"]}
         return replace(self, A=base.A, B=base.B, E=base.E, c=None, base=base, factors=joined)
 
+    def between(self, begin: float, until: float) -> Phase:
+        if (begin, until) == (self.begin, self.until):
+            return self
+        base = self.base.between(begin * self.clock, until * self.clock)
+        return replace(self, begin=begin, until=until, base=base)
+
+    def drifting(self) -> Phase:
+        base = self.base.drifting()
+        return self if self.c is not None else replace(self, c=base.c, base=base)
+
+    def within(self, parameters: ConvexSet | None, names: Sequence[str]) -> Phase:
+        found = super().within(parameters, names)
+        if found is self or parameters is None:
+            return found
+        base = self.base.within(parameters.in_units(1.0 / self.units[int(self.timed) :]), names)
+        assert isinstance(found, PhaseInUnits)
+        return replace(found, base=base)
+
     @shaped
     def describe(self, arguments: Float[Array, " n"]) -> str:
         return self.base.describe(arguments * self.units[self.units.size - arguments.size :])

@@ -330,6 +330,25 @@ def test_units_of_the_drift_and_the_time_are_1_unless_given():
         same(values(plain, np.array([1.0, 0.01])), values(phase, np.array([1.0, 0.01])))
 
 
+def test_what_becomes_of_a_phase_in_units_becomes_of_the_one_that_it_is_stated_by():
+    box = Box([1.0, -0.01], [2.0, 0.03])
+    for phase in phases(begin=2.0, until=12.0):
+        other = in_units(phase)
+        later = other.between(1.0, 2.0)
+        assert (later.stated.begin, later.stated.until) == (4.0, 8.0)
+        again = in_units(later)
+        assert (again.begin, again.until) == (0.25, 0.5)
+        smaller = other.within(box, ("p1", "p2"))
+        assert smaller.domain is box and other.within(other.domain, ("p1", "p2")) is other
+        assert isinstance(smaller.stated.domain, Box)
+        np.testing.assert_array_equal(smaller.stated.domain.lower, [0.5, -0.08])
+        np.testing.assert_array_equal(smaller.stated.domain.upper, [1.0, 0.24])
+        plain = in_units(Phase(phase.A, phase.B, phase.E, BOX)).drifting()
+        forced = plain.forced.matrices(np.array([[2.0, 0.01]]))[1][0]
+        np.testing.assert_array_equal(forced[:, 1:], np.zeros((2, 1)))
+        assert other.drifting() is other and plain.c is not None
+
+
 def timed(*rest: Any) -> Phase:
     """The phase of functions whose first parameter is the time."""
     return Phase(A, B, E, BOX, ("t", "k"), c, 0.5, 1.5, True, *rest)

@@ -385,6 +385,19 @@ def test_units_of_a_system_lead_there_and_back(make):
     alike(matrices_at(ones, 2.5, parameter), matrices_at(system, 2.5, parameter))
 
 
+def test_what_is_left_of_a_system_in_units_is_that_of_the_stated_one():
+    A, B, E, c = factors()
+    other = switched(0.25).in_units(A, B, E, np.ones(2), c, 0.5)
+    left = other.remaining(1.0, 5.0)
+    assert [phase.until for phase in left.phases] == [1.0, 2.5, 5.0]
+    assert [phase.until for phase in left.stated.phases] == [0.5, 1.25, 2.5]
+    again = left.in_units(A, B, E, np.ones(2), c, 0.5)
+    assert [phase.until for phase in again.phases] == [2.0, 5.0, 10.0]
+    smaller = other.with_parameters(Box([0.6, 0.0], [0.7, 0.1]))
+    assert smaller.stated.parameters.is_same(Box([0.6, 0.0], [0.7, 0.1]))
+    assert all(phase.domain.is_same(smaller.parameters) for phase in smaller.stated.phases)
+
+
 def test_other_parameters_are_those_of_every_phase():
     box = Box([0.6, 0.0], [0.7, 0.1])
     smaller = switched(0.25).with_parameters(box)
