@@ -123,7 +123,11 @@ class Phase:
         return self._through(partial(_moved, later), domain, self.names, begin, until)
 
     def at(self, parameter: Array) -> Phase:
-        """A timed phase at one uncertain ``parameter (nu,)``."""
+        """The known phase at one uncertain ``parameter (nu,)``."""
+        if not self.timed:
+            A, B, E = (part[0] for part in self.matrices(parameter[None]))
+            drift = None if self.c is None else self._values("c", parameter[None])[0]
+            return Phase(A, B, E, c=drift, begin=self.begin, until=self.until)
         domain = and_time(self.begin, self.until, None)
         return self._through(partial(_with_parameter, parameter), domain, (TIME,), self.begin, self.until)
 

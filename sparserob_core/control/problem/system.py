@@ -271,7 +271,7 @@ class System:
         return System(tuple(phases), None, self.delay)
 
     def at(self, parameter: Array) -> System:
-        """The known system that one which varies is at one parameter ``(nu,)``."""
+        """The known system at one parameter ``(nu,)``."""
         if self.parameters is None:
             return self
         return System(tuple(phase.at(parameter) for phase in self.phases), None, self.delay)

@@ -367,6 +367,15 @@ def test_at_one_parameter_it_is_a_known_phase_in_time(units):
     enclosed(known, np.array([1.0 / time]), np.array([0.2 / time]))
 
 
+def test_a_phase_that_is_not_timed_is_known_at_one_parameter_too():
+    for phase in phases(begin=2.0, until=12.0):
+        known, other = phase.at(np.array([1.2, 0.1])), in_units(phase).at(np.array([2.4, 0.0125]))
+        assert known.domain is None and not known.timed and (known.begin, known.until) == (2.0, 12.0)
+        same(values(known, np.zeros(0)), truth(np.array([1.2, 0.1])))
+        same(values(other, np.zeros(0)), scaled(truth(np.array([1.2, 0.1]))))
+    assert Phase([[0.0]], [[1.0]], domain=Box([0.0], [1.0])).at(np.array([0.5])).c is None
+
+
 def test_during_one_time_it_is_a_phase_of_its_parameters():
     box = Box([-0.2], [0.4])
     still = timed().during(0.7, box)

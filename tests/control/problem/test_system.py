@@ -333,6 +333,13 @@ def test_a_system_in_time_has_its_matrices_and_is_known_at_a_parameter():
     assert plain.forced is plain and not plain.drifts and plain.dependence is None and plain.powers is None
 
 
+def test_a_system_of_constant_phases_is_known_at_a_parameter_too():
+    known = switched(0.25).at(P)
+    assert known.parameters is None and known.delay == 0.25 and known.switches == ENDS[:-1]
+    np.testing.assert_allclose(reached(known, LATE, np.zeros(0), START), reached(switched(), LATE, P, START))
+    assert OSCILLATOR.at(np.zeros(0)) is OSCILLATOR and UNCERTAIN.at(P).horizon == np.inf
+
+
 @pytest.mark.parametrize("make", [switched, UNCERTAIN.with_delay])
 def test_in_time_a_system_goes_where_it_went(make):
     system = make(0.25)
