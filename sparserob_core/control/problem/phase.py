@@ -256,8 +256,7 @@ class Phase:
             )
         if self.domain is not None and not self.domain.is_bounded:
             raise InputError("the set of parameters must be bounded", path="system")
-        if self.domain is not None:
-            require_consistent("system.parameters", self.domain)
+        require_consistent("system.parameters", self.domain)
         names = tuple(self.names) or tuple(f"p{i + 1}" for i in range(self.count))
         if len(names) != self.count:
             raise InputError(
@@ -415,7 +414,7 @@ class Phase:
         of another. An expression is one and the same for both."""
         given = self._called(name, centre)
         apart = np.abs(given - value) - remainder
-        if not (apart <= SAME * max(float(np.abs(given).max()), float(np.abs(value).max()))).all():
+        if not (apart <= SAME * np.abs(given).max()).all():
             row, column = (int(i) for i in np.unravel_index(int(apart.argmax()), apart.shape))
             raise InputError(
                 path=f"system.{name}",
@@ -439,7 +438,7 @@ class _AsColumn:
 
 
 def _holds_models(value: object) -> bool:
-    return np.asarray(value, dtype=object).dtype == object and not all(
+    return not all(
         isinstance(entry, int | float | np.integer | np.floating) for entry in np.asarray(value, dtype=object).flat
     )
 

@@ -291,7 +291,7 @@ class System:
         arguments = np.concatenate([[time], parameters]) if self.varies else parameters
         phases = tuple(phase.in_units(A, B, E, arguments, c, time) for phase in self.phases)
         bound = None if self.parameters is None else self.parameters.in_units(parameters)
-        return System(phases, boxed(bound) if self.varies and bound is not None else bound, self.delay / time)
+        return System(phases, bound, self.delay / time)
 
     @property
     def stated(self) -> System:
