@@ -55,12 +55,9 @@ def _is_empty(value: object) -> bool:
 
 def noun(record: Any) -> str:
     """A dataclass of what a problem is made of, for its ``__repr__``: one line where it fits into `WIDTH`, else as
-    `brief` says it. What was left out, ``None`` or nothing, is not said."""
-    return phrase(type(record).__name__, _shown(record))
-
-
-def phrase(heading: str, shown: Sequence[tuple[str, object]]) -> str:
-    """A record with this heading as `noun` says it, of which these fields are shown."""
+    `brief` says it. What was left out, ``None`` or nothing, is not said. A record may have a name and fields of its own
+    to be shown by, ``noun_of``."""
+    heading, shown = getattr(record, "noun_of", None) or (type(record).__name__, _shown(record))
     given = _given(shown)
     line = f"{heading}({', '.join(f'{name}={_value(value)}' for name, value in given)})"
     return line if len(line) <= WIDTH else _lines(heading, given)
@@ -76,7 +73,7 @@ def _value(value: object) -> str:
         return f"{len(value)} entries"
     if is_dataclass(value):
         line = repr(value) if type(value).__repr__ is noun else ""
-        return line if line and "\n" not in line else type(value).__name__
+        return line if line and "\n" not in line else getattr(value, "noun_of", (type(value).__name__,))[0]
     if isinstance(value, Mapping):
         return _cut("{" + ", ".join(f"{key}: {_value(one)}" for key, one in value.items()) + "}")
     if isinstance(value, list | tuple):

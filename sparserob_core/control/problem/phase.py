@@ -110,7 +110,7 @@ class Phase:
         """The same, its uncertain parameters in this set and with these names."""
         if self.timed:
             box = None if parameters is None else boxed(parameters)
-            return replace(self, domain=and_time(self.begin, self.until, box), names=(TIME, *names))
+            return replace(self, domain=and_time(self.begin, self.until, box), names=(*self.names[:1], *names))
         return self if parameters is self.domain else replace(self, domain=parameters, names=tuple(names))
 
     def later(self, begin: float, until: float, later: float) -> Phase:
@@ -123,7 +123,11 @@ class Phase:
         return self._through(partial(_moved, later), domain, self.names, begin, until)
 
     def at(self, parameter: Array) -> Phase:
-        """A timed phase at one uncertain ``parameter (nu,)``."""
+        """The known phase at one uncertain ``parameter (nu,)``."""
+        if not self.timed:
+            A, B, E = (part[0] for part in self.matrices(parameter[None]))
+            drift = None if self.c is None else self._values("c", parameter[None])[0]
+            return Phase(A, B, E, c=drift, begin=self.begin, until=self.until)
         domain = and_time(self.begin, self.until, None)
         return self._through(partial(_with_parameter, parameter), domain, (TIME,), self.begin, self.until)
 
@@ -252,8 +256,7 @@ class Phase:
             )
         if self.domain is not None and not self.domain.is_bounded:
             raise InputError("the set of parameters must be bounded", path="system")
-        if self.domain is not None:
-            require_consistent("system.parameters", self.domain)
+        require_consistent("system.parameters", self.domain)
         names = tuple(self.names) or tuple(f"p{i + 1}" for i in range(self.count))
         if len(names) != self.count:
             raise InputError(
@@ -411,7 +414,7 @@ class Phase:
         of another. An expression is one and the same for both."""
         given = self._called(name, centre)
         apart = np.abs(given - value) - remainder
-        if not (apart <= SAME * max(float(np.abs(given).max()), float(np.abs(value).max()))).all():
+        if not (apart <= SAME * np.abs(given).max()).all():
             row, column = (int(i) for i in np.unravel_index(int(apart.argmax()), apart.shape))
             raise InputError(
                 path=f"system.{name}",
@@ -435,7 +438,7 @@ class _AsColumn:
 
 
 def _holds_models(value: object) -> bool:
-    return np.asarray(value, dtype=object).dtype == object and not all(
+    return not all(
         isinstance(entry, int | float | np.integer | np.floating) for entry in np.asarray(value, dtype=object).flat
     )
 
@@ -535,6 +538,24 @@ class PhaseInUnits(Phase):
         base, factors = self.base.forced, self.factors
         joined = {"A": factors["A"], "B": np.hstack([factors["B"], factors["c"]]), "E": factors["E"]}
         return replace(self, A=base.A, B=base.B, E=base.E, c=None, base=base, factors=joined)
+
+    def between(self, begin: float, until: float) -> Phase:
+        if (begin, until) == (self.begin, self.until):
+            return self
+        base = self.base.between(begin * self.clock, until * self.clock)
+        return replace(self, begin=begin, until=until, base=base)
+
+    def drifting(self) -> Phase:
+        base = self.base.drifting()
+        return self if self.c is not None else replace(self, c=base.c, base=base)
+
+    def within(self, parameters: ConvexSet | None, names: Sequence[str]) -> Phase:
+        found = super().within(parameters, names)
+        if found is self or parameters is None:
+            return found
+        base = self.base.within(parameters.in_units(1.0 / self.units[int(self.timed) :]), names)
+        assert isinstance(found, PhaseInUnits)
+        return replace(found, base=base)
 
     @shaped
     def describe(self, arguments: Float[Array, " n"]) -> str:

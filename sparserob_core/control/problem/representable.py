@@ -21,10 +21,7 @@ KEYS = {"initial_set": "initial_state", "stop": "to", "start": "from"}
 def require_representable(problem: OptimalControlProblem) -> None:
     """Raise `InputError`, which begins with the key, for a number beyond `LARGEST`, and for a system that grows by more
     than that within the horizon: ``e^(a T)``, ``a`` the largest real part of an eigenvalue of a mode."""
-    several = len(problem.system.phases) > 1
-    for path, value in _numbers(problem, ()):
-        if path[:2] == ("system", "phases"):
-            path = ("system", *(("pieces", path[2]) if several else ()), *path[3:])
+    for path, value in _keyed(problem):
         _require_small(path, value)
     if problem.system.varies:
         for mode in problem.system.modes:
@@ -46,6 +43,20 @@ def require_representable(problem: OptimalControlProblem) -> None:
                 got=f"e^({rate:.4g} * {until - last:.4g}), of an eigenvalue with the real part {rate:.4g}",
             )
         last = until
+
+
+def _keyed(problem: OptimalControlProblem) -> Iterator[tuple[Path, np.ndarray]]:
+    """Every array and number of a problem, with the keys of a config that lead to it."""
+    several = len(problem.system.phases) > 1
+    for path, value in _numbers(problem, ()):
+        if path[:2] != ("system", "phases"):
+            yield path, value
+        elif path[3] == "domain":  # the parameters of the system, and the times of the phase
+            continue
+        elif several:
+            yield ("system", "pieces", *path[2:]), value
+        else:
+            yield ("horizon",) if path[3] == "until" else ("system", *path[3:]), value
 
 
 def _require_small(path: Path, value: np.ndarray) -> None:

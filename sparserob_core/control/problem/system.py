@@ -11,7 +11,7 @@ from typing import TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.brief import noun, phrase
+from sparserob_core.brief import noun
 from sparserob_core.control.enclosures.dependence import Dependence, Spread, Superposed, dependence
 from sparserob_core.control.problem.expression import parse_column, parse_definitions, parse_matrix
 from sparserob_core.control.problem.phase import PARTS, TIME, Matrix, Phase, PhaseInUnits, and_time, boxed
@@ -65,12 +65,21 @@ class System:
             object.__setattr__(self, "phases", tuple(phase.drifting() for phase in self.phases))
         _ = self._depends
 
-    def __repr__(self) -> str:
-        if self.horizon < np.inf:
-            return noun(self)
-        every = {**vars(self.phases[0]), **vars(self)}
-        shown = [(name, every[name]) for name in ("A", "B", "E", "parameters", "names", "c", "delay")]
-        return phrase("LinearSystem", shown)
+    __repr__ = noun
+
+    @property
+    def noun_of(self) -> tuple[str, list[tuple[str, object]]]:
+        """The name under which it is shown, and the fields that are."""
+        every, own = {**vars(self.phases[0]), **vars(self)}, ("phases", "parameters", "delay")
+        names = ("A", "B", "E", "parameters", "names", "c", "delay") if self.kind == "LinearSystem" else own
+        return self.kind, [(name, every[name]) for name in names]
+
+    @property
+    def kind(self) -> str:
+        """The constructor that makes such a system."""
+        if self.varies:
+            return "VaryingSystem"
+        return "LinearSystem" if self.horizon == np.inf else "SwitchedSystem"
 
     @property
     def states(self) -> int:
@@ -182,12 +191,13 @@ class System:
         if self.horizon == np.inf:
             return self
         left = [
-            (max(0.0, phase.begin - begin), phase)
+            phase
             for phase in self.phases
-            if not over(phase.until, begin, horizon) and (self.varies or not over(begin + horizon, phase.begin))
+            if not over(phase.until, begin, horizon) and not over(begin + horizon, phase.begin)
         ]
-        ends = [*(start for start, _ in left[1:]), horizon if self.varies or len(left) > 1 else np.inf]
-        phases = tuple(phase.later(start, end, begin) for (start, phase), end in zip(left, ends, strict=True))
+        switches = [phase.begin - begin for phase in left[1:]]
+        times = [0.0, *switches, horizon if self.varies or len(left) > 1 else np.inf]
+        phases = tuple(phase.later(*during, begin) for phase, during in zip(left, pairwise(times), strict=True))
         return System(phases, self.parameters, self.delay)
 
     def in_time(self, horizon: float) -> System:
@@ -201,7 +211,7 @@ class System:
 
     def check_horizon(self, horizon: float) -> None:
         """Raise `InputError` where the phases do not fill the horizon."""
-        if self.horizon < np.inf:
+        if self.varies or self.horizon < np.inf:
             _check_ends([phase.until for phase in self.phases], horizon, self.varies and len(self.phases) == 1)
 
     def check_period(self) -> None:
@@ -261,7 +271,7 @@ class System:
         return System(tuple(phases), None, self.delay)
 
     def at(self, parameter: Array) -> System:
-        """The known system that one which varies is at one parameter ``(nu,)``."""
+        """The known system at one parameter ``(nu,)``."""
         if self.parameters is None:
             return self
         return System(tuple(phase.at(parameter) for phase in self.phases), None, self.delay)
@@ -281,7 +291,7 @@ class System:
         arguments = np.concatenate([[time], parameters]) if self.varies else parameters
         phases = tuple(phase.in_units(A, B, E, arguments, c, time) for phase in self.phases)
         bound = None if self.parameters is None else self.parameters.in_units(parameters)
-        return System(phases, boxed(bound) if self.varies and bound is not None else bound, self.delay / time)
+        return System(phases, bound, self.delay / time)
 
     @property
     def stated(self) -> System:
@@ -460,7 +470,7 @@ def _check_ends(ends: Sequence[float], horizon: float, whole: bool) -> None:
     """Raise `InputError` where the systems, or laws, that end at these times do not fill the horizon; ``whole``: it is
     one law, of which no piece is named."""
     last, begin = len(ends) - 1, 0.0
-    if abs(ends[last] - horizon) > SAME_TIME * horizon:
+    if not abs(ends[last] - horizon) <= SAME_TIME * horizon:
         raise InputError(
             path="system" if whole else f"system.pieces.{last}.until",
             expected=f"a law up to {horizon:g}, the horizon"
@@ -486,9 +496,9 @@ def _check_piece(i: int, pair: object, before: float) -> None:
         raise InputError(path=f"system.pieces.{i}.until", expected="a time", got=f"{until!r}")
     if not before < until < np.inf:
         raise InputError(path=f"system.pieces.{i}.until", expected=f"a time after {before:g}", got=f"{until:g}")
-    plain = isinstance(system, System) and system.horizon == np.inf
-    if not plain or system.delay:
-        said = "a delay of its own" if plain else type(system).__name__
+    kind = system.kind if isinstance(system, System) else type(system).__name__
+    if kind != "LinearSystem" or system.delay:
+        said = "a delay of its own" if kind == "LinearSystem" else kind
         raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=said)
 
 

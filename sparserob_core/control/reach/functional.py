@@ -15,8 +15,6 @@ from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
-from sparserob_core.control.problem.phase import Phase
-from sparserob_core.control.problem.system import System
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
 from sparserob_core.control.reach.support import InitialSupport, Support, Supports
 from sparserob_core.control.reach.varying_motion import (
@@ -149,18 +147,13 @@ class WorstCase:
         if model is not None:
             zero = np.zeros(model.channels)
             model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
+        response, exact = self.response, self._exactly
+        if system.parameters is not None:
+            known = system.at(system.parameters.interior_point())
+            response = Response(known, response.grid, response.initial_state)
         if system.varies:
-            response = self.response
-            if system.parameters is not None:
-                fixed = system.at(system.parameters.interior_point())
-                response = Response(fixed, response.grid, response.initial_state)
-            exact = self._exactly
             return replace(self, response=response, disturbance=model, initial=None, shared=None, execution=exact)
-        middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
-        known = [(phase, [part[0] for part in phase.matrices(middle)]) for phase in system.phases]
-        phases = tuple(Phase(A, B, E, begin=one.begin, until=one.until) for one, (A, B, E) in known)
-        response = Response(System(phases), self.response.grid, self.response.initial_state)
-        return WorstCase(response, self.dictionary, model, names=self.names, execution=self._exactly)
+        return WorstCase(response, self.dictionary, model, names=self.names, execution=exact)
 
     @property
     def _exactly(self) -> Execution | None:

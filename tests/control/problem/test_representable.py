@@ -94,3 +94,40 @@ def test_the_values_of_functions_count() -> None:
     large = problem(lambda p: np.array([[0.0, 10.0 * LARGEST * p[0]], [0.0, 0.0]]), parameters=sr.Box([0.0], [1.0]))
     with pytest.raises(sr.InputError, match=r"system\.A"):
         require_representable(large)
+
+
+@pytest.mark.parametrize(
+    ("build", "path"),
+    [
+        (lambda large: sr.LinearSystem([[large]], [[1.0]]), "system.A"),
+        (lambda large: sr.LinearSystem([[1.0]], [[1.0]], parameters=sr.Box([0.0], [large])), "system.parameters.upper"),
+        (
+            lambda large: sr.SwitchedSystem([
+                (0.5, sr.LinearSystem([[1.0]], [[1.0]])), (1.0, sr.LinearSystem([[1.0]], [[large]])),
+            ]),
+            "system.pieces.1.B",
+        ),
+        (
+            lambda large: sr.VaryingSystem.of([["t"]], [["k"]], 1.0, parameters=sr.Box([0.0], [large]), names=("k",)),
+            "system.parameters.upper",
+        ),
+        (lambda large: sr.VaryingSystem.of([["t"]], [[1.0]], large), "horizon"),
+        (
+            lambda large: sr.VaryingSystem.taking_turns([
+                (0.5 * large, ([["t"]], [[1.0]], None, None)), (large, ([["t"]], [[1.0]], None, None)),
+            ]),
+            "system.pieces.0.until",
+        ),
+    ],
+)  # fmt: skip
+def test_a_large_number_of_a_plant_has_the_key_of_a_config(build: Any, path: str) -> None:
+    large = 10.0 * LARGEST
+    system = build(large)
+    made = sr.OptimalControlProblem(
+        system=system,
+        horizon=system.horizon if system.horizon < np.inf else 1.0,
+        initial_state=[0.0],
+        control=sr.Box([-1.0], [1.0]),
+    )
+    with pytest.raises(sr.InputError, match=f"^{path}: expected numbers of at most 1e\\+75"):
+        require_representable(made)
