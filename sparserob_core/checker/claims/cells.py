@@ -1,5 +1,5 @@
-"""Proof of one constraint at one decision: every cell of the certificate's subdivision is bounded, and halved further
-where that is needed."""
+"""The proof of one constraint for one control: every cell of the certificate's subdivision is bounded, and halved
+further where its bound is not small enough."""
 
 from __future__ import annotations
 
@@ -21,21 +21,23 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-MOST_CELLS = 40_000  # cells of time examined per constraint, or `TIMES` those that it begins with
+MOST_CELLS = 40_000  # cells of time examined per constraint; `TIMES` as many as it starts with, where that is more
 TIMES = 4
-MOST_BOXES = 8_000  # boxes of parameters and cells of directions
-BLAME = 0.2  # share of the error from which the box of parameters is to blame for it
+MOST_BOXES = 8_000  # pairs of a box of parameters and a cell of directions
+BLAME = 0.2  # share of the error, or of the slack, from which one of its causes is treated before the others
 
 Reached: TypeAlias = VerifiedTube | LoopTube | Still
 Interval: TypeAlias = tuple[int, float, float]
-"""A piece of the grid, and a part of it from one time to another (which may be the same)."""
+"""The number of a piece of the grid, and the start and the end of a part of it, which may be the same time."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Proven:
-    """A constraint is exceeded by at most ``bound``, of a row's own unit at most ``share``; shown on ``cells`` cells of
-    time in ``boxes`` boxes of parameters."""
+    """The result of a proof: no row exceeds its limit by more than ``bound``.
+
+    The excess is at most ``share`` of a row's own unit. The proof took ``cells`` cells of time and ``boxes`` pairs of a
+    box of parameters and a cell of directions."""
 
     bound: float
     share: float
@@ -44,7 +46,7 @@ class Proven:
 
 
 Work: TypeAlias = tuple[Corners, Sides, list[Interval]]
-"""A box of parameters, what is to be bounded, and when."""
+"""A box of parameters, the rows to bound on it, and the intervals of time."""
 
 
 def prove(
@@ -54,16 +56,40 @@ def prove(
     clock: Clock,
     beside: Beside | None = None,
 ) -> Proven:
-    """Show that no row, with what stands ``beside`` the state in it, is exceeded by more than its slack on the cells
-    ``work``; raises `Broken` where one is, and
-    `Unchecked` where neither could be shown."""
+    """Show that no row of the constraint exceeds its limit by more than its slack on the given cells.
+
+    Parameters
+    ----------
+    tubes
+        Returns the reachable states over a box of parameters.
+    parameters
+        The set of the parameters; a box that provably holds none of them needs no proof.
+    work
+        The boxes of parameters, each with the rows to bound on it and the intervals of time.
+    clock
+        When to stop.
+    beside
+        The terms that are added to the state in each row, if there are any.
+
+    Returns
+    -------
+    Proven
+        The upper bounds of the excess, and how many cells the proof took.
+
+    Raises
+    ------
+    Broken
+        Where a row certainly exceeds its limit by more than its slack.
+    Unchecked
+        Where neither could be shown with the cells and the time allowed.
+    """
     waiting = dict[Corners, list[tuple[Sides, list[Interval]]]]()
     for box, sides, todo in reversed(work):
         waiting.setdefault(box, []).append((sides, todo))
     found, cells, items = _Found(), 0, 0
     most = max(MOST_CELLS, TIMES * sum(len(todo) for _, _, todo in work))
     while waiting:
-        # all directions of one box, whose tube is dear, before any of its halves
+        # all directions of one box come before any of its halves, because the tube of a box is expensive
         box, stack = waiting.popitem()
         if not parameters.meets(box):
             continue
@@ -93,7 +119,7 @@ def prove(
 @final
 @dataclass(frozen=True, eq=False)
 class Place:
-    """One box of parameters."""
+    """One box of parameters with the reachable states over it."""
 
     tube: Reached
     parameters: Parameters
@@ -102,7 +128,7 @@ class Place:
     beside: Beside | None = None
 
     def cells(self, interval: Interval, z: Array, sharp: bool) -> list[Polynomial]:
-        """The polynomials of all rows on an interval, `VerifiedTube.cells` of them."""
+        """Return the polynomials of the rows ``z (k, b)`` on an interval, with the terms `beside` the state."""
         found = self.tube.cells(*interval, z, sharp)
         if self.beside is None:
             return found
@@ -112,12 +138,13 @@ class Place:
 @final
 @dataclass(eq=False)
 class _Found:
-    """The largest excess that could not be excluded so far: as it is, and as a share of its row's own unit."""
+    """The largest excess that could not be excluded so far, as a number and as a share of the unit of its row."""
 
     bound: float = -np.inf
     share: float = -np.inf
 
     def add(self, top: float, row: Bounded) -> None:
+        """Record the excess of a row whose bound is ``top``, not positive, relative to what it may reach."""
         over = top + row.slack
         self.bound = max(self.bound, over)
         self.share = max(self.share, over / row.unit)
@@ -126,8 +153,11 @@ class _Found:
 @final
 @dataclass(eq=False)
 class _Left:
-    """What a box leaves open: cells to be halved in time, those for smaller cells of directions, those for smaller
-    boxes; the ``influence`` of every parameter on these, and the ``slopes`` of every coordinate of directions."""
+    """The cells of time that one box of parameters and one cell of directions leave open, sorted by what to halve next.
+
+    ``halves`` holds shorter intervals, for the same box and directions. The intervals in ``turned`` wait for smaller
+    cells of directions, with the ``slopes (b,)`` of the bounds along each coordinate of the directions. The intervals
+    in ``wide`` wait for smaller boxes of parameters, with the ``influence (nu,)`` of each parameter."""
 
     influence: Array
     slopes: Array = field(default_factory=lambda: np.zeros(1))
@@ -137,7 +167,9 @@ class _Left:
 
 
 def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, shown: _Found) -> None:
-    """Bound every cell of time; notes the bounds that will do, and sorts what will not."""
+    """Bound the rows on every cell of time, and sort the cells whose bounds are too large into ``left``.
+
+    The bounds that suffice are recorded in ``shown``."""
     for interval, found, tops in _batch(place, sides.rows, todo):
         for i, row in enumerate(sides.rows):
             if not tops[i] <= 0.0:
@@ -160,8 +192,10 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
 
 
 def _closer(place: Place, row: Bounded, interval: Interval, poly: Polynomial, top: float) -> tuple[float, Polynomial]:
-    """A bound that is less far from the truth, with what takes longer: a sharper polynomial where switching is to
-    blame, and the set of parameters."""
+    """Return a tighter bound with its polynomial, by means that take longer.
+
+    The polynomial is sharper where switching disturbances cause the error, and the half-spaces of the set of parameters
+    are used."""
     if poly.kinks > BLAME * row.slack:
         ((_, (sharper,), (other,)),) = _batch(place, [row], [interval], sharp=True)
         if other < top:
@@ -172,10 +206,12 @@ def _closer(place: Place, row: Bounded, interval: Interval, poly: Polynomial, to
 def _turn(
     place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
 ) -> bool:
-    """Whether a cell fails, by at most ``worst``, because its directions differ too much: the one in its middle does
-    not fail, and the others lose more than what smaller cells of time and parameters would gain. That may be twice the
-    error: neighbours on both sides of a switch see different worst disturbances. Stops at a violation that is certain:
-    at the cell's start."""
+    """Return whether a cell fails, by at most ``worst``, because its directions differ too much.
+
+    The direction in the middle of the cell must not fail. The other directions must exceed it by more than smaller
+    cells of time and parameters could gain. That gain may be twice the error, because neighbours on both sides of a
+    switch have different worst disturbances. Raise `Broken` where the constraint is certainly violated at the start of
+    the cell."""
     middle = sides.centre
     if middle is None:
         _refute(place, interval, failed)
@@ -188,6 +224,8 @@ def _turn(
 
 
 def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
+    """Raise `Broken` where a row certainly exceeds its limit by more than its slack, at the start of the interval and
+    at the centre of the box, if the centre is proven to be a parameter."""
     for row, poly in rows:
         least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
         if least > row.slack and place.parameters.holds(np.array(place.tube.flow.centre)):
@@ -197,8 +235,9 @@ def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Poly
 def _batch(
     place: Place, rows: Sequence[Bounded], todo: Sequence[Interval], sharp: bool = False
 ) -> Iterator[tuple[Interval, list[Polynomial], list[float]]]:
-    """Every interval with its polynomials, one per row, and the proven upper bounds of what they exceed their row's
-    limit and slack by."""
+    """Yield every interval with its polynomials, one per row, and with proven upper bounds of their excess.
+
+    Each bound holds for the polynomial with its error, less the limit and the slack of its row."""
     z, every = np.array([row.z for row in rows]), []
     for interval in todo:
         place.clock.check()
@@ -209,7 +248,9 @@ def _batch(
 
 
 def _tops(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
-    """Upper bounds of polynomials less what they may reach; sharp only where they are positive."""
+    """Return upper bounds ``(k,)`` of polynomials with their errors, each less the value that it is allowed to reach.
+
+    A bound is at most 0 where halving boxes shows that; where it is positive it may be far from sharp."""
     tops, monomials = np.empty(len(flat)), tube.flow.monomials
     for orders in {poly.coefficients.shape[0] for poly, _ in flat}:
         which = [i for i, (poly, _) in enumerate(flat) if poly.coefficients.shape[0] == orders]
@@ -227,8 +268,9 @@ def _tops(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
 
 
 def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
-    """The bound with the help of the set of parameters: where ``a'p <= s`` on the set, ``v <= v + weight (s - a'p)``
-    there."""
+    """Return the upper bound that the half-spaces of the set of parameters give.
+
+    Where ``a'p <= s`` on the set, ``v <= v + weight (s - a'p)`` holds there for every ``weight >= 0``."""
     tube, top = place.tube, np.inf
     centre, radius = np.array(tube.flow.centre), np.array(tube.flow.radius)
     if place.parameters.is_box:
@@ -246,9 +288,11 @@ def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
 
 
 def _to_blame(poly: Polynomial, top: float, interval: Interval) -> bool:
-    """Whether a smaller box of parameters helps more than a shorter time where a row seems to be exceeded by ``top``:
-    by what the box has to do with the error. Where the row is exceeded by more than errors make it, by how much it
-    changes over the box and over the time: halving leads to what refutes it, or to parameters outside their set."""
+    """Return whether a smaller box of parameters helps more than a shorter time against an excess of ``top``.
+
+    It does at a single time, and where the box or a chord in time causes more than a small share of the error. Where
+    the excess is more than errors explain, the larger change of the polynomial decides: over the box or over the time.
+    Halving then leads to a refutation, or to parameters outside their set."""
     if interval[1] == interval[2] or poly.expansion + poly.turning > BLAME * poly.error:
         return True
     if top <= 2.0 * poly.error + poly.kinks:
@@ -257,8 +301,11 @@ def _to_blame(poly: Polynomial, top: float, interval: Interval) -> bool:
 
 
 def _influence(tube: Reached, poly: Polynomial) -> Array:
-    """How much each parameter has to do with what is left open: by the coefficients of the system where the expansion
-    is to blame, else by those of the polynomial."""
+    """Return how much each parameter contributes to what is left open, ``(nu,)``.
+
+    It is measured by the coefficients of the system where the expansion causes the error, else by those of the
+    polynomial. Where the size of the box in bounded inputs causes it, the share ``poly.bent`` of each parameter is
+    returned."""
     expansion = poly.expansion > BLAME * poly.error
     sizes = tube.flow.sizes if expansion else np.abs(poly.coefficients).sum(axis=0)
     answer: Array = np.array(tube.flow.monomials.exponents, dtype=float).T @ sizes
@@ -268,6 +315,7 @@ def _influence(tube: Reached, poly: Polynomial) -> Array:
 
 
 def _halves(interval: Interval) -> list[Interval]:
+    """Return both halves of an interval; raise `Unchecked` where no double lies between its ends."""
     piece, start, stop = interval
     middle = (start + stop) / 2
     if not start < middle < stop:
@@ -276,7 +324,7 @@ def _halves(interval: Interval) -> list[Interval]:
 
 
 def _split(box: Corners, influence: Array) -> list[Corners]:
-    """Both halves of a box, across the parameter of most influence whose interval still has a middle."""
+    """Return both halves of a box, cut across the parameter of most influence whose interval still has a middle."""
     lower, upper = list(box[0]), list(box[1])
     middles = (np.array(lower) + np.array(upper)) / 2
     thick = (np.array(lower) < middles) & (middles < np.array(upper))
