@@ -1,4 +1,4 @@
-"""The proof of one row of a constraint along its adjoint, on cells of time of the checker's own."""
+"""The proof of one row of a constraint by its adjoint, on cells of time that the checker chooses itself."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP
 from sparserob_core.sip.convex_set import Array
 
-MOST_CELLS = 400_000  # of time, examined for one row
-PARTS = 8  # into which a cell is cut that is not bounded: a tenth of a chord's distance is left, and less
-HALVINGS = 16  # rounds of cuts: cells are then rounding
+MOST_CELLS = 400_000  # cells of time examined for one row
+PARTS = 8  # of a cell whose bound is too large: the distance to a chord, quadratic in the length, falls to 1/64
+HALVINGS = 16  # rounds of cuts: then cells are 2^-48 of their first length, near rounding
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class FollowedRow:
-    """The row of a window of a case with the normal ``direction``."""
+    """The row with the normal ``direction`` of a constraint of a case."""
 
     case: Case
     window: ConstraintWindow
@@ -34,12 +34,24 @@ class FollowedRow:
 
     @cached_property
     def worst(self) -> Worst:
-        """The worst of what the state does to it."""
+        """The worst case of ``c'x(t)`` over all deviations, ``c`` the part of the normal on the state."""
         return self.case.followed.worst(self.window.split(self.direction)[0], self.case.scene)
 
     def prove(self, limit: float) -> tuple[int, float]:
-        """Show that the row is nowhere in its window above ``limit``; the number of cells that this took, and what it
-        is at most."""
+        """Show that the row is at most ``limit`` at every time of its window.
+
+        Returns
+        -------
+        tuple of int and float
+            The number of cells that the proof took, and an upper bound of the row.
+
+        Raises
+        ------
+        Broken
+            Where the row is certainly larger than ``limit``.
+        Unchecked
+            Where neither could be shown with the cells and the time allowed.
+        """
         window = self.window
         times = self.worst.cuts([window.start, window.stop, *window.cuts(self.case.control.breakpoints.tolist())])
         times = times[(times >= window.start) & (times <= window.stop)]
@@ -62,8 +74,10 @@ class FollowedRow:
         raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
 
     def beside(self, time: float, inside: float) -> tuple[float, float]:
-        """What stands beside the state in the row at a time, with the control of the piece that holds ``inside``,
-        between bounds."""
+        """Return a lower and an upper bound of the terms that are added to the state in the row at a time.
+
+        A mixed constraint takes the control of the piece that holds the time ``inside``. Raise `Broken` where that
+        piece does not meet the window at the time."""
         case, window, (state, gains) = self.case, self.window, self.window.split(self.direction)
         offset, _ = window.moved(time, time)
         total = -sum((a * b for a, b in zip(balls(state), offset, strict=True)), balls([0.0])[0])
@@ -77,19 +91,22 @@ class FollowedRow:
 
     @property
     def _delivered(self) -> FollowedExecution | None:
-        """How exactly the control is delivered."""
+        """The errors of execution of the control; ``None`` where there are none."""
         found = self.case.sources.execution
-        assert found is None or isinstance(found, FollowedExecution)  # it is followed by age there
+        assert found is None or isinstance(found, FollowedExecution)  # one system acts all along
         return found
 
     def erring(self, times: Array) -> tuple[Array, Array]:
-        """What the worst errors of execution add to it at ``times (k,)``: between ``(k,)`` and ``(k,)``."""
+        """Return lower and upper bounds ``(k,)`` of what the worst errors of execution add to the row at
+        ``times (k,)``."""
         delivered, none = self._delivered, np.zeros(times.size)
         return (none, none) if delivered is None else delivered.added_at(self.window.split(self.direction)[0], times)
 
     def _added(self, start: Array, stop: Array) -> Array:
-        """What stands beside the state at both ends of cells, and what errors of execution add there, ``(2, k)``, at
-        most; with how far these may be above their chord."""
+        """Return upper bounds ``(2, k)``, at both ends of cells, of the terms that are added to the state.
+
+        The worst errors of execution are among these terms, with the largest distance by which they may lie above their
+        chord."""
         found, delivered = np.zeros((2, start.size)), self._delivered
         if self.window.reference is not None or self.window.is_mixed:
             cells = self.case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
@@ -101,8 +118,10 @@ class FollowedRow:
         return found
 
     def _refute(self, start: Array, stop: Array, limit: float) -> None:
-        """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell, with sets whose support
-        functions are sharp."""
+        """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell.
+
+        Nothing is refuted where a set of deviations is curved, because its computed support function need not be
+        sharp."""
         sets = (self.case.problem.initial_set, self.case.problem.disturbance)
         if any(one is not None and known(one).facets is None for one in sets):
             return
@@ -120,7 +139,7 @@ class FollowedRow:
 
 
 def _parts(start: Array, stop: Array) -> tuple[Array, Array]:
-    """Cells in equal parts; none where these are rounding."""
+    """Return every cell cut into equal parts; no cells at all where the parts of one are too short for doubles."""
     ends = start[:, None] + (stop - start)[:, None] * (np.arange(PARTS + 1) / PARTS)
     ends[:, 0], ends[:, -1] = start, stop
     if not (np.diff(ends, axis=1) > 0.0).all():

@@ -1,4 +1,5 @@
-"""A constraint on the state, which may move with time and speak of the control too, and what that adds to its rows."""
+"""A constraint on the state, which may follow a reference and may include the control, and the terms that this adds to
+its rows."""
 
 from __future__ import annotations
 
@@ -27,17 +28,18 @@ if TYPE_CHECKING:
     from sparserob_core.checker.reach.tube import Around
     from sparserob_core.checker.sets.parameters import Corners
 
-DIRECTIONS_KEPT = 4096  # of cells of directions, which are asked for at every time; with a tenth of them some anew
+DIRECTIONS_KEPT = 4096  # sets of directions, needed again at every time; a tenth of it computes some of them anew
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class ConstraintWindow:
-    """``x(t) - r(t)`` in ``shape`` for all ``t`` from ``start`` to ``stop``; of more coordinates than the ``states``:
-    ``(x(t), u(t))``, with ``u`` of every piece of the control that meets the window in positive length.
+    """The constraint that ``x(t) - r(t)`` is in ``shape`` for all ``t`` from ``start`` to ``stop``.
 
-    ``reference (q, 1 + d)``: times and points between which ``r`` is linear; ``None``: ``r = 0``.
-    """
+    A shape of more coordinates than the ``states`` is a mixed constraint: ``(x(t), u(t))`` is in it, with ``u`` of
+    every piece of the control that meets the window in positive length.
+
+    ``reference (q, 1 + d)`` holds times and points between which ``r`` is linear; ``None`` means ``r = 0``."""
 
     name: str
     shape: ConvexSet
@@ -48,27 +50,30 @@ class ConstraintWindow:
 
     @property
     def seen(self) -> Shape:
-        """The set in balls."""
+        """The set in ball arithmetic."""
         return known(self.shape)
 
     @property
     def is_mixed(self) -> bool:
-        """Whether the control is in it."""
+        """Whether the constraint includes the control."""
         return self.shape.dimension > self.states
 
     def split(self, direction: Array) -> tuple[Array, Array]:
-        """The parts of a normal on the state and on the control."""
+        """Return the parts of a normal on the state ``(d,)`` and on the control ``(m,)``, which may be empty."""
         return direction[: self.states], direction[self.states :]
 
     def limit(self, direction: Array, time: float) -> arb:
-        """The largest ``c'x + g'u`` that is allowed at a time."""
+        """Return the upper bound of ``c'x + g'u`` that the constraint sets at a time, ``(c, g)`` the direction."""
         c, _ = self.split(direction)
         offset, _ = self.moved(time, time)
         moved = [ball(a) * r for a, r in zip(c, offset, strict=True) if a]
         return sum(moved, self.seen.limit(direction))
 
     def moved(self, start: float, stop: float) -> tuple[list[arb], list[arb]]:
-        """``r(start)`` and ``r'`` on ``[start, stop]``, which no time of the reference cuts, ``(d,)`` each."""
+        """Return ``r(start)`` and the derivative ``r'`` on ``[start, stop]``, ``(d,)`` each.
+
+        No time of the reference lies between ``start`` and ``stop``. Outside the times of the reference ``r`` is
+        constant."""
         zero = [ball(0.0)] * self.states
         if self.reference is None:
             return zero, zero
@@ -81,12 +86,16 @@ class ConstraintWindow:
         return [ball(a) + v * (ball(start) - ball(t)) for a, v in zip(p, slope, strict=True)], slope
 
     def cuts(self, breakpoints: Sequence[float]) -> list[float]:
-        """Times at which its rows turn or jump, beside what the state does; ``breakpoints`` are the control's."""
+        """Return the times at which the rows have a kink or a jump that the state does not have.
+
+        ``breakpoints (K + 1,)`` are those of the control, at which mixed constraints jump."""
         kinks = [] if self.reference is None else self.reference[:, 0].tolist()
         return kinks + (list(breakpoints) if self.is_mixed else [])
 
     def meets(self, breakpoints: Sequence[float], piece: int, time: float) -> None:
-        """Raise `Broken` unless a piece of the control holds a time and meets the window in positive length."""
+        """Raise `Broken` unless a piece of the control holds a time and meets the window in positive length.
+
+        ``breakpoints (K + 1,)`` are those of the control."""
         if not 0 <= piece < len(breakpoints) - 1:
             raise Broken(f"{self.name}: the control has no piece {piece}")
         begin, end = float(breakpoints[piece]), float(breakpoints[piece + 1])
@@ -97,8 +106,11 @@ class ConstraintWindow:
 @final
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """What stands beside ``c'x(t)`` in the rows of a window: ``g'u - c'r(t)``, for ``c = z'basis``, ``g = z'gains``,
-    ``basis (b, d)``, ``gains (b, m)``. ``breakpoints`` and ``pieces`` are the commanded control's."""
+    """The terms ``g'u - c'r(t)`` that are added to ``c'x(t)`` in the rows of a window.
+
+    The coefficients are ``c = z'basis`` and ``g = z'gains``, with ``basis (b, d)`` and ``gains (b, m)``.
+    ``breakpoints`` and ``pieces`` are those of the commanded control. ``delivered`` holds the bounded inputs, whose
+    worst case is added too."""
 
     window: ConstraintWindow
     basis: Array
@@ -116,9 +128,21 @@ class Beside:
         piece: int | None = None,
         within: tuple[Corners, Around] | None = None,
     ) -> list[Polynomial]:
-        """The polynomials of ``c'x``, one for every ``z (k, b)``, with what stands beside it on ``[start, stop]``; with
-        the control of a ``piece``, that of the interval unless given. ``within``: the box of parameters, where they are
-        over one, and the monomials on it."""
+        """Return the polynomials of ``c'x`` on an interval with the added terms.
+
+        Parameters
+        ----------
+        found
+            The polynomials of ``c'x``, one for every row of ``z``.
+        start, stop
+            The ends of the interval, which no cut of the window divides.
+        z
+            The coordinates of the directions, ``(k, b)``.
+        piece
+            The piece whose control counts; by default the one at ``start``.
+        within
+            The box of parameters with the monomials on it; ``None`` at a single parameter.
+        """
         offset, slope = self.window.moved(start, stop)
         basis = exactly(self.basis)
         level = -basis * stacked([[r] for r in offset])
@@ -145,8 +169,9 @@ class Beside:
 
     @remembered(lambda: DIRECTIONS_KEPT, lambda self, z: z.tobytes())
     def directions(self, z: Array) -> tuple[Array, Array]:
-        """``c = z'basis`` as floats ``(k, d)``, and how far they are off at most: where nothing is added up, and mostly
-        elsewhere, they are exact."""
+        """Return ``c = z'basis`` as floats ``(k, d)``, with bounds ``(k, d)`` of their rounding errors.
+
+        The floats are exact where nothing is added up, and mostly elsewhere."""
         exact = (exactly(z) * exactly(self.basis)).entries()
         floats = [float(x) for x in exact]
         left = [x - ball(c) for x, c in zip(exact, floats, strict=True)]
@@ -163,8 +188,10 @@ class Beside:
         times: Sequence[float],
         within: tuple[Corners, Around] | None,
     ) -> Polynomial:
-        """A polynomial with what errors add at most to ``c'x`` between two ``times``, or at one, along a direction that
-        is nowhere off by more than ``off (d,)``: what they add is sublinear in it."""
+        """Return a polynomial with the upper bound of what a bounded input adds to ``c'x`` at one time or between two.
+
+        The direction ``c`` has an error of at most ``off (d,)``. The addition is sublinear in the direction, so this
+        error adds at most ``off`` times the additions along the axes."""
         found = one.over(c, times, within)
         terms, lost = found.ends[:1], found.off
         if len(found.ends) > 1:
@@ -182,8 +209,9 @@ class Beside:
 
 
 def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
-    """A polynomial plus one with coefficients ``terms (J, M)``, of the first monomials, that are off by ``lost``
-    together."""
+    """Return the sum of a polynomial and another one with coefficients ``terms (J, M)`` of the first monomials.
+
+    All errors of these coefficients together are at most ``lost``."""
     missing = max(0, len(terms) - poly.coefficients.shape[0])
     coefficients = np.pad(poly.coefficients, ((0, missing), (0, 0)))
     changed = coefficients[: len(terms), : terms.shape[1]]
