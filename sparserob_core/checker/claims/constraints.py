@@ -1,5 +1,7 @@
-"""The proof of one state constraint from the cells of a certificate; and of states that are fixed at the end: no
-parameter, no disturbance and no choice of initial state may reach them, and the control must bring them there."""
+"""The proof of one state constraint from the cells of a certificate, and of the states that are fixed at the end.
+
+Without feedback, no parameter, no disturbance and no choice of initial state may reach a fixed state. The control must
+bring it to its value."""
 
 from __future__ import annotations
 
@@ -38,11 +40,24 @@ if TYPE_CHECKING:
     from flint import arb
 
 TUBES_KEPT = 8
-WIDER = 1e-12  # by which the boxes of a parameter set that is none are widened, relative to the whole
+WIDER = 1e-12  # of their whole extent, by which boxes are widened where the set of parameters is no box
 
 
 def bounded(case: Case, window: ConstraintWindow) -> str:
-    """Show that a constraint is kept at every time, disturbance and parameter; a sentence with the figures."""
+    """Show that a constraint is kept at every time, for every disturbance and every parameter.
+
+    Returns
+    -------
+    str
+        A sentence with the upper bound of the excess, what is excused, and the number of cells.
+
+    Raises
+    ------
+    Broken
+        Where the certificate holds no valid proof, or the constraint is certainly violated.
+    Unchecked
+        Where neither could be shown.
+    """
     data = case.certificate.get("proof", {})
     entry = data.get(window.name) if isinstance(data, Mapping) else None
     if not isinstance(entry, Mapping):
@@ -69,7 +84,7 @@ def bounded(case: Case, window: ConstraintWindow) -> str:
 
 
 def _excused(case: Case, window: ConstraintWindow, normals: Array) -> str:
-    """In words, the largest violation that counts as none; of a curved set the largest along its normals."""
+    """Return, in words, the largest violation that counts as none; of a curved set the largest along its normals."""
     if window.seen.facets is None:
         curved = Curved(window.seen, normals, units_of(case, window).least)
         axes = np.eye(len(normals))
@@ -80,7 +95,7 @@ def _excused(case: Case, window: ConstraintWindow, normals: Array) -> str:
 
 
 def _along_rows(case: Case, window: ConstraintWindow) -> Proven:
-    """Show that no row of a flat set is exceeded by more than what counts as none, along their adjoints."""
+    """Show by the adjoints of the rows that no row of a flat set is exceeded by more than what counts as none."""
     flat, units = window.seen.facets, units_of(case, window).rows.tolist()
     assert flat is not None
     count, bound, share = 0, -np.inf, -np.inf
@@ -93,15 +108,27 @@ def _along_rows(case: Case, window: ConstraintWindow) -> Proven:
 
 
 def _unit(case: Case, window: ConstraintWindow) -> str:
-    """The units of the rows of a window; of a curved set, whose excess is in multiples of its gauge, none."""
+    """Return the units of the rows of a window in words; none for a curved set, judged along its gauge."""
     sides = window.shape.halfspaces()
     rows = () if sides is None else sides[0]
     return joined(unit_of_row(row, case.problem.names, window.states).strip() for row in rows)
 
 
 def normals_of(window: ConstraintWindow, data: object) -> Array:
-    """The coordinates of a curved set's directions, ``(b, d)``: they must be able to name every direction in which it
-    is bounded. Those of the state where the certificate has none."""
+    """Return the vectors ``(b, d)`` whose combinations are the directions of a curved set.
+
+    Parameters
+    ----------
+    window
+        The constraint.
+    data
+        The normals that the certificate names; ``None`` for the axes of the coordinates that the set bounds.
+
+    Raises
+    ------
+    Broken
+        Where not every direction in which the set is bounded is a combination of the normals.
+    """
     shape, b, d = window.seen, window.seen.spanned, window.shape.dimension
     if data is None:
         return shape.lifted(np.eye(b))
@@ -116,13 +143,16 @@ def normals_of(window: ConstraintWindow, data: object) -> Array:
 
 
 def parameters_of(case: Case) -> Parameters:
-    """The set of the parameters."""
+    """Return the set of the parameters."""
     bound = case.problem.system.parameters
     return Parameters(None if bound is None else known(bound))
 
 
 def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> None:
-    """The cells must fill the times and parameters, and for a curved set every face of the cube of directions too."""
+    """Raise `Broken` unless the cells fill the window in time and the set of parameters.
+
+    For a curved set they must do so with every face of the cube of directions. ``lower`` and ``upper`` are the corners
+    of the cells, ``(k, 1 + nu + b)`` each, ``b = 0`` for a flat set."""
     nu = case.problem.system.parameter_count
     b = 0 if window.seen.facets is not None else window.seen.spanned
     if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1] != 1 + nu + b:
@@ -141,6 +171,10 @@ def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
 
 
 def _extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the lower and the upper corner of the times and parameters that the cells must fill, ``(1 + nu,)`` each.
+
+    For a set of parameters that is no box it is the box around the cells. This box must hold the set, up to a share
+    `WIDER` of its width."""
     nu, bound = case.problem.system.parameter_count, case.problem.system.parameters
     if bound is None:
         return np.array([window.start]), np.array([window.stop])
@@ -161,8 +195,10 @@ def _extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
 def _work(
     case: Case, window: ConstraintWindow, normals: Array, lower: Array, upper: Array
 ) -> tuple[Array, Array, list[Work]]:
-    """What directions are combinations of, ``(b, d)``, with their parts on the control, ``(b, m)``, and the cells,
-    those with the same parameters and directions together, their times cut wherever anything turns or jumps."""
+    """Return the vectors that directions are combinations of, and the cells in the form that `prove` takes.
+
+    The vectors are ``(b, d)`` on the state and ``(b, m)`` on the control. Cells with the same parameters and directions
+    are put together. Their times are cut at every kink and jump."""
     nu, units = case.problem.system.parameter_count, units_of(case, window)
     basis, gains, flat = _facets(window, units)
     curved = None if flat is not None else Curved(window.seen, normals, units.least)
@@ -180,20 +216,21 @@ def _work(
 
 
 def cut_times(case: Case, window: ConstraintWindow, times: Sequence[tuple[float, float]]) -> list[Interval]:
-    """The ``times``, cut wherever anything turns or jumps."""
+    """Return the ``times``, each a start and an end, cut at every kink and jump of the state and of the rows."""
     every = np.union1d(_cuts(case), window.cuts(case.control.breakpoints.tolist()))
     return [one for start, stop in times for one in cut(np.array(case.timing.grid), every, start, stop)]
 
 
 @lru_cache(maxsize=2)
 def _cuts(case: Case) -> Array:
-    """The times from each of which to the next the state is a polynomial of the time, under one command."""
+    """Return the times between which one polynomial in time encloses the state, under one control."""
     return np.union1d(case.timing.grid, case.flows.marks(case.timing.grid))
 
 
 def _facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array, Sides | None]:
-    """The normals of a flat set's facets up to the sign, on the state and on the control, and its rows; no rows for a
-    curved one."""
+    """Return the normals of a flat set's facets, on the state ``(b, d)`` and on the control ``(b, m)``, and its rows.
+
+    Opposite facets share a normal. The rows are ``None`` for a curved set."""
     found, flat = window.seen.basis, window.seen.facets
     if found is None or flat is None:
         return np.zeros((0, 0)), np.zeros((0, 0)), None
@@ -205,7 +242,7 @@ def _facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array,
 
 
 def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
-    """The parts between the increasing ``cuts``, each with the piece of the ``grid`` that it lies in."""
+    """Return the parts between the increasing ``cuts``, each with the piece of the ``grid`` that it lies in."""
     inside = cuts[np.searchsorted(cuts, start, side="right") : np.searchsorted(cuts, stop)].tolist()
     parts = list(pairwise([start, *inside, stop]))
     pieces = np.searchsorted(grid, [a for a, _ in parts], side="right") - 1
@@ -215,14 +252,36 @@ def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
 def prove_on_cells(
     case: Case, window: ConstraintWindow, rows: tuple[Array, Array], work: Sequence[Work], cells: tuple[Array, Array]
 ) -> Proven:
-    """`prove` of combinations of ``rows``, ``(b, d)`` on the state and ``(b, m)`` on the control, on the parts ``work``
-    of cells between lower and upper corners."""
+    """Show with `prove` that a constraint is kept on the given cells.
+
+    Parameters
+    ----------
+    case, window
+        The case, and its constraint.
+    rows
+        The vectors that the rows are combinations of: ``(b, d)`` on the state, ``(b, m)`` on the control.
+    work
+        The parts of the cells, with the rows to bound on each.
+    cells
+        The lower and the upper corners of all cells, ``(k, 1 + nu + b)`` each.
+    """
     beside = case.beside(window, *rows)
     return prove(tubes(case, *rows, *cells), parameters_of(case), work, case.clock, beside)
 
 
 def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
-    """What makes the tube of a box of parameters; the cells ``[lower, upper]`` say how far these go."""
+    """Return a function that makes the reachable states over a box of parameters.
+
+    Parameters
+    ----------
+    case
+        The case.
+    basis, gains
+        The vectors that rows are combinations of: ``(b, d)`` on the state, ``(b, m)`` on the control.
+    lower, upper
+        The corners of all cells, ``(k, 1 + nu + b)`` each. Around a set of parameters that is no box, every box is
+        widened by a share `WIDER` of their extent.
+    """
     if case.answering:
         loop_tube = LoopTube(feedback_of(case).loop, basis, gains)
         return lambda _: loop_tube
@@ -243,8 +302,20 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
 
 
 def equalities(case: Case) -> str:
-    """Show that the fixed states are met at every parameter, disturbance and initial state; a sentence with the
-    figures."""
+    """Show that every fixed state has its value at the end, for every parameter, disturbance and initial state.
+
+    Returns
+    -------
+    str
+        A sentence with the largest residual.
+
+    Raises
+    ------
+    Broken
+        Where a residual is not shown to be at most what is excused.
+    Unchecked
+        Where an uncertainty may reach a fixed state.
+    """
     worst, states = 0.0, np.eye(case.problem.system.states)[[state for state, _ in case.equalities]]
     sizes = nominal_sizes(case, states, np.zeros((len(states), 0))).tolist()
     for (state, value), (off, added), size, row in zip(case.equalities, missed(case), sizes, states, strict=True):
@@ -259,8 +330,10 @@ def equalities(case: Case) -> str:
 
 
 def missed(case: Case) -> list[tuple[arb, float]]:
-    """By how much every fixed state is missed at most, and the size of the numbers that are added up to it: of what
-    initial state and control do, and where deviations are answered also of these, with and without the control."""
+    """Return for every fixed state an upper bound of its residual, and the size of the numbers that are added up to it.
+
+    The size counts what the initial state and the control contribute. Where the control answers deviations, it also
+    counts what these contribute, without the control and with it."""
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = WindowUnits(case.problem, case.flows, scene, everything, horizon, horizon).sums
@@ -277,7 +350,7 @@ def missed(case: Case) -> list[tuple[arb, float]]:
 
 
 def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
-    """The final state ``(d, 1)`` where no uncertainty reaches what is fixed of it, whatever the control."""
+    """Return the nominal final state ``(d, 1)``; raise `Unchecked` where an uncertainty may reach a fixed entry."""
     for state, _ in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
@@ -285,7 +358,7 @@ def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
 
 
 def pushed_by_middle(case: Case, state: int) -> arb:
-    """What the disturbance in the middle of its set adds to a state at the end."""
+    """Return what the disturbance in the middle of its set adds to a state at the end."""
     (total,), about = balls([0.0]), case.disturbances.middle
     if about.any():
         end, column = case.problem.horizon, stacked([[w] for w in balls(about)])
@@ -296,14 +369,15 @@ def pushed_by_middle(case: Case, state: int) -> arb:
 
 
 def of_fixed(case: Case) -> str:
-    """The units of the states that are fixed."""
+    """Return the units of the fixed states in words."""
     units = case.problem.names.state_units
     return joined(units[state] if units else "" for state, _ in case.equalities)
 
 
 def _reached(case: Case, state: int) -> bool:
-    """Whether an uncertain entry, a disturbance or the choice of an initial state may reach a state: follow the entries
-    of ``A`` that are not 0 at every parameter."""
+    """Return whether an uncertain entry, a disturbance or the choice of an initial state may reach a state.
+
+    States are linked by the entries of ``A`` that are other than 0 at some time and parameter."""
     reaching = _linked(case, state)
     rows = sorted(reaching)
     there, changed = case.flows.links
@@ -318,14 +392,15 @@ def _reached(case: Case, state: int) -> bool:
 
 
 def _is_wide(bound: ConvexSet, axis: Array) -> bool:
-    """Whether a set is more than one point along an axis."""
+    """Return whether a set is more than one point along an axis."""
     width = known(bound).support(balls(axis)) + known(bound).support(balls(-axis))
     return not width <= math.ulp(0.0)
 
 
 def _rests(case: Case, state: int) -> bool:
-    """Whether a state begins at 0 and nothing ever moves it: neither another state that is linked to it, nor a control
-    of the decision, nor a drift, nor the middle of a disturbance."""
+    """Return whether a state starts at 0 and nothing ever moves it.
+
+    Neither a linked state, nor a control of the decision, nor a drift, nor the middle of a disturbance may move it."""
     reaching, (there, _) = _linked(case, state), case.flows.links
     m, early = case.problem.system.controls, case.problem.initial_control
     commands = [*case.pieces, *([] if early is None else [stacked([[u] for u in balls(np.asarray(early))])])]
@@ -338,7 +413,7 @@ def _rests(case: Case, state: int) -> bool:
 
 
 def _linked(case: Case, state: int) -> set[int]:
-    """The states that may reach a state by entries of ``A`` that are not 0 at every time and parameter."""
+    """Return the states that may reach a state by entries of ``A`` that are other than 0 at some time and parameter."""
     d, reaching = case.problem.system.states, {state}
     A = case.flows.links[0][:, :d]
     for _ in range(d):
