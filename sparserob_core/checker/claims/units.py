@@ -1,4 +1,4 @@
-"""The own units of state constraints: what a violation is judged by (decision 0016)."""
+"""The own units of state constraints, by which violations are judged (decision 0016)."""
 
 from __future__ import annotations
 
@@ -27,34 +27,37 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-MOST_TIMES = 64  # at which a window is looked at
-MOST_HELD = 16_000_000  # numbers that tell what inputs do on every piece, at once
-# So many times as far as a control goes it is taken to go in the numbers that are added up, where its range is larger.
+MOST_TIMES = 64  # times at which a window is examined
+MOST_HELD = 16_000_000  # weights of inputs on every piece that are in memory at once
+# The numbers that are added up count the range of the control, but at most so many times what the decision uses of it.
 # With a tenth of it, runs would be refused that were honest in the units of their whole range; with ten times as much,
 # a control of 1 in a range of 1e7 would forgive seven digits.
 BEYOND = 2.0**20
-# Of its unit, 1 at most, that of a row whose bound, width and nominal values are 0: a billionth of it is excused, which
-# is no rounding of any number that the row could have, but more than the balls around a 0. The run asks for more.
+# The unit of a row whose bound, width and nominal values are all 0, as a share of what is resolved, or of 1 if that is
+# less. A billionth of this unit is excused: less than the rounding of any number that the row could have, but more than
+# the radius of a ball around a 0. The run itself excuses less.
 NOTHING = 2.0**-50
-MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
+MOST_AXES = 4  # axes of the parameters at whose ends a window is examined
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class WindowUnits:
-    """The units of the constraint ``x(t) - r(t)`` in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in one
-    of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``;
-    ``acting (m,)``: how far the control of a decision goes; ``flows``: those of the system; ``nominal``: the largest
-    values of rows on the state and on the control along the nominal trajectory.
+    """The units of the rows of one constraint: a violation of `TOLERANCE` of a unit counts as none.
 
-    That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any
-    admissible control, the worst disturbance, any parameter), ``|b|``, and the width of the slab where the opposite row
-    exists; of a row whose width is `THIN`, how far it can reach alone. That of a curved set in a direction ``c`` is
-    ``h(c) - c'm``, ``m`` its centre. It is at least what double precision resolves of the numbers that are added up,
-    but never more than what a user can read: the largest of ``|b|``, of that width, and of what the row does along the
-    nominal trajectory (decision 0088). A violation of `TOLERANCE` of it counts as none. Units are no claims: floating
-    point will do.
-    """
+    The constraint is that ``x(t) - r(t)`` is in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in a shape of
+    more coordinates. ``reference (q, 1 + d)`` holds times and points of ``r``. ``acting (m,)`` is the largest absolute
+    value of each channel of the decision's control. ``flows`` are those of the system. ``nominal`` returns the largest
+    absolute values of rows, on the state and on the control, along the nominal trajectory.
+
+    The unit of a row ``c'x <= b`` is the smallest number that is not zero among three. The first is how far ``c'x`` can
+    reach over the window, for any admissible control, the worst disturbance and any parameter. The others are ``|b|``
+    and the width of the slab where the opposite row exists. A row whose width is `THIN` has the reach alone. The unit
+    of a curved set in a direction ``c`` is ``h(c) - c'm``, ``m`` its centre.
+
+    A unit is at least what double precision resolves of the numbers that are added up. It is never more than what a
+    user can read: the largest of ``|b|``, the width, and the values of the row along the nominal trajectory (decision
+    0088). Units are no claims, so they are computed in floating point."""
 
     problem: OptimalControlProblem
     flows: VerifiedFlows
@@ -68,7 +71,7 @@ class WindowUnits:
 
     @cached_property
     def rows(self) -> Array:
-        """The unit ``(k,)`` of every facet of a flat set."""
+        """The unit ``(k,)`` of every facet of a flat set, by which a claim excuses violations."""
         resolved, flat = self.resolved, known(self.shape).facets
         assert flat is not None
         across = np.array(widths(flat))
@@ -79,9 +82,10 @@ class WindowUnits:
         return np.asarray(np.minimum(resolved, np.where(sizes > 0.0, sizes, NOTHING * np.minimum(resolved, 1.0))))
 
     def least(self, direction: Array, width: float) -> float:
-        """The least unit of a direction ``c (d,)`` of a curved set that reaches ``width`` from its centre along it:
-        what double precision resolves, but never more than what the states do along the nominal trajectory; these alone
-        where the set is `THIN`."""
+        """Return the least unit of a direction ``c (d,)``, along which a curved set reaches ``width`` from its centre.
+
+        It is what double precision resolves, but never more than the values of the states along the nominal trajectory.
+        Where the set is `THIN`, it is these values alone."""
         size = np.abs(direction)
         floors = self._seen if width < THIN * float(size @ self.sums) else self._floors
         return float(size @ floors)
@@ -93,14 +97,15 @@ class WindowUnits:
 
     @cached_property
     def _seen(self) -> Array:
-        """How far every state goes along the nominal trajectory, ``(d,)``."""
+        """The largest absolute value of every state along the nominal trajectory, ``(d,)``."""
         d = self.problem.system.states
         return np.zeros(d) if self.nominal is None else self.nominal(np.eye(d), np.zeros((d, 0)))
 
     @cached_property
     def resolved(self) -> Array:
-        """The unit ``(k,)`` of every facet of a flat set as far as double precision resolves it, readable or not: by
-        that figures are compared, nothing is excused."""
+        """The unit ``(k,)`` of every facet of a flat set as far as double precision resolves it, large or small.
+
+        It says how closely figures must agree; nothing is excused by it."""
         flat = known(self.shape).facets
         assert flat is not None
         heights = np.array([abs(float(b)) for _, b in flat])
@@ -118,12 +123,14 @@ class WindowUnits:
 
     @cached_property
     def sums(self) -> Array:
-        """The largest numbers ``(d,)`` that are added up to a state within the window."""
+        """The largest numbers ``(d,)`` that are added up to each state within the window."""
         return self._measured(self._middle, states=True)[1]
 
     def slack(self, direction: Array, limit: arb) -> float:
-        """How closely doubles tell ``c'x`` in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its
-        facet, or the sum of those of the facets that it is a sum of."""
+        """Return how closely doubles determine ``c'x`` in a direction ``c (d,)`` with ``c'x <= limit`` on the set.
+
+        The direction of a flat set is a combination of normals with weights that are not negative. The numbers of these
+        facets are added up with the same weights."""
         return self._share(
             direction,
             limit,
@@ -132,14 +139,16 @@ class WindowUnits:
         )
 
     def excused(self, direction: Array, limit: arb) -> float:
-        """What a claim excuses in any direction, likewise (decision 0088)."""
+        """Return the violation that a claim excuses in a direction ``c (d,)``, as in `slack` (decision 0088)."""
         return self._share(direction, limit, lambda: self.rows, lambda width: self.least(direction, width))
 
     def _share(
         self, direction: Array, limit: arb, facets: Callable[[], Array], least: Callable[[float], float]
     ) -> float:
-        """`TOLERANCE` of a direction's unit: of those of the ``facets (k,)``, or, of a curved set, of its width, but
-        no less than the ``least`` for that width."""
+        """Return `TOLERANCE` of the unit of a direction.
+
+        A flat set takes the units ``facets (k,)``. A curved set takes its width, but at least the ``least`` unit for
+        that width."""
         shape = known(self.shape)
         if shape.facets is None:
             width = float(limit) - float(direction @ shape.centre)
@@ -148,6 +157,7 @@ class WindowUnits:
 
     @property
     def _middle(self) -> tuple[float, ...]:
+        """A parameter in the interior of the set, ``(nu,)``."""
         bound = self.problem.system.parameters
         return () if bound is None else tuple(map(float, bound.interior_point()))
 
@@ -162,9 +172,11 @@ class WindowUnits:
 
     @remembered()
     def _measured(self, parameter: tuple[float, ...], states: bool) -> tuple[Array, Array]:
-        """How far the normal of every facet, or every one of the ``states``, reaches at one parameter, and the largest
-        sums of absolute numbers from which these are computed, ``(k,)`` each; by one walk back through the pieces from
-        every time that is looked at, as many of them together as fit."""
+        """Return how far rows reach over the window at one parameter, and the largest sums of absolute terms.
+
+        The rows are the normals of the facets, or all ``states``; both results are ``(k,)``. The intervals of time are
+        traversed once backwards from every time of the window that is examined, for as many times together as memory
+        allows."""
         with np.errstate(over="ignore", invalid="ignore"):
             nodes, places = self._nodes()
             each = len(nodes) * len(self._rows_of(states)[0])
@@ -177,7 +189,8 @@ class WindowUnits:
         return found
 
     def _rows_of(self, states: bool) -> tuple[Array, Array]:
-        """The normals of the facets on the state and on the control, or every state: ``(k, d)``, ``(k, m)``."""
+        """Return the normals of the facets on state ``(k, d)`` and control ``(k, m)``, or the axes of the
+        ``states``."""
         d = self.problem.system.states
         if states:
             return np.eye(d), np.zeros((d, 0))
@@ -189,6 +202,7 @@ class WindowUnits:
     def _walked(
         self, parameter: tuple[float, ...], states: bool, nodes: list[float], places: npt.NDArray[np.intp]
     ) -> tuple[Array, Array]:
+        """Return reach and sums as in `_measured`, ``(k,)`` each, over the times ``places`` among the ``nodes``."""
         system, bound = self.problem.system, self.problem.disturbance
         d, m, columns = system.states, system.controls, system.controls + system.drifts
         rows, gains = self._rows_of(states)
@@ -238,7 +252,7 @@ class WindowUnits:
         return np.maximum(np.abs(high), np.abs(low)).max(axis=0), sums.max(axis=0)
 
     def _joined(self, nodes: list[float], pushed: Array) -> Array:
-        """What acts on each piece of the disturbance, from what acts on each interval between ``nodes``."""
+        """Return the weights of the disturbance on its pieces, from those on the intervals between ``nodes``."""
         if self.problem.disturbance is None or len(nodes) < 2:
             return pushed
         middles = (np.array(nodes[:-1]) + np.array(nodes[1:])) / 2
@@ -249,7 +263,7 @@ class WindowUnits:
         return self.scene.lasting.gathered(answer[..., None], np.zeros((*answer.shape, 1)))[0][..., 0]
 
     def _nodes(self) -> tuple[list[float], npt.NDArray[np.intp]]:
-        """The grid up to the window's end with the window's ends, and the places among it that are looked at."""
+        """Return the grid up to the window's end, with both its ends, and the places of the times to examine."""
         inside = [t for t in self.scene.grid if t < self.stop]
         nodes = sorted({*inside, self.start, self.stop})
         window = np.flatnonzero(np.array(nodes) >= self.start)
@@ -260,12 +274,12 @@ class WindowUnits:
 
 @lru_cache(maxsize=2)
 def _units_of(case: Case) -> dict[ConstraintWindow, WindowUnits]:
-    """Those that were made."""
+    """Return the units of the constraints of a case that were made before."""
     return {}
 
 
 def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
-    """What violations of a constraint are judged by."""
+    """Return the units by which violations of a constraint are judged."""
     made = _units_of(case)
     if window not in made:
         made[window] = WindowUnits(
@@ -284,7 +298,7 @@ def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
 
 @lru_cache(maxsize=2)
 def _nominal_values(case: Case) -> tuple[Array, Array]:
-    """The nominal ``(x, u)`` of the decision where every piece begins to act, and at the end, and their radii."""
+    """Return the nominal ``(x, u)`` where pieces begin to act and at the end, ``(K', d + m)``, and the radii."""
     states = case.price.nominal_states(case.pieces)
     every = np.array([[(float(x), float(x.rad())) for x in one.entries()] for one in states])
     seen = np.delete(every, case.problem.system.states, axis=1)  # without the 1
@@ -292,10 +306,17 @@ def _nominal_values(case: Case) -> tuple[Array, Array]:
 
 
 def nominal_sizes(case: Case, rows: Array, gains: Array) -> Array:
-    """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``.
+    """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``, never too large.
 
-    They are seen where every piece of the control begins to act, of ``rows (k, d)`` and ``gains (k, m)``, and never
-    too large. Under feedback, rows of the state alone count what deviations do too.
+    The trajectory is evaluated where every piece of the control begins to act, and at the end. Under feedback, rows of
+    the state alone include the deviations.
+
+    Parameters
+    ----------
+    case
+        The case.
+    rows, gains
+        The coefficients ``c (k, d)`` of the state and ``g (k, m)`` of the control; ``g`` may have no columns.
     """
     if case.answering and not gains.any():
         return feedback_of(case).sizes(rows)
