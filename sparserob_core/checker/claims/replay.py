@@ -1,5 +1,6 @@
-"""One time of a run: the state under a disturbance and a parameter that must be admissible, the constraint that a
-witness exceeds there, and by how much the worst one does."""
+"""One time of a run: the state under an admissible disturbance and parameter, and the excess over a constraint there.
+
+The excess is that of a witness, or that of the worst disturbance."""
 
 from __future__ import annotations
 
@@ -30,15 +31,36 @@ if TYPE_CHECKING:
 
     from sparserob_core.checker.claims.window import ConstraintWindow
 
-# Of its row's unit, for every state, by how much the violation that a run tells may be off where rows are followed:
-# sums of so many terms are rounded. Of 348 states, whose modes are conditioned by 5e3, a run rounds 1.6e-9, for which
-# its proof allows: a tenth of this calls such a run wrong, ten times as much is seen in the seventh digit of a wall.
+# The rounding error that is allowed in a reported violation where rows are followed, per state and in a row's unit:
+# sums of so many terms are rounded. A run of 348 states whose modes have a condition number of 5e3 rounds by 1.6e-9,
+# for which its proof allows. A tenth of this calls such a run wrong; ten times as much shows in the seventh digit of a
+# wall.
 ROUNDED = 1e-11
 
 
 def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
-    """The state at ``time`` under the case's control, and ``signal (mw, pieces)`` on the pieces of the common grid
-    (``None``: no disturbance), from the centre of the initial states and a ``deviation (d,)`` in their set."""
+    """Return the state at a time under the control of the case, ``(d,)`` balls.
+
+    Parameters
+    ----------
+    case
+        The case.
+    time
+        The time at which the state is computed.
+    parameter
+        The parameter of the system, ``(nu,)``.
+    signal
+        The disturbance ``(mw, pieces)`` on the pieces of the common grid; not read where the problem has none.
+    deviation
+        The deviation ``(d,)`` from the centre of the initial states; not read where these are one point.
+
+    Raises
+    ------
+    Broken
+        Where the disturbance or the deviation is not shown to be in its set.
+    Unchecked
+        Where the disturbance is given on another grid.
+    """
     w = _admissible(case, signal) if case.problem.disturbance is not None else None
     weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.timing.grid[1:-1] if t < time), time])
     x = weights.free * _start(case, deviation)
@@ -51,7 +73,7 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
 
 
 def _start(case: Case, deviation: object) -> arb_mat:
-    """The initial state ``(d, 1)`` that a deviation leads to."""
+    """Return the initial state ``(d, 1)`` that a deviation leads to."""
     begin = balls(np.asarray(case.problem.initial_state))
     if case.problem.initial_set is not None:
         begin = [v + off for v, off in zip(begin, balls(_begun(case, deviation)), strict=True)]
@@ -59,8 +81,18 @@ def _start(case: Case, deviation: object) -> arb_mat:
 
 
 def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
-    """By how much a witness exceeds the constraint that it names, under the disturbance and from the initial state that
-    it names, and how much of that counts as none."""
+    """Return the excess of a witness over the constraint that it names, and how closely a figure of it must agree.
+
+    The witness names the time, the direction, the disturbance and the initial state, which must be admissible. Where
+    the control is delivered with errors, the worst errors are added.
+
+    Raises
+    ------
+    Broken
+        Where the witness is not admissible, or names no constraint of the problem.
+    Unchecked
+        Where the witness holds no disturbance that can be followed.
+    """
     name, time, direction = (
         str(data.get("constraint")),
         number(data, "time"),
@@ -106,8 +138,10 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
 
 
 def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
-    """How much of that counts as none: what a claim excuses of a constraint on the state, which may be less than the
-    ``slack`` up to which its figure is known; of others the slack."""
+    """Return the part of a witness's excess that counts as none.
+
+    For a constraint on the state it is what a claim excuses, which may be less than ``slack``, the accuracy of the
+    figure. For other constraints it is the ``slack``."""
     name, direction = str(data.get("constraint")), numbers(data.get("direction"), "direction")
     if commanded(case, name) is not None or (name == EQUALS and case.equalities):
         return slack
@@ -118,8 +152,10 @@ def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
 def _farthest(
     case: Case, direction: tuple[Array, Array], time: float, parameter: Sequence[float], piece: int | None
 ) -> arb:
-    """The largest ``c'x(t) + gain'u``, ``u`` the control on a ``piece``, under measurable disturbances, at a
-    parameter."""
+    """Return a ball that holds the largest ``c'x(t) + gain'u`` under measurable disturbances, at a parameter.
+
+    ``direction`` is ``(c, gain)``, and ``u`` is the control on a ``piece``; where it is ``None``, ``gain'u`` is left
+    out."""
     (c, gain), none, strayed = direction, balls([0.0])[0], case.sources.strayed_at(parameter)
     assert strayed is not None
     row = case.duality.row(c, time, parameter, none)
@@ -133,14 +169,38 @@ def _farthest(
 
 
 def _along(direction: Array, named: NamedDeviations | None, rows: Sequence[list[arb]]) -> arb:
-    """The value of ``c'x`` of what is nominal and has responses, ``(1 + Q,)`` each, under deviations that are named."""
+    """Return ``c'x`` for rows with a nominal value and responses, ``(1 + Q,)`` each, under the named deviations.
+
+    Without named deviations it is the nominal value."""
     return along(direction, [row[0] for row in rows] if named is None else named.of(rows))
 
 
 def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None) -> tuple[list[float], float]:
-    """By how much the worst disturbance exceeds each row of a constraint at one time and parameter, and how closely
-    that is known; from the worst initial state, or from ``begun (d,)``. `said` holds the names ``constraint``,
-    ``time``, ``parameter`` and ``violation``. Raises `Broken` where these are none, `Unchecked` for a curved set."""
+    """Return the excess of the worst disturbance over each row of a constraint at one time, with its accuracy.
+
+    Parameters
+    ----------
+    case
+        The case.
+    said
+        What a result says, with the keys ``constraint``, ``time``, ``parameter`` and ``violation``.
+    begun
+        The initial state ``(d,)``; by default the worst one. It is not used under feedback.
+
+    Returns
+    -------
+    list of float
+        The excess of each row; where the control jumps in a mixed constraint, of each row on both sides.
+    float
+        How closely these numbers are known.
+
+    Raises
+    ------
+    Broken
+        Where ``said`` names no constraint of the problem, no time of it or no numbers.
+    Unchecked
+        For a curved set, whose worst direction is not reported.
+    """
     name, time, held = str(said.get("constraint")), number(said, "time"), commanded(case, str(said.get("constraint")))
     number(said, "violation")
     if held is not None:
@@ -154,7 +214,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         every = missed(case)
         return [float(off) for off, _ in every], TOLERANCE * max(added for _, added in every)
     window, parameter = case.window(name), numbers(said.get("parameter", []), "parameter")
-    asked(case, window, time, parameter)  # of one at the edge of its set, rounded, the worst is compared
+    asked(case, window, time, parameter)  # not `admissible`: rounding may take a parameter at the edge out of its set
     flat, found = window.seen.facets, window.seen.basis
     if flat is None or found is None:
         raise Unchecked("the worst direction of a curved set is not told")
@@ -182,8 +242,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
 def _along_rows(
     case: Case, window: ConstraintWindow, time: float, begun: Array | None, pieces: Sequence[tuple[int, int]]
 ) -> tuple[list[float], float]:
-    """By how much the worst disturbance exceeds each row of a flat set at a time, by the adjoints of the rows, and how
-    closely that is known."""
+    """Return the excess of the worst disturbance over each row of a flat set, by adjoints, with its accuracy."""
     flat, over, slack = window.seen.facets, list[float](), 0.0
     assert flat is not None
     breaks = case.control.breakpoints.tolist()
@@ -201,7 +260,9 @@ def _along_rows(
 
 
 def _pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
-    """The pieces of the grid and of the control that a time is in; where the control ``jumps``, on either side."""
+    """Return the pairs of a piece of the grid and a piece of the control that a time is in.
+
+    Where the control ``jumps``, the pieces on both sides of the time count."""
     sides: tuple[Literal["left", "right"], ...] = ("left", "right") if jumps else ("right",)
     ends = np.array(case.timing.grid), case.control.breakpoints
     places = ([int(np.clip(np.searchsorted(e, time, side=side) - 1, 0, e.size - 2)) for e in ends] for side in sides)
@@ -209,7 +270,7 @@ def _pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
 
 
 def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains: Array) -> Reached:
-    """The states that are reached at a parameter, from the initial state ``begun (d,)`` alone where one is given."""
+    """Return the reachable states at a parameter, from the initial state ``begun (d,)`` alone where it is given."""
     if case.answering:
         return LoopTube(feedback_of(case).loop, basis, gains)
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
@@ -218,7 +279,7 @@ def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains
 
 
 def _begun(case: Case, data: object) -> Array:
-    """The deviation of the initial state, shown to be one of the problem's."""
+    """Return the deviation ``(d,)`` of the initial state; raise `Broken` unless it is shown to be in its set."""
     bound = case.problem.initial_set
     assert bound is not None
     deviation = shaped({"deviation": data}, "deviation", (bound.dimension,))
@@ -228,7 +289,9 @@ def _begun(case: Case, data: object) -> Array:
 
 
 def _admissible(case: Case, signal: object) -> Array:
-    """The disturbance, shown to be one of the problem's."""
+    """Return the disturbance ``(mw, pieces)``, shown to be admissible.
+
+    Raise `Broken` where it leaves its set or jumps within one of its pieces, `Unchecked` where its grid is another."""
     changes, bound = case.disturbances.changes, case.problem.disturbance
     assert changes is not None and bound is not None
     w = numbers(signal, "disturbance")
