@@ -1,9 +1,9 @@
-"""The least share of time that an admissible control must act, in ball arithmetic.
+"""A lower bound, in ball arithmetic, of the share of time that an admissible control must act.
 
 An entry ``u_i`` of a control with values in ``[low_i, high_i]`` satisfies
-``max(u_i, 0) / high_i + max(-u_i, 0) / |low_i| <= [u_i != 0]``, or counts always where 0 is outside. So the minimum of
-that cost over the admissible controls, bounded by weak duality, is below the weighted time that any of them acts.
-"""
+``max(u_i, 0) / high_i + max(-u_i, 0) / |low_i| <= [u_i != 0]``. Where 0 is outside of the interval, the entry counts
+always. So the minimum of that cost over the admissible controls is at most the weighted time that any of them acts.
+Weak duality bounds the minimum from below."""
 
 from __future__ import annotations
 
@@ -23,25 +23,37 @@ from sparserob_core.control.sets.curved import NormBall
 if TYPE_CHECKING:
     from flint import arb
 
-ROUNDED = 1e-12  # of the terms of which a value of the control is a sum: that much counts as 0
+ROUNDED = 1e-12  # of the terms that a value of the control is a sum of: so small a value counts as 0
 EQUAL = 1e-12  # counts that differ by no more are equal
-NEARLY = 1e-6  # of one count, by which a whole number of them may be missed
+NEARLY = 1e-6  # of one count: a bound so little above a whole number of counts is not rounded up to the next
 
 Rows = list[tuple[float, ConstraintRow]]
 
 
 def acted(case: Case) -> float:
-    """The share of time, weighted over the channels, that the certificate's control acts."""
+    """Return the share of time, weighted over the channels, that the certificate's control acts."""
     acts = np.abs(case.control.control(case.theta)) > ROUNDED * case.control.summands(case.theta)
-    for block in case.price.blocks:  # channels that make one vector act together
+    for block in case.price.blocks:  # the channels of one vector act together
         acts[block] = acts[block].any(axis=0)
     counts = _counts(case)
     return float(counts[acts].sum() / counts.sum())
 
 
 def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
-    """Multipliers of the cost, as multipliers of the count: divided by what the largest value of a channel costs, which
-    is best where all have the same. Any factor that is not negative proves something."""
+    """Return multipliers of the cost as multipliers of the count, together with those of the pieces.
+
+    Both are divided by the largest absolute value of a channel times the factor ``l1`` of the cost. This is best where
+    all channels have the same largest value; any factor that is not negative gives a valid bound.
+
+    Parameters
+    ----------
+    case
+        The case.
+    rows
+        The multipliers with their constraints.
+    pieces
+        The multipliers ``(m, K)`` of the control's pieces, or ``None``.
+    """
     most = max((max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _ranges(case)), default=1.0)
     most = most * case.problem.cost.l1 or 1.0
     rest = pieces if pieces is None else (np.asarray(pieces, dtype=float) / most).tolist()
@@ -49,8 +61,19 @@ def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
 
 
 def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> float:
-    """The share below which no admissible control acts, by these multipliers; a whole number of pieces where all count
-    the same."""
+    """Return the share of time, from 0 to 1, that every admissible control acts at least, by the given multipliers.
+
+    It is a whole number of pieces where all pieces count the same.
+
+    Parameters
+    ----------
+    case
+        The case.
+    rows
+        The multipliers with their constraints.
+    pieces
+        The multipliers ``(m, K)`` of the control's pieces, or ``None``.
+    """
     total, slopes = case.duality.summed(rows, pieces)
     ranges = _ranges(case)
     counts = [[ball(c) * length for c in case.price.counts] for length in _lengths(case)]
@@ -63,8 +86,9 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
 
 
 def least_of_cost(case: Case, cost: arb) -> float:
-    """The share below which no admissible control acts, where none costs less than ``cost``: a vector of channels that
-    is not 0 costs at most its highest weight times the longest that it can be."""
+    """Return the share of time that every admissible control acts at least, where none costs less than ``cost``.
+
+    A vector of channels that is not 0 costs at most its highest weight times the largest length that it can have."""
     counts, highest = case.price.counts, case.price.highest
     factors = [
         ball(len(block)) * ball(counts[c]) / (ball(case.problem.cost.l1) * ball(highest[c]) * longest)
@@ -77,7 +101,7 @@ def least_of_cost(case: Case, cost: arb) -> float:
 
 
 def _longest(case: Case, block: Sequence[int]) -> arb:
-    """At least how long the vector of some channels can be."""
+    """Return an upper bound of the Euclidean length of the vector of some channels."""
     bound, ranges = case.problem.control, _ranges(case)
     reach = [abs(ranges[i][0]).max(abs(ranges[i][1])) for i in block]
     size = sum((r * r for r in reach), ball(0)).sqrt()
@@ -88,12 +112,12 @@ def _longest(case: Case, block: Sequence[int]) -> arb:
 
 
 def _whole(case: Case, total: arb) -> float:
-    """A bound of the time of action as a share of the largest."""
+    """Return a lower bound of the time of action as a share of the largest."""
     return min(1.0, _rounded(case, total) / float(_vectors(case).sum()))
 
 
 def _rounded(case: Case, total: arb) -> float:
-    """A bound of the time of action, rounded up where all that counts, counts the same."""
+    """Return a lower bound of the time of action, rounded up to whole pieces where all of them count the same."""
     table = _vectors(case)
     bound = float(np.nextafter(float(total.lower()), -np.inf))
     if np.ptp(table) <= EQUAL * table.max():
@@ -110,8 +134,10 @@ def _least(
     off: Sequence[bool] = (),
     sizes: Sequence[arb] = (),
 ) -> arb:
-    """At most the minimum of what one piece counts and the slopes, and ``sizes`` of absolute values, add, over the
-    controls in the set that are 0 in the channels that are ``off``."""
+    """Return a lower bound of the sum that one piece contributes, over the controls of the set.
+
+    The sum is the count of the channels that act, the products of the ``slope (m,)`` and the control, and
+    ``sizes (m,)`` times its absolute values. The channels marked in ``off`` are 0."""
     ups, downs, certain = [], [], ball(0)
     for (low, high), one in zip(ranges, count, strict=True):
         always = low > 0 or high < 0
@@ -123,13 +149,13 @@ def _least(
     for i, size in enumerate(sizes):
         ups[i], downs[i] = ups[i] + size, downs[i] + size
     for i, zero in enumerate(off):
-        if zero:  # what a value that is not 0 there would bring is outweighed
+        if zero:  # then no value other than 0 lowers the sum
             ups[i] = downs[i] = abs(slope[i])
     return certain + known(case.problem.control).least(ups, downs, slope)
 
 
 def _ranges(case: Case) -> list[tuple[arb, arb]]:
-    """The least and the largest value of every channel."""
+    """Return the least and the largest value of every channel."""
     found, m, shape = [], case.problem.system.controls, known(case.problem.control)
     for i in range(m):
         axis = [ball(i == j) for j in range(m)]
@@ -138,34 +164,54 @@ def _ranges(case: Case) -> list[tuple[arb, arb]]:
 
 
 def _lengths(case: Case) -> list[arb]:
+    """Return the length of every piece of the control, in time."""
     breaks = case.control.breakpoints
     return [ball(b) - ball(a) for a, b in pairwise(breaks)]
 
 
 def _counts(case: Case) -> np.ndarray:
-    """What every piece of every channel counts, ``(m, K)``."""
+    """Return the count of every piece of every channel, ``(m, K)``: its weight times its length."""
     return np.asarray(np.outer(case.price.counts, np.diff(case.control.breakpoints)))
 
 
 def _vectors(case: Case) -> np.ndarray:
-    """What every piece of every vector of channels counts, ``(b, K)``."""
+    """Return the count of every piece of every vector of channels, ``(b, K)``."""
     counts = _counts(case)
     return np.array([counts[block].sum(axis=0) for block in case.price.blocks])
 
 
 def largest(case: Case) -> float:
-    """The longest time that a control can act, weighted over its channels."""
+    """Return the longest time that a control can act, weighted over its channels."""
     return float(_counts(case).sum())
 
 
 Part = tuple[float, float, bool]
-"""Bounds of one piece of one channel in a part of the controls, and whether it counts there whatever its value."""
+"""The lower and upper bound of one piece of one channel in a part, and whether it counts whatever its value."""
 ANY: Part = (-np.inf, np.inf, False)
 
 
 def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, Any]], Rows]) -> float:
-    """The time that every control acts at least, by the leaves of a tree of parts: infinite where each leaf proves that
-    nothing is feasible in its part. Raises `Broken` unless the parts are all controls."""
+    """Return the time that every control acts at least, by the leaves of a tree of parts of the controls.
+
+    Parameters
+    ----------
+    case
+        The case.
+    nodes
+        The nodes of the tree as the certificate has them, the root first.
+    weighted
+        Returns the multipliers of a leaf with their constraints.
+
+    Returns
+    -------
+    float
+        The least bound of the leaves; infinite where every leaf proves that its part holds no feasible control.
+
+    Raises
+    ------
+    Broken
+        Where the nodes are no tree whose leaves cover all controls, or a leaf does not prove what it says.
+    """
     answer, waiting, seen = float("inf"), [(0, dict[tuple[int, int], Part]())], set[int]()
     while waiting:
         case.clock.check()
@@ -189,8 +235,10 @@ def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, An
 def _divided(
     case: Case, node: Mapping[str, Any], parts: Mapping[tuple[int, int], Part]
 ) -> tuple[dict[tuple[int, int], Part], dict[tuple[int, int], Part]]:
-    """Two halves that hold every control of a part: of one channel's values on a piece, or where channels make one
-    vector, that this is 0 there, and that it counts."""
+    """Return two halves that together hold every control of a part.
+
+    They divide the values of one channel on a piece between two letters. Without letters, one half has the vector of
+    the channel at 0 on the piece, and the other half counts it whatever its value."""
     channel, piece = node.get("channel"), node.get("piece")
     m, K = case.problem.system.controls, case.control.pieces
     if type(channel) is not int or type(piece) is not int or not (0 <= channel < m and 0 <= piece < K):
@@ -210,7 +258,7 @@ def _divided(
 
 
 def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], rows: Rows) -> float:
-    """The time that a control of one part acts at least."""
+    """Return a lower bound of the time that the controls of one part act; infinite where none is feasible."""
     total, slopes = case.duality.summed(rows, None)
     sizes = case.duality.charged(rows, [[ball(0)] * case.problem.system.controls] * len(slopes))
     for k, (length, slope, charged) in enumerate(zip(_lengths(case), slopes, sizes, strict=True)):
@@ -225,8 +273,7 @@ def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], row
 
 
 def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb], sizes: Sequence[arb]) -> arb:
-    """At most the minimum of what one piece counts and the slopes, and ``sizes`` of absolute values, add, over the
-    controls' set within a part."""
+    """Return a lower bound of the sum that one piece contributes, as `_least` does, over the controls of a part."""
     from flint import arb
 
     if case.problem.control.is_box or case.letters is not None:
@@ -244,8 +291,10 @@ def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: 
 
 
 def _values(case: Case, part: Part, low: float, high: float) -> list[float]:
-    """The values at one of which the count of an entry and any slope are least together: the ends of its range, and
-    0 in between; with an alphabet its letters."""
+    """Return the values among which the count of an entry plus any slope has its minimum.
+
+    They are the ends of the range of the entry, and 0 in between; with an alphabet they are the letters in the
+    range."""
     if case.letters is not None:
         return [letter for letter in case.letters if part[0] <= letter <= part[1]]
     least, most = max(low, part[0]), min(high, part[1])
