@@ -1,5 +1,7 @@
-"""The lower bound that the multipliers of a certificate prove: each names a constraint of the problem, at a time and a
-parameter, and at single deviations where the control answers them, else at the worst."""
+"""The lower bound that the multipliers of a certificate prove.
+
+Each multiplier names a constraint of the problem, at a time and a parameter. Where the control answers deviations, it
+also names the deviations; elsewhere the constraint is taken at the worst ones."""
 
 from __future__ import annotations
 
@@ -28,8 +30,21 @@ MOST_MULTIPLIERS = 100_000
 
 
 def multiplied(case: Case, priced: bool) -> arb:
-    """The bound that the certificate's multipliers give: of the cost, or not ``priced`` of by how much a weighted sum
-    of constraints is missed at least."""
+    """Return the lower bound that the certificate's multipliers prove.
+
+    Parameters
+    ----------
+    case
+        The case.
+    priced
+        Whether the bound is one of the cost. Otherwise it is a bound of the weighted sum of constraints over all
+        controls; a positive bound proves that no control is feasible.
+
+    Returns
+    -------
+    arb
+        A ball; its lower end is the bound.
+    """
     data = case.certificate.get("multipliers")
     rows, pieces = weighted(case, data)
     price, touched = (case.price, touched_by(case, data)) if priced else (None, None)
@@ -38,7 +53,29 @@ def multiplied(case: Case, priced: bool) -> arb:
 
 
 def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]], Any]:
-    """Multipliers with their constraints, and those of the control's pieces."""
+    """Return the multipliers with their constraints, and the multipliers of the control's pieces.
+
+    Parameters
+    ----------
+    case
+        The case.
+    data
+        The ``multipliers`` of a certificate, or a part of it of the same form.
+
+    Returns
+    -------
+    list of tuple
+        Each multiplier with its constraint.
+    Array or None
+        The multipliers ``(m, K)`` of the pieces; ``None`` where every piece has a function of its own.
+
+    Raises
+    ------
+    Broken
+        Where an entry is malformed or names no constraint of the problem.
+    Unchecked
+        Where there are no multipliers.
+    """
     if data is None:
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
     if not isinstance(data, Mapping):
@@ -48,7 +85,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
     rows = [weighted_row for entry in entries for weighted_row in rows_of(case, entry)]
     nu = numbers(listed(data, "equalities"), "equalities")
-    if nu.shape != (0 if case.answering else len(case.equalities),):  # where it answers these are rows of deviations
+    if nu.shape != (0 if case.answering else len(case.equalities),):  # under feedback they are constraints
         raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
     bound = case.problem.system.parameters
     middle = [] if bound is None else bound.interior_point().tolist()
@@ -58,15 +95,18 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
             row = _along_adjoint(case, direction, case.problem.horizon, ball(value), disturbed=False)
         else:
             row = case.duality.row(direction, case.problem.horizon, middle, ball(value), disturbed=False)
-        # what is known of a disturbance that does not vary counts; where none may reach the state it is any member
+        # a disturbance of one point counts; where none may reach the state, any member of its set may stand for it
         rows.append((multiplier, replace(row, constant=row.constant + pushed_by_middle(case, state))))
-    if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
+    if case.control.functions >= case.control.pieces:  # every piece has a function of its own
         return rows, None
     return rows, shaped(data, "pieces", (case.problem.system.controls, case.control.pieces))
 
 
 def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
-    """The control at which the certificate replaces the cost by its tangent, on every piece."""
+    """Return the control ``(m, 1)`` on every piece at which the certificate replaces the cost by its tangent.
+
+    It is ``None`` where the cost has neither quadratic terms nor norms of groups. Raise `Broken` where a quadratic term
+    is not convex."""
     if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
         return None
     said = data if isinstance(data, Mapping) else {}
@@ -76,15 +116,18 @@ def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
 
 
 def norms_of(case: Case, data: object) -> Array | None:
-    """The vectors ``(m, K)`` that the certificate offers in the place of norms of the control, if it does."""
+    """Return the vectors ``(m, K)`` that the certificate offers in the place of norms of the control, or ``None``."""
     if not isinstance(data, Mapping) or data.get("norms") is None:
         return None
     return shaped(data, "norms", (case.problem.system.controls, case.control.pieces))
 
 
 def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
-    """A multiplier with its constraint, which must be one of the problem's; a step across the seam of a plan that
-    answers is the sum of two, of the last control and of the first one, which answer what they see of two periods."""
+    """Return an entry's multiplier with its constraint, which must be one of the problem's.
+
+    Under feedback, a step across the seam of a plan that repeats gives two constraints with the same multiplier. One is
+    on the last control of a period and the other on the first control of the next, which answer innovations of two
+    periods."""
     case.clock.check()
     if not isinstance(entry, Mapping):
         raise Broken("multipliers: expected a constraint, a time, a parameter, a direction and a number each")
@@ -93,7 +136,7 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     y, parameter = number(entry, "multiplier"), numbers(entry.get("parameter", []), f"{name}: parameter")
     if not y > 0:
         raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
-    if parameter.size:  # what is asked of the control alone is at none
+    if parameter.size:  # constraints on the control alone have none
         sized(parameter, case.problem.system.parameter_count, name)
     named = feedback_of(case).named(entry, name) if case.answering else None
     if any(window.name == name for window in case.windows) or (case.answering and name == EQUALS and case.equalities):
@@ -122,7 +165,7 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
 def _of_state(
     case: Case, entry: Mapping[str, Any], said: tuple[str, Array, float, Array], named: NamedDeviations | None
 ) -> ConstraintRow:
-    """The constraint on the state, and on the control on a piece of it, that an entry names."""
+    """Return the constraint on the state, and on the control of a piece where it is mixed, that an entry names."""
     name, direction, time, parameter = said
     window = None if name == EQUALS and case.equalities else case.window(name)
     sized(direction, case.problem.system.states if window is None else window.shape.dimension, name)
@@ -141,14 +184,15 @@ def _of_state(
 
 @lru_cache(maxsize=2)
 def _rows_of(case: Case) -> dict[tuple[object, ...], ConstraintRow]:
-    """Constraints that were derived before."""
+    """Return the constraints of a case that were derived before."""
     return {}
 
 
 def _undisturbed(
     case: Case, window: ConstraintWindow | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
 ) -> ConstraintRow:
-    """The same for the worst deviations, or without any where the control answers them."""
+    """Return the constraint on the state for the worst deviations, or without deviations where the control answers
+    them."""
     _, direction, time, parameter = said
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
@@ -168,8 +212,9 @@ def _undisturbed(
 
 
 def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> ConstraintRow:
-    """``c'x(t) <= limit`` of a system whose rows are followed, for the worst deviations or without any: no matrix is
-    made for a duration, which of hundreds of states takes a minute each."""
+    """Return the constraint ``c'x(t) <= limit`` by the adjoint of its row, for the worst deviations or without them.
+
+    No transition matrix is computed, because each would take a minute for hundreds of states."""
     worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
     m, begins = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
     state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
@@ -188,7 +233,7 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
 
 
 def _of_control(case: Case, name: str, direction: Array, time: float, named: NamedDeviations | None) -> ConstraintRow:
-    """The constraint on the control on one piece, or on its peak."""
+    """Return the constraint on the control of one piece: that it is in its set, or at most its peak."""
     row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
     if named is not None:
         seen = named.innovations
@@ -201,7 +246,8 @@ def _of_control(case: Case, name: str, direction: Array, time: float, named: Nam
 
 
 def _of_effort(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:
-    """The control at deviations, each entry of it times a share of ``[-1, 1]``, is at most the effort."""
+    """Return the constraint that the control at deviations, each entry times a share of ``[-1, 1]``, is at most the
+    effort."""
     K, m = case.control.pieces, case.problem.system.controls
     if shares.shape != (m * K,) or not (np.abs(shares) <= 1.0).all():
         raise Broken(f"{EFFORT}: expected {m * K} numbers from -1 to 1")
@@ -212,7 +258,9 @@ def _of_effort(case: Case, shares: Array, named: NamedDeviations | None) -> Cons
 
 
 def fixed_limit(case: Case, direction: Array, time: float) -> arb:
-    """The value of ``c'x(T)`` for a direction of one fixed state or its opposite."""
+    """Return the value of ``c'x(T)`` for a direction ``c (d,)`` of one fixed state or its opposite.
+
+    Raise `Broken` for any other direction or time."""
     values = dict(case.equalities)
     states = np.flatnonzero(direction).tolist()
     if len(states) != 1 or states[0] not in values or time != case.problem.horizon:
@@ -221,7 +269,9 @@ def fixed_limit(case: Case, direction: Array, time: float) -> arb:
 
 
 def piece_of(case: Case, window: ConstraintWindow, entry: Mapping[str, Any], time: float) -> int:
-    """The piece of the control that a mixed constraint speaks of."""
+    """Return the number of the control's piece that an entry names for a mixed constraint.
+
+    Raise `Broken` unless that piece holds the time and meets the window in positive length."""
     piece = entry.get("piece")
     if type(piece) is not int:
         raise Broken(f"{window.name}: piece is {piece!r}, expected the number of a piece of the control")
@@ -230,21 +280,21 @@ def piece_of(case: Case, window: ConstraintWindow, entry: Mapping[str, Any], tim
 
 
 def admissible(case: Case, window: ConstraintWindow, time: float, parameter: Array) -> None:
-    """Raise `Broken` unless a constraint asks something at a time, and a parameter is shown to be in its set."""
+    """Raise `Broken` unless the time is in the window of a constraint and the parameter is shown to be in its set."""
     asked(case, window, time, parameter)
     if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
         raise Broken(f"{window.name}: the parameter {parameter.tolist()} is not shown to be in its set")
 
 
 def asked(case: Case, window: ConstraintWindow, time: float, parameter: Array) -> None:
-    """Raise `Broken` unless a constraint asks something at a time, and the parameter has as many numbers as there
-    are."""
+    """Raise `Broken` unless the time is in the window of a constraint and the parameter has as many numbers as it
+    needs."""
     sized(parameter, case.problem.system.parameter_count, f"{window.name}: parameter")
     if not window.start <= time <= window.stop:
         raise Broken(f"{window.name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
 
 
 def sized(vector: Array, size: int, name: str) -> None:
-    """Raise `Broken` unless a vector has the size that is expected."""
+    """Raise `Broken` unless a vector has the expected size."""
     if vector.shape != (size,):
         raise Broken(f"{name}: {vector.size} numbers where {size} are expected")
