@@ -1,6 +1,8 @@
-"""The answers of a control, derived anew from its gains in ball arithmetic: the loop that they close, the deviations
-that a certificate names and what is seen of them, and how far all gains together can lower a weighted sum of
-constraints. A control that answers nothing has no deviations here, and no innovations."""
+"""The answers of a control to deviations, derived anew from its gains in ball arithmetic.
+
+This module has the closed loop of the system with the gains, the deviations that a certificate names and the
+innovations that they cause, and the bound of how far all gains together can lower a weighted sum of constraints. A
+control that answers nothing has no deviations here, and no innovations."""
 
 from __future__ import annotations
 
@@ -39,8 +41,9 @@ class VerifiedFeedback:
 
     @cached_property
     def gains(self) -> Array:
-        """The gains, none of a control that answers nothing; raises `Broken` where they answer what is not yet
-        measured, or what the policy does not answer."""
+        """The gains ``(K, K, m, p)``, 0 for a control that answers nothing.
+
+        Raises `Broken` where they answer what is not yet measured, or what the policy does not answer."""
         case = self.case
         if not case.answering:
             return self._none
@@ -65,7 +68,10 @@ class VerifiedFeedback:
 
     @cached_property
     def observer(self) -> Array | None:
-        """What makes innovations of the outputs, ``(K, d, p)``; any is right that is written."""
+        """The observer gains ``(K, d, p)`` that make innovations of the outputs; ``None`` where no outputs are
+        answered.
+
+        Any gains that are written are valid."""
         case = self.case
         if case.problem.measurements is None or not case.answering:
             return None
@@ -78,7 +84,9 @@ class VerifiedFeedback:
         return self._loop(self.case.pieces, self.gains)
 
     def _loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> VerifiedLoop:
-        """The loop; where ``changes`` are given, under disturbances that jump there only."""
+        """Return the closed loop; where ``changes`` are given, under disturbances that jump at these times only.
+
+        Raise `Unchecked` for the kinds of systems and disturbances that the checker does not know under feedback."""
         case = self.case
         system = case.problem.system
         if system.parameter_count:
@@ -108,15 +116,18 @@ class VerifiedFeedback:
 
     @cached_property
     def commands(self) -> list[arb_mat]:
-        """The control on every piece, ``(m, 1)``, and what it answers of every deviation beside it, ``(m, 1 + Q)``."""
+        """The control ``(m, 1)`` on every piece; under feedback ``(m, 1 + Q)``, with its responses to all
+        deviations."""
         return (
             [self.loop.inputs(k) for k in range(self.case.control.pieces)] if self.case.answering else self.case.pieces
         )
 
     def changes(self, k: int) -> list[arb_mat]:
-        """The change of the control at the beginning of piece ``k``, as a sum of parts that deviate apart. Across the
-        seam of a plan that repeats the last control of a period and the first one of the next are chosen apart: what
-        each answers is another's."""
+        """Return the step of the control at the beginning of piece ``k``, as parts whose sum it is.
+
+        Each part is ``(m, 1 + Q)``, and the parts have independent deviations. ``k = K`` is the seam of a plan that
+        repeats. There the last control of a period and the first control of the next answer the deviations of two
+        different periods, so the step has two parts."""
         if k == self.case.control.pieces:
             return [self.commands[0], -self.commands[k - 1]]
         if k:
@@ -125,7 +136,10 @@ class VerifiedFeedback:
         return [self.commands[0] - stacked([balls([u, *none]) for u in before(self.case.problem)])]
 
     def parts_at(self, name: str, time: float) -> list[arb_mat]:
-        """The control at a time, or its change there, as a sum of parts that deviate apart."""
+        """Return the control at a time, or its step there, as parts ``(m, 1 + Q)`` whose sum it is.
+
+        The parts have independent deviations. Raise `Broken` where a step is asked for and there is none at that
+        time."""
         case = self.case
         if name != STEP:
             return [self.commands[case.duality.control_piece(time)]]
@@ -135,18 +149,20 @@ class VerifiedFeedback:
         return self.changes(places[0])
 
     def support(self, responses: list[arb]) -> arb:
-        """How far deviations take what has these ``responses (Q,)`` to them; 0 of none."""
+        """Return the support value of all deviations in the direction ``responses (Q,)``; 0 without any."""
         return self.loop.deviations.support(responses) if responses else balls([0.0])[0]
 
     def heights(self, parts: Sequence[arb_mat], rows: arb_mat) -> list[arb]:
-        """The largest ``c'u`` for every row ``c`` of ``rows (r, m)`` of a sum of ``parts (m, 1 + Q)`` that deviate
-        apart."""
+        """Return the largest ``c'u`` over all deviations, ``(r,)``, for every row ``c`` of ``rows (r, m)``.
+
+        ``u`` is a sum of ``parts (m, 1 + Q)`` with independent deviations."""
         every = [[row[0] + self.support(row[1:]) for row in (rows * part).tolist()] for part in parts]
         return [sum(heights[1:], heights[0]) for heights in zip(*every, strict=True)]
 
     def sizes(self, rows: Array) -> Array:
-        """Return the largest ``|c'x|`` at the breakpoints of the grid under any deviation, ``(k,)`` of ``rows (k, d)``,
-        never too large."""
+        """Return the largest ``|c'x|`` at the breakpoints of the grid under any deviation, ``(k,)``, never too large.
+
+        The coefficients are ``rows (k, d)``."""
         found = np.zeros(len(rows))
         for node in self.loop.nodes:
             for sign in (1.0, -1.0):
@@ -155,8 +171,9 @@ class VerifiedFeedback:
         return np.asarray(np.where(np.isfinite(found), found, 0.0))
 
     def added(self, state: int) -> float:
-        """The size of the numbers that are added up in a state at the end: of what the system does without control, and
-        with it, and of what deviations add to both."""
+        """Return the size of the numbers that are added up to a state at the end.
+
+        They are the state without control, the state with it, and what deviations add to both."""
         total = 0.0
         for loop in (self.loop_at_rest, self.loop):
             first, *responses = (float(abs(x).upper()) for x in loop.nodes[-1].tolist()[state])
@@ -164,8 +181,10 @@ class VerifiedFeedback:
         return total
 
     def cost(self) -> arb:
-        """The cost of the control; where absolute values are charged as an effort, the written one, which is shown to
-        be none too small."""
+        """Return the cost of the control as a ball.
+
+        With the cost ``worst`` it is the written cost; raise `Broken` or `Unchecked` where that is not shown to be
+        large enough, up to rounding."""
         case, total = self.case, ball(0)
         if case.charge not in (PEAK, WORST):
             return case.price.of(case.pieces)
@@ -184,7 +203,7 @@ class VerifiedFeedback:
         return total + squares
 
     def _effort(self, limit: arb) -> None:
-        """Show that no deviation causes an effort beyond a limit."""
+        """Raise `Broken` or `Unchecked` unless it is shown that no deviation causes an effort beyond ``limit``."""
         case, loop = self.case, self.loop
         a, A = [], []
         for k, costs in enumerate(case.price.costs):
@@ -197,11 +216,18 @@ class VerifiedFeedback:
         at_most(a, A, deviations.support, reach, limit, case.clock)
 
     def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
-        """At most what gains, and peaks or an effort that are charged, add to the sum of ``rows`` times their
-        multipliers; 0 where nothing is answered.
+        """Return a lower bound of what gains, and charged peaks or an effort, add to the sum of weighted ``rows``.
 
-        Of peaks and of the effort only how far the set of the control lets them go is used; of the gains that the
-        control that they cause is no wider than its set, ``h(F_kl) + h(-F_kl) <= width`` summed over the blocks ``l``.
+        It is 0 where nothing is answered. Peaks and the effort are bounded by the set of the control alone. Of the
+        gains it is used that the control that they cause is no wider than its set: ``h(F_kl) + h(-F_kl) <= width``,
+        summed over the blocks ``l``.
+
+        Parameters
+        ----------
+        rows
+            The multipliers with their constraints.
+        priced
+            Whether the cost is part of the sum.
         """
         case, total, most = self.case, ball(0), ball(0)
         for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
@@ -218,12 +244,15 @@ class VerifiedFeedback:
 
     @cached_property
     def _gains_bound(self) -> GainsBound:
+        """The bound of how far all gains together can lower a weighted sum of constraints."""
         return GainsBound(self.loop_at_rest, self.case.answers, self.case.problem.control)
 
     @cached_property
     def loop_at_rest(self) -> VerifiedLoop:
-        """The same system without any control; of measurable disturbances under some of them, that jump often enough to
-        push the state wherever any do."""
+        """The system without any control.
+
+        Measurable disturbances are replaced by some of them, which jump often enough to move the state in every
+        direction in which any of them does."""
         case = self.case
         if not case.measurable:
             return self._resting(None)
@@ -232,17 +261,30 @@ class VerifiedFeedback:
         return self._resting([float(t) for a, b in ends for t in a + parts * (b - a)])
 
     def _resting(self, changes: list[float] | None) -> VerifiedLoop:
+        """Return the system without any control, under disturbances that jump at ``changes``."""
         return self._loop(self._still, self._none, changes)
 
     @property
     def _still(self) -> list[arb_mat]:
-        """No control on every piece."""
+        """The control 0 on every piece."""
         none = stacked([balls([0.0])] * self.case.problem.system.controls)
         return [none] * self.case.control.pieces
 
     def named(self, entry: Mapping[str, Any], name: str) -> NamedDeviations:
-        """The deviations that an entry of a certificate names, under measurable disturbances of one that jumps where it
-        says."""
+        """Return the deviations that an entry of a certificate names.
+
+        Parameters
+        ----------
+        entry
+            The entry. With measurable disturbances it also says at which ``changes`` its disturbance jumps.
+        name
+            The name of its constraint, for messages.
+
+        Raises
+        ------
+        Broken
+            Where a deviation is not shown to be in its set, or the times are not increasing from 0 to before the end.
+        """
         loop = self.loop_at_rest
         if self.case.measurable:
             changes = numbers(entry.get("changes"), f"{name}: changes")
@@ -254,8 +296,10 @@ class VerifiedFeedback:
         return NamedDeviations(self.case, loop, _deviations(self.case, loop, entry, name))
 
     def following(self, named: NamedDeviations, entry: Mapping[str, Any], name: str) -> NamedDeviations:
-        """The deviations across the seam of a plan that repeats: no disturbance yet, and the initial state of the next
-        period that an entry names, which must be in its set; none where there is one initial state."""
+        """Return the deviations that the first control of the next period answers, in a plan that repeats.
+
+        No disturbance has acted yet. The entry names the ``following`` deviation ``(d,)`` of the next initial state;
+        there is none where only one initial state exists. Raise `Broken` where it is not shown to be in its set."""
         calm = named.loop.deviations.rests[: named.loop.deviations.begun]
         if self.case.problem.initial_set is None:
             return NamedDeviations(self.case, named.loop, calm)
@@ -270,7 +314,7 @@ class VerifiedFeedback:
 
 
 def commanded(case: Case, name: str) -> ConvexSet | None:
-    """The set that a constraint of that name keeps the control, or its changes, in; ``None`` for one of the state."""
+    """Return the set in which the named constraint keeps the control or its steps; ``None`` for one on the state."""
     if any(window.name == name for window in case.windows):
         return None
     return {case.of_control: case.problem.control, STEP: case.problem.control_step}.get(name)
@@ -278,29 +322,31 @@ def commanded(case: Case, name: str) -> ConvexSet | None:
 
 @lru_cache(maxsize=2)
 def feedback_of(case: Case) -> VerifiedFeedback:
-    """What the control of a case answers, made once."""
+    """Return the answers of the control of a case, which are made once."""
     return VerifiedFeedback(case)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class NamedDeviations:
-    """Deviations ``z`` from their middles, block by block, under which the system of ``loop`` is at rest."""
+    """Deviations ``z`` from the middles of their sets, one list of balls per block, in a ``loop`` without control."""
 
     case: Case
     loop: VerifiedLoop
     z: list[list[arb]]
 
     def of(self, rows: Sequence[list[arb]]) -> list[arb]:
-        """What is nominal and has responses, ``(1 + Q,)`` each, under these deviations."""
+        """Return the values of ``rows`` under these deviations, each a nominal value and responses, ``(1 + Q,)``."""
         every = [x for block in self.z for x in block]
         return [sum((a * b for a, b in zip(row[1:], every, strict=True)), row[0]) for row in rows]
 
     @property
     def innovations(self) -> list[list[arb]]:
-        """What is seen of them at every breakpoint, ``(K, p)``, beside what is seen of points of their sets next to the
-        middles: differences of points of a set without an interior are in its span, those from a middle that was
-        rounded are not. The nominal control stands for that under these points."""
+        """The innovations at every breakpoint, ``(K, p)``, less those under points of the sets next to the middles.
+
+        A rounded middle may lie outside of a set without an interior. Differences of two points of such a set lie in
+        its span; differences from the rounded middle do not. The nominal control includes the answers under these
+        points."""
         pairs = zip(self.z, self.loop.deviations.rests, strict=True)
         z = [
             [ball(0)] * len(mine) if mine is rest else [x - r for x, r in zip(mine, rest, strict=True)]
@@ -315,7 +361,7 @@ class NamedDeviations:
         ]
 
     def given(self, direction: Array, time: float) -> arb:
-        """What the disturbance and the initial state give to ``c'x(t)`` where no control answers them."""
+        """Return the contribution of disturbance and initial state to ``c'x(t)``, ``c (d,)``, without control."""
         case, loop = self.case, self.loop
         weights = case.duality.pushed(direction, time, loop.changes)
         parts, of = [*zip(loop.deviations.sets, self.z, strict=True)], loop.deviations
@@ -332,8 +378,12 @@ class NamedDeviations:
 
 
 def _deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
-    """The deviations, block by block, of the ``disturbance (mw, blocks)``, of the ``noise (K, p)`` and of the initial
-    state, ``deviation (d,)`` from its centre, that an entry names, which must be in their sets."""
+    """Return the deviations from the middles that an entry names, block by block; raise `Broken` unless each is in its
+    set.
+
+    A point that rounding took out of a thin set is replaced by one of the set next to it. The entry holds the
+    ``disturbance (mw, blocks)``, the ``noise (K, p)`` and the ``deviation (d,)`` of the initial state from its
+    centre."""
     from flint import arb
 
     points, of = list[Array](), loop.deviations
