@@ -1,14 +1,16 @@
-"""The claim against every causal policy, derived anew in balls from signals and multipliers alone.
+"""The lower bound of the cost of every causal policy, derived anew in balls from signals and multipliers alone.
 
-A control on piece ``k`` depends on the disturbance before ``tau_k`` only, or before the last measurement that is known
-by then, whatever is measured: it is one vector for all signals that agree until then. Of outputs with a noise it
-depends on these alone: a signal comes with its outputs beside the nominal ones, as exact numbers, and with the noise
-that makes up what its disturbance and its initial state leave of them, which is derived in balls and must be proven to
-be in its set. Then the control is one vector for all signals whose known outputs are the same numbers: piece by piece,
-since with the same controls so far the same outputs follow. So a weighted sum of constraints under the signals is, for
-every causal policy, at least what the least of every such vector over the set of the control leaves, its part of the
-cost included.
-"""
+A control on piece ``k`` depends only on the disturbance before ``tau_k``, or before the last measurement that is known
+by then, whatever is measured. So it is one vector for all signals that agree until then.
+
+Where outputs with noise are measured, a control depends on these alone. Each signal then names its outputs relative to
+the nominal ones, as exact numbers. The noise is the difference between these outputs and the effect of the signal's
+disturbance and initial state. It is derived in balls and must be proven to be in its set. The control is one vector for
+all signals whose known outputs are the same numbers. This holds piece by piece, since the same controls so far lead to
+the same outputs.
+
+So for every causal policy a weighted sum of constraints under the signals has a lower bound. It is the constant part of
+the sum, plus the minimum over each such vector in the set of the control, with the vector's part of the cost."""
 
 from __future__ import annotations
 
@@ -30,24 +32,46 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-MOST = 100_000  # multipliers
+MOST = 100_000  # multipliers that are checked
 Pushed: TypeAlias = (
-    "tuple[ConstraintRow, list[list[arb]], list[arb]]"  # a row, what disturbance and initial state give to it
+    "tuple[ConstraintRow, list[list[arb]], list[arb]]"  # a row, its weights of the disturbance and the initial state
 )
 Rows: TypeAlias = dict[tuple[str, float, bytes], Pushed]
-SHARE = 1.0 - 2.0**-40  # of a price, that is shared: so that rounding does not share more than there is
+SHARE = 1.0 - 2.0**-40  # of a price is shared, so that rounding does not share more than the price
 
 
 def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
-    """What every causal policy costs at least; not ``priced``: by how much it misses the weighted sum of the
-    constraints at least, which proves that there is none where it is positive."""
+    """Return the lower bound that signals and multipliers prove for every causal policy.
+
+    Parameters
+    ----------
+    case
+        The case.
+    data
+        The ``causal`` entry of a certificate.
+    priced
+        Whether the bound is one of the cost. Otherwise it is one of the weighted sum of the constraints; where it is
+        positive, no causal policy exists.
+
+    Returns
+    -------
+    arb
+        A ball; its lower end is the bound.
+
+    Raises
+    ------
+    Broken
+        Where an entry is malformed, or a signal is not shown to be admissible.
+    Unchecked
+        For problems whose causal policies the checker does not bound.
+    """
     _refuse(case)
     signals, rest = _signals(case, data), middle_of(case)
     K, m, total = case.control.pieces, case.problem.system.controls, ball(0)
     changes = case.disturbances.changes or []
     points, measured = case.control.breakpoints, case.problem.measurements
     known_last = points[:-1] if measured is None else measured.latest(points)
-    seen = [bisect_left(changes, float(t)) for t in known_last]  # blocks that began before what is known was measured
+    seen = [bisect_left(changes, float(t)) for t in known_last]  # blocks that begin before the last known measurement
     reports, begun = signals, None
     if measured is not None and "outputs" in data:
         seen = measured.known(points).sum(axis=1).tolist()
@@ -82,7 +106,9 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
 
 
 def _shares(data: Mapping[str, Any], count: int) -> list[arb]:
-    """How much the effort under every signal counts: a mean of these is at most the largest."""
+    """Return the weights of the efforts under the signals; their weighted sum is at most the largest effort.
+
+    Raise `Broken` unless no weight is negative and their sum is at most 1."""
     found = numbers(data.get("shares", []), "causal: shares")
     if found.shape != (count,) or not (found >= 0.0).all():
         raise Broken(f"causal: expected shares of {count} signals, not below 0")
@@ -93,6 +119,7 @@ def _shares(data: Mapping[str, Any], count: int) -> list[arb]:
 
 
 def _refuse(case: Case) -> None:
+    """Raise `Unchecked` for problems whose causal policies the checker does not bound."""
     if case.policy is None or case.problem.system.parameter_count or not case.problem.cost.is_linear:
         raise Unchecked("the checker bounds causal policies of known systems, with the cost of an L1 norm, only")
     if not case.control.is_indicators:
@@ -100,7 +127,9 @@ def _refuse(case: Case) -> None:
 
 
 def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, Pushed]:
-    """The multiplier of an entry, its signal, and the constraint that it names, with what the disturbance gives."""
+    """Return the multiplier of an entry, the number of its signal, and its constraint.
+
+    With the constraint come the weights of the disturbance and of the initial state in it."""
     if not isinstance(entry, Mapping):
         raise Broken("causal: expected a signal, a constraint, a time, a direction and a number each")
     name, time, y = str(entry.get("constraint")), number(entry, "time"), number(entry, "multiplier")
@@ -131,7 +160,7 @@ def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, in
 
 
 def middle_of(case: Case) -> Array:
-    """The nominal signal ``(mw, blocks)``: the middle of its set throughout."""
+    """Return the nominal signal ``(mw, blocks)``, which is the middle of the set of disturbances throughout."""
     shape = case.problem.disturbance
     if shape is None:
         return np.zeros((0, 0))
@@ -139,11 +168,12 @@ def middle_of(case: Case) -> Array:
 
 
 def _until(signal: Array, blocks: int) -> bytes:
+    """Return the first ``blocks`` columns of a signal as bytes, which are equal for equal numbers."""
     return np.ascontiguousarray(signal[:, :blocks] + 0.0).tobytes()
 
 
 def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
-    """The signals ``(mw, blocks)``, which must be in the set of the disturbance."""
+    """Return the signals ``(mw, blocks)``; raise `Broken` unless all are shown to be in the set of disturbances."""
     found, shape = [], case.problem.disturbance
     for said in listed(data, "signals"):
         case.clock.check()
@@ -162,8 +192,9 @@ def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
 
 
 def _begun(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
-    """By how much the initial state of every signal is beside the middle of its set, in which it must be; nothing
-    where there is no set."""
+    """Return for every signal the deviation ``(d,)`` of its initial state from the middle of the set.
+
+    It is empty where there is no set. Raise `Broken` unless every initial state is shown to be in the set."""
     shape, told = case.problem.initial_set, listed(data, "initial_states")
     if len(told) != count:
         raise Broken(f"causal: {len(told)} initial states of {count} signals")
@@ -181,8 +212,10 @@ def _begun(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
 def _outputs(
     case: Case, data: Mapping[str, Any], signals: list[Array], begun: list[list[arb]], known_at_all: int
 ) -> list[Array]:
-    """The outputs ``(p, K)`` under every signal beside the nominal ones. The noise that makes up for what is left of
-    each must be in its set, as far as anybody knows of it."""
+    """Return the outputs ``(p, K)`` under every signal, relative to the nominal ones.
+
+    The remaining difference of each output must be a noise of the set, at the first ``known_at_all`` breakpoints; later
+    outputs are known to no control."""
     measured, told, times = case.problem.measurements, listed(data, "outputs"), case.control.breakpoints
     assert measured is not None
     C, K = np.asarray(measured.C, dtype=float), case.control.pieces
@@ -211,8 +244,10 @@ def _outputs(
 
 
 def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[bytes, arb], priced: bool) -> arb:
-    """The least that the controls on one piece can cost and give to the weighted sum, those of every group of signals
-    together; ``counts``: how much of the price a group pays; that of a peak is shared among all."""
+    """Return a lower bound of what the controls on one piece contribute to the weighted sum and the cost.
+
+    The controls of each group of signals are one vector with the slope ``groups[key]``. ``counts`` says which part of
+    the price a group pays; the price of a peak is shared among all groups."""
     m, control = case.problem.system.controls, case.problem.control
     prices = case.price.costs[k] if priced else [ball(0)] * m
     total, zero = ball(0), [ball(0)] * m
@@ -225,8 +260,9 @@ def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[b
 
 
 def _shared(case: Case, prices: list[arb], groups: dict[bytes, list[arb]]) -> dict[bytes, list[arb]]:
-    """The price of a channel's peak, parted among the groups as far as the control can give: ``max_g |u_g|`` is at
-    least every mean of ``|u_g|``."""
+    """Return the part of the price of a channel's peak that each group pays, as far as it can lower its slope.
+
+    The sum of the parts is at most the price, since ``max_g |u_g|`` is at least every mean of ``|u_g|``."""
     shares = {key: [ball(0)] * len(prices) for key in groups}
     for i, price in enumerate(prices):
         axis = [ball(j == i) for j in range(len(prices))]
