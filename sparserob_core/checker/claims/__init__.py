@@ -1,1 +1,1 @@
-"""What a run claims, one claim after another."""
+"""The claims of a run, checked one after another."""

@@ -1,4 +1,4 @@
-"""A run as the checker sees it: the problem's records, and the certificate."""
+"""A run as the checker sees it: the records of the problem, and the certificate."""
 
 from __future__ import annotations
 
@@ -47,11 +47,12 @@ EQUALS, STEP = "equals", "control_step"
 @final
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What is checked: a certificate (plain data) against a problem on its two dictionaries; what it integrates, and
-    what parameters add beside the time, is made states of it here, once, for every claim; ``given`` is the problem
-    before that, where there is another one. ``counts``: its cost is
-    the time that the control acts, which may take the values ``letters`` only where there are any; ``policy``: the
-    control answers what it measures."""
+    """A certificate, as plain data, and the problem that it is checked against, on the problem's two dictionaries.
+
+    ``given`` is the problem as it was given. In ``problem`` its integrals, and its parameters other than the time, are
+    made states, once for every claim. ``counts`` says that the cost is the time that the control acts. The control may
+    then take the values ``letters`` only, where there are any. With a ``policy`` the control answers what it measures.
+    ``clock`` says when to stop."""
 
     problem: OptimalControlProblem
     control: Dictionary
@@ -78,7 +79,7 @@ class Case:
             object.__setattr__(self, "problem", known_by)
             object.__setattr__(self, "disturbance", joint)
         if self.policy is not None and self.control.functions == self.control.pieces:
-            # as many functions as pieces, which are independent, make all controls on these: what is written are values
+            # as many independent functions as pieces make every control on these; the certificate writes its values
             object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))
 
     @property
@@ -88,7 +89,7 @@ class Case:
 
     @cached_property
     def of_control(self) -> str:
-        """What the control's own set is called: ``rate`` where a constraint on the path is called ``control``."""
+        """The name of the control's own set: ``rate`` where a constraint on the path is called ``control``."""
         return "rate" if any(window.name == "control" for window in self.windows) else "control"
 
     @cached_property
@@ -98,12 +99,12 @@ class Case:
 
     @property
     def answering(self) -> bool:
-        """Whether the control answers what it measures."""
+        """True where the control answers what it measures."""
         return self.policy is not None
 
     @property
     def charge(self) -> Cost:
-        """Which cost the policy is charged; that of the nominal control where there is none."""
+        """The kind of cost that the policy is charged; ``nominal``, that of the nominal control, without a policy."""
         return "nominal" if self.policy is None else self.policy.charge.cost
 
     @cached_property
@@ -119,17 +120,19 @@ class Case:
 
     @cached_property
     def returned(self) -> list[ConstraintWindow]:
-        """Of a plan that repeats, that every final state is one of the initial states, where there is more than one of
-        a coordinate; for every corner of parameters beside the time where these states are in a curved set."""
+        """The constraints that every final state of a plan that repeats is one of the initial states.
+
+        There are none where the set of initial states is one point. A curved set has one for every corner of the
+        parameters that were made states."""
         return [_window(self.problem, entry, RETURN) for entry in self.problem.windows if isinstance(entry, Return)]
 
     @property
     def equalities(self) -> list[tuple[int, float]]:
-        """The states that are fixed at the end, and at what."""
+        """The states that are fixed at the end, each with its value."""
         return [(int(i), float(end.values[i])) for end in self.problem.terminal_equalities for i in end.fixed]
 
     def window(self, name: str) -> ConstraintWindow:
-        """The constraint of that name."""
+        """Return the constraint of that name; raise `Broken` where there is none."""
         found = [window for window in self.windows if window.name == name]
         if not found:
             raise Broken(f"the problem has no constraint {name!r}")
@@ -137,18 +140,18 @@ class Case:
 
     @property
     def measurable(self) -> bool:
-        """Whether there are measurable disturbances."""
+        """True where there are measurable disturbances."""
         return self.problem.measurable is not None
 
     @cached_property
     def timing(self) -> Timing:
-        """The times at which something begins to act."""
+        """The times at which an input may begin to act."""
         ends = self.control.breakpoints, self.disturbance.breakpoints
         return Timing(self.problem, *ends, self.answering, self.clock)
 
     @cached_property
     def disturbances(self) -> Disturbances:
-        """What is known of the disturbances on the pieces of their dictionary."""
+        """The disturbances on the pieces of their dictionary."""
         return Disturbances(self.problem, self.disturbance, self.timing)
 
     @cached_property
@@ -158,13 +161,13 @@ class Case:
 
     @cached_property
     def sources(self) -> Sources:
-        """What enters at any time, by its size alone."""
+        """The inputs that act at any time and of which only the size is known."""
         pieces = lambda: [] if self.certificate.get("decision") is None else self.pieces  # noqa: E731
         return Sources(self.problem, self.timing, self.flows, pieces, self.followed.still is not None)
 
     @cached_property
     def flows(self) -> VerifiedFlows:
-        """The flows of the system, over boxes of its parameters and at single ones."""
+        """The flows of the system, over boxes of its parameters and at single parameters."""
         return VerifiedFlows.of(self.problem.system, self.timing.until)
 
     @cached_property
@@ -183,8 +186,9 @@ class Case:
         return self.on_pieces(self.theta)
 
     def on_pieces(self, coefficients: Array) -> list[arb_mat]:
-        """A control ``(m, 1)`` on every piece of its dictionary, from coefficients ``(m, N)``; equal ones are one
-        object."""
+        """Return the control ``(m, 1)`` on every piece of its dictionary, from its coefficients ``(m, N)``.
+
+        Equal values are one object."""
         from flint import arb, arb_mat
 
         if self.control.is_indicators:
@@ -229,8 +233,17 @@ class Case:
     def beside(
         self, window: ConstraintWindow, basis: Array, gains: Array, parameter: Sequence[float] | None = None
     ) -> Beside | None:
-        """What stands beside the state in the rows of a constraint, at one parameter where it is given; ``None``:
-        nothing."""
+        """Return the terms that are added to the state in the rows of a constraint, or ``None`` where there are none.
+
+        Parameters
+        ----------
+        window
+            The constraint.
+        basis, gains
+            The vectors that rows are combinations of: ``(b, d)`` on the state, ``(b, m)`` on the control.
+        parameter
+            The parameter ``(nu,)`` at which the terms are taken; by default all parameters.
+        """
         entering = self.sources.entering(parameter)
         if window.reference is None and not window.is_mixed and not entering:
             return None
@@ -245,20 +258,20 @@ class Case:
 
     @cached_property
     def duality(self) -> Duality:
-        """What lower bounds are derived from."""
+        """The data that lower bounds are derived from."""
         given = self.disturbances
         return Duality(self.problem, self.control, given.changes, self.flows, given.held, given.lasting)
 
 
 def _window(problem: OptimalControlProblem, entry: PathConstraint | MixedConstraint, name: str) -> ConstraintWindow:
-    """One entry of a problem, under its own name where it has one."""
+    """Return the constraint of one entry of a problem, under the entry's own name where it has one."""
     stop = problem.horizon if entry.stop is None else entry.stop
     moved = None if entry.relative_to is None else np.asarray(entry.relative_to)
     return ConstraintWindow(entry.name or name, entry.set, entry.start, stop, problem.system.states, moved)
 
 
 def numbers(data: object, name: str) -> Array:
-    """Finite numbers from the certificate; raises `Broken` where they are none."""
+    """Return finite numbers from the certificate; raise `Broken` where the data are something else."""
     if not _numeric(data):
         raise Broken(f"{name}: expected numbers")
     try:
@@ -271,7 +284,19 @@ def numbers(data: object, name: str) -> Array:
 
 
 def shaped(data: Mapping[str, Any], key: str, shape: tuple[int, ...], whose: str = "") -> Array:
-    """Finite numbers of one shape under a key of a certificate; ``whose``: of which entry that is, in words."""
+    """Return finite numbers of one shape from the certificate; raise `Broken` where they are something else.
+
+    Parameters
+    ----------
+    data
+        The part of the certificate that holds them.
+    key
+        Their key.
+    shape
+        The expected shape.
+    whose
+        The name of their entry, which precedes the key in messages.
+    """
     found = numbers(data.get(key), f"{whose}{key}")
     if found.shape != shape:
         raise Broken(f"{whose}{key}: shape {found.shape}, expected {shape}")
@@ -279,7 +304,7 @@ def shaped(data: Mapping[str, Any], key: str, shape: tuple[int, ...], whose: str
 
 
 def _numeric(data: object) -> bool:
-    """Whether that is a number, or lists of them: text and truth values are none."""
+    """Return whether the data are a number or nested lists of numbers; text and truth values are none."""
     level: list[object] = [data]
     while level:
         kinds = set(map(type, level))
@@ -290,8 +315,20 @@ def _numeric(data: object) -> bool:
 
 
 def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy:
-    """What a certificate says of its policy: the cost that it is charged, and the ranges of breakpoints that each of
-    the ``pieces`` answers; raises `Broken` where that is no such thing."""
+    """Return the policy that a certificate describes: the cost that it is charged, and what each piece answers.
+
+    Parameters
+    ----------
+    certificate
+        The certificate, whose ``policy`` has the ranges of breakpoints for every piece.
+    pieces
+        The number of pieces of the control.
+
+    Raises
+    ------
+    Broken
+        Where the certificate describes no such policy.
+    """
     data = certificate.get("policy")
     if not isinstance(data, Mapping):
         raise Broken("policy: expected a cost, and the breakpoints that every piece answers")
@@ -314,7 +351,7 @@ def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy
 
 
 def number(data: Mapping[str, Any], name: str) -> float:
-    """One finite number of the certificate."""
+    """Return one finite number of the certificate; raise `Broken` where there is none."""
     value = numbers(data.get(name), name)
     if value.shape != ():
         raise Broken(f"{name}: expected a number")
@@ -322,7 +359,7 @@ def number(data: Mapping[str, Any], name: str) -> float:
 
 
 def listed(data: Mapping[str, Any], name: str) -> Sequence[Any]:
-    """One list of the certificate."""
+    """Return one list of the certificate; raise `Broken` where there is none."""
     value = data.get(name)
     if not isinstance(value, list):
         raise Broken(f"{name}: expected a list")

@@ -55,7 +55,7 @@ class ConstraintWindow:
 
     @property
     def is_mixed(self) -> bool:
-        """Whether the constraint includes the control."""
+        """True where the constraint includes the control."""
         return self.shape.dimension > self.states
 
     def split(self, direction: Array) -> tuple[Array, Array]:
