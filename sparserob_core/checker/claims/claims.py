@@ -1,4 +1,4 @@
-"""What a certificate claims, each claim derived anew from the problem's data in ball arithmetic."""
+"""The claims of a certificate, each derived anew from the problem's data in ball arithmetic."""
 
 from __future__ import annotations
 
@@ -37,17 +37,25 @@ if TYPE_CHECKING:
 
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
-VARYING = 96  # more bits for a tree of products, in each level of which balls grow; half of it shows after ten orbits
-SMALL_COST = 1e-6  # of what is added up to a cost: a gap is relative to at least so much
-SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
-# Of a cost, or of 1, by which a lower bound that is derived may be above it: what is excused of constraints lets it be,
-# by their multipliers. More is a contradiction between two proofs, of which one is wrong.
+VARYING = 96  # further bits for trees of products, where radii grow at each level; half of it shows after ten orbits
+SMALL_COST = 1e-6  # share of what is added up to a cost; a gap is relative to at least this share
+SMALL_GAP = 1e-11  # a gap that was closed may open by the rounding error that is subtracted from the lower bound
+# Share of what is added up to a cost, or of 1, by which a derived lower bound may exceed the cost: excused violations
+# allow that, by their multipliers. A larger excess is a contradiction between two proofs, of which one is wrong.
 CONTRADICTION = 1e-4
 ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
 
 
 def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
-    """One verdict per claim of the certificate; nothing that the file says is believed."""
+    """Return one verdict per claim of the certificate; nothing that the file says is believed.
+
+    Parameters
+    ----------
+    case
+        The certificate with its problem.
+    gap_tolerance
+        The relative gap up to which a control is certified by the config; ``None`` where the config names none.
+    """
     from flint import ctx
 
     status = case.certificate.get("status")
@@ -81,8 +89,9 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
 
 
 def derived_bound(case: Case) -> float:
-    """The lower bound of the cost that the certificate's multipliers prove, rounded downwards; raises `Unchecked` and
-    `Broken` where there is none."""
+    """Return the lower bound of the cost that the certificate's multipliers prove, rounded down.
+
+    Raise `Broken` or `Unchecked` where they prove none."""
     from flint import ctx
 
     with ctx.workprec(precision_of(case)):
@@ -90,8 +99,22 @@ def derived_bound(case: Case) -> float:
 
 
 def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> float:
-    """What every causal policy costs at least, by these signals and multipliers, rounded downwards; not ``priced``: by
-    how much it misses their sum. Raises `Unchecked` and `Broken` where there is none."""
+    """Return the lower bound that signals and multipliers prove for every causal policy, rounded down.
+
+    Parameters
+    ----------
+    case
+        The certificate with its problem.
+    data
+        An entry ``causal`` of a certificate.
+    priced
+        Whether the bound is one of the cost, otherwise of the weighted sum of the constraints.
+
+    Raises
+    ------
+    Broken, Unchecked
+        Where the signals and multipliers prove no bound.
+    """
     from flint import ctx
 
     from sparserob_core.checker.claims.causal import causal_bound
@@ -101,8 +124,10 @@ def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> f
 
 
 def precision_of(case: Case) -> int:
-    """Bits of a number. The exponential of a matrix is enclosed in a norm, so that its smallest entries need as many
-    more bits as the system's numbers differ by, in the units that the user chose."""
+    """Return the bits of a number that the claims of a case need.
+
+    The exponential of a matrix is enclosed in a norm. Its smallest entries need more bits, as many as the system's
+    numbers differ by in the units that the user chose."""
     problem = case.problem
     parameters = problem.system.parameters
     middle = np.zeros((1, 0)) if parameters is None else parameters.interior_point()[None]
@@ -110,7 +135,7 @@ def precision_of(case: Case) -> int:
         parts = [part for mode in problem.system.modes for part in mode.matrices(middle)]
     except InputError:  # not finite there
         return PRECISION
-    with np.errstate(over="ignore"):  # what is not finite does not count
+    with np.errstate(over="ignore"):  # numbers that are not finite do not count
         entries = np.concatenate([np.ravel(part) for part in parts]) * problem.horizon
     sizes = np.abs(entries[np.isfinite(entries) & (entries != 0.0)])
     apart = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
@@ -119,8 +144,9 @@ def precision_of(case: Case) -> int:
 
 
 def judged(name: str, derive: Callable[[], str]) -> Finding:
-    """The verdict of a derivation that returns a sentence or raises. Where a number of floats overflows nothing is
-    derived: what it is compared with would pass, were it not a number."""
+    """Return the verdict of a derivation that returns a sentence or raises.
+
+    Where floats overflow, the claim is not checked: a comparison with a NaN could pass."""
     try:
         with np.errstate(over="raise", invalid="raise", divide="raise"):
             return Finding(name, "holds", derive())
@@ -135,15 +161,16 @@ def judged(name: str, derive: Callable[[], str]) -> Finding:
 
 
 def _of_status(status: str, found: Finding) -> Finding:
-    """The verdict on a constraint of a control of that status: of one that is not proven it is no claim, whatever a
-    control misses that a run was stopped at."""
+    """Return the verdict on a constraint, given the status of the control.
+
+    A control that is not proven, such as one at which a run was stopped, claims no constraint. So it fails none."""
     if found.verdict != "fails" or status in ("certified", "verified"):
         return found
     return Finding(found.name, "not checked", f"the certificate does not claim it: {found.text}")
 
 
 def _policy(case: Case) -> str:
-    """What is written of the policy, which bounds and gains are about, must be what the problem's policy says."""
+    """Show that the written policy, which bounds and gains are about, is the policy of the problem."""
     written = written_policy(case.certificate, case.control.pieces)
     if written.charge.cost != case.charge:
         raise Broken(f"the cost {written.charge.cost} is written, the config asks for {case.charge}")
@@ -154,14 +181,14 @@ def _policy(case: Case) -> str:
         raise Broken(f"that piece {k + 1} answers breakpoint {j + 1} {does} written, which the config's policy denies")
     told = f"answers {int(case.answers.sum())} of {case.control.pieces * (case.control.pieces + 1) // 2} pairs of a"
     told += f" piece and a measurement before it, and is charged {case.charge}"
-    # what a component that is not loaded would say is not known: bounds are of the policies that are written
+    # a component that is not loaded cannot be asked for its policy: then bounds are about the written policy
     return f"it {told}" + (
         ", as is written; its own component is not loaded" if isinstance(case.policy, WrittenPolicy) else ""
     )
 
 
 def _control(case: Case) -> str:
-    """Every piece of the control in its set."""
+    """Show that every piece of the control is in its set."""
     commands, places = feedback_of(case).commands, dict[int, int]()
     for k, command in enumerate(commands):
         places.setdefault(id(command), k)
@@ -172,8 +199,10 @@ def _control(case: Case) -> str:
 def _in_set(
     case: Case, bound: ConvexSet, places: Sequence[int], parts: Callable[[int], list[arb_mat]], name: str
 ) -> str:
-    """Show that the control on every one of these pieces, or its change to it, is in its set, whatever it answers: it
-    is a sum of ``parts (m, 1 + Q)`` that deviate apart. Figures in words."""
+    """Show that the control on the given pieces, or its change to them, is in its set for all deviations.
+
+    ``parts`` returns matrices ``(m, 1 + Q)`` with independent deviations, whose sum is the control or the change.
+    Return the largest excess in words."""
     shape, feedback, worst, wide = known(bound), feedback_of(case), 0.0, list[int]()
     for k in places:
         case.clock.check()
@@ -197,8 +226,9 @@ def _in_set(
 
 
 def _turned(case: Case, shape: Shape, places: Sequence[int], heights: Callable[[int, arb_mat], list[arb]]) -> float:
-    """Show that what answers is in a curved set on these pieces, in every direction; by how much it leaves it at
-    most."""
+    """Show that what answers deviations is in a curved set on the given pieces, in every direction.
+
+    Return the largest excess that was not excluded, in units of the set."""
     m, times = shape.dimension, case.control.breakpoints.tolist()
     curved = Curved(shape, np.diag(1.0 / np.array(shape.radius)), lambda c, width: 0.0)
     work = list[Work]()
@@ -212,16 +242,20 @@ def _turned(case: Case, shape: Shape, places: Sequence[int], heights: Callable[[
 
 
 def _nominal(part: arb_mat) -> list[arb]:
+    """Return the nominal part ``(m,)``, the first column."""
     return [row[0] for row in part.tolist()]
 
 
 def _without_nominal(part: arb_mat) -> arb_mat:
+    """Return a part ``(m, 1 + Q)`` with 0 in place of its nominal column."""
     return stacked([[row[0] * 0, *row[1:]] for row in part.tolist()])
 
 
 def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
-    """That all constraints hold in every period: every final state is an initial one again, and what holds on one
-    period, the return and the steps across the seam among it, holds."""
+    """Show that all constraints hold in every period of a plan that repeats.
+
+    Every final state is one of the initial states, and the claims about one period hold. Among these are the return and
+    the steps across the seam."""
     if case.certificate.get("repeat") is not True or not case.problem.repeat:
         raise Broken("the certificate and the problem differ about whether the plan repeats")
     if case.problem.system.delay > 0.0:
@@ -247,19 +281,19 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
 
 
 def _strictly(case: Case, window: ConstraintWindow) -> None:
-    """That what the proof of the return allows is still in the set of initial states."""
+    """Raise `Unchecked` unless the set of initial states also holds what the proof of the return excuses."""
     from flint import arb
 
     bound = case.stated.initial_set
     assert bound is not None
     mine, flat = window.seen.facets, known(bound).facets
     if mine is None or flat is None:
-        return  # what is allowed there is a share of the whole set
+        return  # along the gauge a share of the whole set is excused, and the return is proven for a smaller set
     kept, alone = dict[tuple[float, ...], list[arb]](), {*single(case.stated)}
     for c, b in flat:
         if not set(np.flatnonzero(c).tolist()) <= alone:
             kept.setdefault(tuple(c.tolist()), []).append(b)
-    own = [tuple(c[: bound.dimension].tolist()) for c, _ in mine]  # one at every corner of parameters beside the time
+    own = [tuple(c[: bound.dimension].tolist()) for c, _ in mine]  # once for each corner of parameters made states
     if {*own} != kept.keys():
         raise Unchecked("the sides of the set of initial states are not told apart")
     for normal, (_, within), unit in zip(own, mine, units_of(case, window).rows.tolist(), strict=True):
@@ -271,7 +305,7 @@ def _strictly(case: Case, window: ConstraintWindow) -> None:
 
 
 def _steps(case: Case) -> str:
-    """Every change of the control from piece to piece in its set."""
+    """Show that every step of the control from piece to piece is in its set."""
     bound, found = case.problem.control_step, steps(case.problem, case.control)
     assert bound is not None
     return (
@@ -280,6 +314,7 @@ def _steps(case: Case) -> str:
 
 
 def _cost(case: Case) -> str:
+    """Show that the written cost is the cost of the control."""
     if case.counts:
         return _counted(case)
     derived = feedback_of(case).cost()
@@ -288,12 +323,14 @@ def _cost(case: Case) -> str:
 
 
 def _effort(case: Case) -> str:
-    """The unit of the cost, with a space before it, where it is known."""
+    """Return the unit of the cost after a space; an empty string where it is not known."""
     return f" {unit}" if (unit := case.problem.cost_unit) else ""
 
 
 def _counted(case: Case) -> str:
-    """The time that the control acts, the cost J beside it, and its letters."""
+    """Show that the written time of action and the written cost ``J`` are those of the control.
+
+    Where there is an alphabet, its letters must be the only values of the control."""
     acted, total = activity.acted(case), activity.largest(case)
     _agrees("cost", number(case.certificate, "cost"), ball(acted * total), 0.0)
     derived = case.price.of(case.pieces)
@@ -310,13 +347,14 @@ def _counted(case: Case) -> str:
 
 
 def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
+    """Raise `Broken` unless a written figure is the derived one, to `FIGURES` of the larger of it and ``scale``."""
     off = abs(ball(written) - derived)
     if not off <= ball(FIGURES) * ball(scale).max(abs(derived)):
         raise Broken(f"{name}: {written!r} is written, {float(derived)!r} is derived")
 
 
 def _fewest(case: Case, status: str) -> str:
-    """Between what the least share of time lies that an admissible control must act."""
+    """Show the bounds that the certificate claims of the least share of time that an admissible control must act."""
     data = case.certificate["fewest_active"]
     if not isinstance(data, Mapping):
         raise Broken("fewest_active: expected lower, upper and multipliers")
@@ -347,13 +385,13 @@ def _fewest(case: Case, status: str) -> str:
 
 
 def _at_least(case: Case, share: float) -> str:
-    """How little an admissible control acts, in the words of a run."""
+    """Return the least share of time that an admissible control acts, in the words of a run."""
     mean = ", the mean over its channels" if case.problem.system.controls > 1 else ""
     return f"every admissible control acts at least {share:.1%} of the time{mean}"
 
 
 def _other(case: Case, data: Mapping[str, Any]) -> Case:
-    """Another control that the certificate offers, which is admissible too and acts less; or the case itself."""
+    """Return the case with another control that the certificate offers, shown to be admissible, or the case itself."""
     if data.get("decision") is None:
         return case
     said = {name: data.get(name) for name in ("decision", "proof")}
@@ -367,6 +405,7 @@ def _other(case: Case, data: Mapping[str, Any]) -> Case:
 
 
 def _lower(case: Case) -> str:
+    """Show that no admissible control costs less than the written lower bound."""
     if case.certificate.get("multipliers") is None and case.certificate.get("tree") is None:
         written = number(case.certificate, "lower_bound")
         if written <= 0.0:
@@ -377,7 +416,7 @@ def _lower(case: Case) -> str:
             raise Broken(f"{written!r} is written, the leaves prove {least!r}")
         return f"no control of these acts for less than {written:.9g} {case.problem.names.time}".rstrip()
     written, derived = number(case.certificate, "lower_bound"), multiplied(case, priced=True)
-    if written <= 0.0:  # absolute values, lengths and positive semidefinite squares: no multiplier is needed for that
+    if written <= 0.0:  # absolute values, lengths and semidefinite squares are not negative without a multiplier
         return f"no control costs less than {written:.12g}{_effort(case)}, for no term of the cost is negative"
     if not derived >= written:
         raise Broken(f"{written!r} is written, the multipliers prove {float(derived.lower())!r}")
@@ -389,7 +428,7 @@ def _lower(case: Case) -> str:
 
 
 def _causal(case: Case) -> str:
-    """The bound against every causal policy."""
+    """Show the lower bound of every causal policy, or that no causal policy exists."""
     from sparserob_core.checker.claims.causal import causal_bound
 
     data = case.certificate["causal"]
@@ -408,7 +447,7 @@ def _causal(case: Case) -> str:
 
 
 def _tree(case: Case) -> float:
-    """What the leaves of the certificate's tree prove of the time that a control acts."""
+    """Return the lower bound of the time of action that the leaves of the certificate's tree prove."""
     data = case.certificate.get("tree")
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no tree of parts")
@@ -429,6 +468,7 @@ def _tree(case: Case) -> float:
 
 
 def _infeasible(case: Case) -> str:
+    """Show that no control is feasible."""
     if case.certificate.get("tree") is not None and case.certificate.get("multipliers") is None:
         if not case.counts or _tree(case) < np.inf:
             raise Broken("the leaves of the tree leave some control")
@@ -445,7 +485,7 @@ def _infeasible(case: Case) -> str:
 
 
 def _status(case: Case, status: str, tolerance: float | None, claims: list[Finding]) -> str:
-    """The status must follow from the claims before it."""
+    """Show that the status follows from the claims before it."""
     if status == "undecided":
         return "nothing is claimed beyond the figures above"
     kept = [claim for claim in claims if claim.name not in ("cost", "lower bound", *ASIDE)]
@@ -475,13 +515,17 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
 
 
 def relative_gap(case: Case, cost: float, lower: float) -> float:
-    """The gap relative to the larger of the two bounds, or to a millionth of what is added up to the cost where that is
-    more; 0 where the bounds meet."""
+    """Return the gap between the cost and the lower bound relative to the larger of their absolute values.
+
+    Where a millionth of what is added up to the cost is larger, the gap is relative to that. It is 0 where the bounds
+    meet."""
     return 0.0 if cost <= lower else (cost - lower) / max(abs(cost), abs(lower), SMALL_COST * added_up(case))
 
 
 def added_up(case: Case) -> float:
-    """What is added up to the cost that is claimed: the cost itself, but where the quadratic terms of one cancel."""
+    """Return the size of the numbers that are added up to the claimed cost.
+
+    It is the cost itself, except for quadratic costs, whose terms may cancel."""
     cost = number(case.certificate, "cost")
     if case.counts or not case.price.is_quadratic:
         return abs(cost)
@@ -490,18 +534,20 @@ def added_up(case: Case) -> float:
 
 
 def compared(case: Case) -> float:
-    """What the rounding of a cost is a share of: all products that are added up to it, which may be more than
-    `added_up` where they cancel within the matrix of one term."""
+    """Return the size of the numbers that the rounding error of a cost is relative to.
+
+    All products that are added up to the cost count. They may be more than `added_up` where they cancel within the
+    matrix of one term."""
     return max(added_up(case), 0.0 if case.counts else case.price.terms(case.pieces))
 
 
 def largest_cost(case: Case) -> float:
-    """The largest cost that a control may have, of which earlier versions made the gap a share."""
+    """Return the largest cost that a control may have; earlier versions made the gap relative to it."""
     return activity.largest(case) if case.counts else case.price.largest
 
 
 def _witness(case: Case) -> str:
-    """The state that the witness leads to, and by how much it leaves the constraint."""
+    """Show that the state to which the witness leads violates the constraint by as much as is written."""
     data = case.certificate.get("witness")
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no witness")
@@ -509,11 +555,11 @@ def _witness(case: Case) -> str:
 
 
 def _exceeded(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> str:
-    """A constraint is exceeded by ``over``, as the witness says in a figure that is known up to ``slack``."""
+    """Show that an excess ``over`` is a violation, and agrees with the figure of the witness up to ``slack``."""
     none = excused(case, data, slack)
     if not over > none:
         raise Broken(f"it leads to a violation of {float(over):.3g}, up to {none:.3g} is none")
-    # a figure in doubles is rounded by every step of the state's transition, d + 2 times each; slack is 17 roundings
+    # each step of the state's transition rounds a figure in doubles d + 2 times; the slack stands for 17 roundings
     rounded = slack * max(1.0, len(case.timing.grid) * (case.problem.system.states + 2) / 17.0)
     if abs(float(over) - number(data, "violation")) > 1e-6 * abs(float(over)) + rounded:
         raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over)!r} is derived")
@@ -525,12 +571,12 @@ def _exceeded(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> s
 
 
 def _at(case: Case, time: float) -> str:
-    """A time in words."""
+    """Return a time in words."""
     return f"t = {time:.6g} {case.problem.names.time}".rstrip()
 
 
 def _measured(case: Case, name: str, direction: Array) -> str:
-    """The unit of a row of a constraint with its normal, with a space before it; of a curved set none."""
+    """Return the unit of the row of a constraint with this normal, after a space; an empty string for a curved set."""
     held = {case.of_control: case.problem.control, STEP: case.problem.control_step}
     shape = held[name] if name in held else None if name == EQUALS else case.window(name).shape
     if shape is not None and shape.halfspaces() is None:
