@@ -40,20 +40,10 @@ def acted(case: Case) -> float:
 
 
 def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
-    """Return multipliers of the cost as multipliers of the count, together with those of the pieces.
+    """Return multipliers of the cost as multipliers of the count, with those of the pieces, ``(m, K)`` or ``None``.
 
     Both are divided by the largest absolute value of a channel times the factor ``l1`` of the cost. This is best where
-    all channels have the same largest value; any factor that is not negative gives a valid bound.
-
-    Parameters
-    ----------
-    case
-        The case.
-    rows
-        The multipliers with their constraints.
-    pieces
-        The multipliers ``(m, K)`` of the control's pieces, or ``None``.
-    """
+    all channels have the same largest value; any factor that is not negative gives a valid bound."""
     most = max((max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _ranges(case)), default=1.0)
     most = most * case.problem.cost.l1 or 1.0
     rest = pieces if pieces is None else (np.asarray(pieces, dtype=float) / most).tolist()
@@ -63,17 +53,8 @@ def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
 def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> float:
     """Return the share of time, from 0 to 1, that every admissible control acts at least, by the given multipliers.
 
-    It is a whole number of pieces where all pieces count the same.
-
-    Parameters
-    ----------
-    case
-        The case.
-    rows
-        The multipliers with their constraints.
-    pieces
-        The multipliers ``(m, K)`` of the control's pieces, or ``None``.
-    """
+    ``rows`` are the multipliers with their constraints, ``pieces (m, K)`` those of the control's pieces, if there are
+    any. The share is a whole number of pieces where all pieces count the same."""
     total, slopes = case.duality.summed(rows, pieces)
     ranges = _ranges(case)
     counts = [[ball(c) * length for c in case.price.counts] for length in _lengths(case)]
@@ -193,6 +174,8 @@ ANY: Part = (-np.inf, np.inf, False)
 def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, Any]], Rows]) -> float:
     """Return the time that every control acts at least, by the leaves of a tree of parts of the controls.
 
+    It is infinite where every leaf proves that its part holds no feasible control.
+
     Parameters
     ----------
     case
@@ -201,11 +184,6 @@ def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, An
         The nodes of the tree as the certificate has them, the root first.
     weighted
         Returns the multipliers of a leaf with their constraints.
-
-    Returns
-    -------
-    float
-        The least bound of the leaves; infinite where every leaf proves that its part holds no feasible control.
 
     Raises
     ------

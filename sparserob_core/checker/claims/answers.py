@@ -1,8 +1,8 @@
 """The answers of a control to deviations, derived anew from its gains in ball arithmetic.
 
-This module has the closed loop of the system with the gains, the deviations that a certificate names and the
-innovations that they cause, and the bound of how far all gains together can lower a weighted sum of constraints. A
-control that answers nothing has no deviations here, and no innovations."""
+This module has the closed loop of the system with the gains, the deviations that a certificate names, and their
+innovations. It also bounds how far all gains together can lower a weighted sum of constraints. A control that answers
+nothing has no deviations here, and no innovations."""
 
 from __future__ import annotations
 
@@ -68,8 +68,7 @@ class VerifiedFeedback:
 
     @cached_property
     def observer(self) -> Array | None:
-        """The observer gains ``(K, d, p)`` that make innovations of the outputs; ``None`` where no outputs are
-        answered.
+        """The observer gains ``(K, d, p)`` that make innovations of the outputs; ``None`` without answered outputs.
 
         Any gains that are written are valid."""
         case = self.case
@@ -116,8 +115,7 @@ class VerifiedFeedback:
 
     @cached_property
     def commands(self) -> list[arb_mat]:
-        """The control ``(m, 1)`` on every piece; under feedback ``(m, 1 + Q)``, with its responses to all
-        deviations."""
+        """The control on every piece, ``(m, 1)``; under feedback ``(m, 1 + Q)``, with responses to all deviations."""
         return (
             [self.loop.inputs(k) for k in range(self.case.control.pieces)] if self.case.answering else self.case.pieces
         )
@@ -160,9 +158,7 @@ class VerifiedFeedback:
         return [sum(heights[1:], heights[0]) for heights in zip(*every, strict=True)]
 
     def sizes(self, rows: Array) -> Array:
-        """Return the largest ``|c'x|`` at the breakpoints of the grid under any deviation, ``(k,)``, never too large.
-
-        The coefficients are ``rows (k, d)``."""
+        """Return the largest ``|c'x|`` on the grid under any deviation, for ``rows (k, d)``, never too large."""
         found = np.zeros(len(rows))
         for node in self.loop.nodes:
             for sign in (1.0, -1.0):
@@ -218,17 +214,9 @@ class VerifiedFeedback:
     def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
         """Return a lower bound of what gains, and charged peaks or an effort, add to the sum of weighted ``rows``.
 
-        It is 0 where nothing is answered. Peaks and the effort are bounded by the set of the control alone. Of the
-        gains it is used that the control that they cause is no wider than its set: ``h(F_kl) + h(-F_kl) <= width``,
-        summed over the blocks ``l``.
-
-        Parameters
-        ----------
-        rows
-            The multipliers with their constraints.
-        priced
-            Whether the cost is part of the sum.
-        """
+        It is 0 where nothing is answered. ``priced`` says whether the cost is part of the sum. Peaks and the effort are
+        bounded by the set of the control alone. For the gains, the control that they cause is no wider than its set:
+        ``h(F_kl) + h(-F_kl) <= width``, summed over the blocks ``l``."""
         case, total, most = self.case, ball(0), ball(0)
         for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
             for i, price in enumerate(costs):
@@ -271,20 +259,10 @@ class VerifiedFeedback:
         return [none] * self.case.control.pieces
 
     def named(self, entry: Mapping[str, Any], name: str) -> NamedDeviations:
-        """Return the deviations that an entry of a certificate names.
+        """Return the deviations that an entry of a certificate names, for the constraint of that name.
 
-        Parameters
-        ----------
-        entry
-            The entry. With measurable disturbances it also says at which ``changes`` its disturbance jumps.
-        name
-            The name of its constraint, for messages.
-
-        Raises
-        ------
-        Broken
-            Where a deviation is not shown to be in its set, or the times are not increasing from 0 to before the end.
-        """
+        With measurable disturbances the entry also says at which ``changes`` its disturbance jumps. Raise `Broken`
+        where a deviation is not shown to be in its set, or the times do not increase from 0 to before the end."""
         loop = self.loop_at_rest
         if self.case.measurable:
             changes = numbers(entry.get("changes"), f"{name}: changes")
@@ -378,12 +356,11 @@ class NamedDeviations:
 
 
 def _deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
-    """Return the deviations from the middles that an entry names, block by block; raise `Broken` unless each is in its
-    set.
+    """Return the deviations from the middles that an entry names, block by block.
 
-    A point that rounding took out of a thin set is replaced by one of the set next to it. The entry holds the
-    ``disturbance (mw, blocks)``, the ``noise (K, p)`` and the ``deviation (d,)`` of the initial state from its
-    centre."""
+    Raise `Broken` unless each point is shown to be in its set. A point that rounding took out of a thin set is replaced
+    by one of the set next to it. The entry holds the ``disturbance (mw, blocks)``, the ``noise (K, p)`` and the
+    ``deviation (d,)`` of the initial state from its centre."""
     from flint import arb
 
     points, of = list[Array](), loop.deviations

@@ -235,15 +235,8 @@ class Case:
     ) -> Beside | None:
         """Return the terms that are added to the state in the rows of a constraint, or ``None`` where there are none.
 
-        Parameters
-        ----------
-        window
-            The constraint.
-        basis, gains
-            The vectors that rows are combinations of: ``(b, d)`` on the state, ``(b, m)`` on the control.
-        parameter
-            The parameter ``(nu,)`` at which the terms are taken; by default all parameters.
-        """
+        Rows are combinations of ``basis (b, d)`` on the state and ``gains (b, m)`` on the control. The terms are taken
+        at one ``parameter (nu,)``, or at all of them by default."""
         entering = self.sources.entering(parameter)
         if window.reference is None and not window.is_mixed and not entering:
             return None
@@ -284,19 +277,9 @@ def numbers(data: object, name: str) -> Array:
 
 
 def shaped(data: Mapping[str, Any], key: str, shape: tuple[int, ...], whose: str = "") -> Array:
-    """Return finite numbers of one shape from the certificate; raise `Broken` where they are something else.
+    """Return finite numbers of one shape under a key of the certificate; raise `Broken` where they are something else.
 
-    Parameters
-    ----------
-    data
-        The part of the certificate that holds them.
-    key
-        Their key.
-    shape
-        The expected shape.
-    whose
-        The name of their entry, which precedes the key in messages.
-    """
+    ``whose`` names their entry, before the key in messages."""
     found = numbers(data.get(key), f"{whose}{key}")
     if found.shape != shape:
         raise Broken(f"{whose}{key}: shape {found.shape}, expected {shape}")
@@ -317,18 +300,7 @@ def _numeric(data: object) -> bool:
 def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy:
     """Return the policy that a certificate describes: the cost that it is charged, and what each piece answers.
 
-    Parameters
-    ----------
-    certificate
-        The certificate, whose ``policy`` has the ranges of breakpoints for every piece.
-    pieces
-        The number of pieces of the control.
-
-    Raises
-    ------
-    Broken
-        Where the certificate describes no such policy.
-    """
+    The answers are ranges of breakpoints for each of the ``pieces``. Raise `Broken` where there is no such policy."""
     data = certificate.get("policy")
     if not isinstance(data, Mapping):
         raise Broken("policy: expected a cost, and the breakpoints that every piece answers")

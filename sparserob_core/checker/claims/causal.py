@@ -41,22 +41,19 @@ SHARE = 1.0 - 2.0**-40  # of a price is shared, so that rounding does not share 
 
 
 def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
-    """Return the lower bound that signals and multipliers prove for every causal policy.
+    """Return a ball whose lower end is the bound that signals and multipliers prove for every causal policy.
+
+    Where ``priced`` it bounds the cost. Otherwise it bounds the weighted sum of the constraints; where that is
+    positive, no causal policy exists.
 
     Parameters
     ----------
     case
         The case.
     data
-        The ``causal`` entry of a certificate.
+        An entry ``causal`` of a certificate.
     priced
-        Whether the bound is one of the cost. Otherwise it is one of the weighted sum of the constraints; where it is
-        positive, no causal policy exists.
-
-    Returns
-    -------
-    arb
-        A ball; its lower end is the bound.
+        Whether the cost is part of the sum.
 
     Raises
     ------

@@ -1,5 +1,6 @@
-"""The proof of one constraint for one control: every cell of the certificate's subdivision is bounded, and halved
-further where its bound is not small enough."""
+"""The proof of one constraint for one control, cell by cell.
+
+Every cell of the certificate's subdivision is bounded, and halved further where its bound is not small enough."""
 
 from __future__ import annotations
 
@@ -34,10 +35,9 @@ Interval: TypeAlias = tuple[int, float, float]
 @final
 @dataclass(frozen=True, eq=False)
 class Proven:
-    """The result of a proof: no row exceeds its limit by more than ``bound``.
+    """The result of a proof: no row exceeds its limit by more than ``bound``, or ``share`` in its own unit.
 
-    The excess is at most ``share`` of a row's own unit. The proof took ``cells`` cells of time and ``boxes`` pairs of a
-    box of parameters and a cell of directions."""
+    The proof took ``cells`` cells of time and ``boxes`` pairs of a box of parameters and a cell of directions."""
 
     bound: float
     share: float
@@ -119,7 +119,7 @@ def prove(
 @final
 @dataclass(frozen=True, eq=False)
 class Place:
-    """One box of parameters with the reachable states over it."""
+    """A box of parameters with the reachable states over it."""
 
     tube: Reached
     parameters: Parameters
@@ -224,8 +224,9 @@ def _turn(
 
 
 def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
-    """Raise `Broken` where a row certainly exceeds its limit by more than its slack, at the start of the interval and
-    at the centre of the box, if the centre is proven to be a parameter."""
+    """Raise `Broken` where a row certainly exceeds its limit by more than its slack.
+
+    It is evaluated at the start of the interval and at the centre of the box, if that is proven to be a parameter."""
     for row, poly in rows:
         least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
         if least > row.slack and place.parameters.holds(np.array(place.tube.flow.centre)):

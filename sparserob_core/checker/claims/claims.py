@@ -49,13 +49,7 @@ ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
 def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
     """Return one verdict per claim of the certificate; nothing that the file says is believed.
 
-    Parameters
-    ----------
-    case
-        The certificate with its problem.
-    gap_tolerance
-        The relative gap up to which a control is certified by the config; ``None`` where the config names none.
-    """
+    ``gap_tolerance`` is the relative gap up to which the config calls a control certified, or ``None``."""
     from flint import ctx
 
     status = case.certificate.get("status")
@@ -101,20 +95,8 @@ def derived_bound(case: Case) -> float:
 def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> float:
     """Return the lower bound that signals and multipliers prove for every causal policy, rounded down.
 
-    Parameters
-    ----------
-    case
-        The certificate with its problem.
-    data
-        An entry ``causal`` of a certificate.
-    priced
-        Whether the bound is one of the cost, otherwise of the weighted sum of the constraints.
-
-    Raises
-    ------
-    Broken, Unchecked
-        Where the signals and multipliers prove no bound.
-    """
+    ``data`` is an entry ``causal`` of a certificate. The bound is one of the cost where ``priced``, else of the
+    weighted sum of the constraints. Raise `Broken` or `Unchecked` where none is proven."""
     from flint import ctx
 
     from sparserob_core.checker.claims.causal import causal_bound
@@ -416,7 +398,7 @@ def _lower(case: Case) -> str:
             raise Broken(f"{written!r} is written, the leaves prove {least!r}")
         return f"no control of these acts for less than {written:.9g} {case.problem.names.time}".rstrip()
     written, derived = number(case.certificate, "lower_bound"), multiplied(case, priced=True)
-    if written <= 0.0:  # absolute values, lengths and semidefinite squares are not negative without a multiplier
+    if written <= 0.0:  # absolute values, lengths and semidefinite squares need no multiplier for that
         return f"no control costs less than {written:.12g}{_effort(case)}, for no term of the cost is negative"
     if not derived >= written:
         raise Broken(f"{written!r} is written, the multipliers prove {float(derived.lower())!r}")

@@ -46,18 +46,9 @@ WIDER = 1e-12  # of their whole extent, by which boxes are widened where the set
 def bounded(case: Case, window: ConstraintWindow) -> str:
     """Show that a constraint is kept at every time, for every disturbance and every parameter.
 
-    Returns
-    -------
-    str
-        A sentence with the upper bound of the excess, what is excused, and the number of cells.
-
-    Raises
-    ------
-    Broken
-        Where the certificate holds no valid proof, or the constraint is certainly violated.
-    Unchecked
-        Where neither could be shown.
-    """
+    Return a sentence with the upper bound of the excess, what is excused, and the number of cells. Raise `Broken` where
+    the certificate holds no valid proof or the constraint is certainly violated, `Unchecked` where neither could be
+    shown."""
     data = case.certificate.get("proof", {})
     entry = data.get(window.name) if isinstance(data, Mapping) else None
     if not isinstance(entry, Mapping):
@@ -117,18 +108,8 @@ def _unit(case: Case, window: ConstraintWindow) -> str:
 def normals_of(window: ConstraintWindow, data: object) -> Array:
     """Return the vectors ``(b, d)`` whose combinations are the directions of a curved set.
 
-    Parameters
-    ----------
-    window
-        The constraint.
-    data
-        The normals that the certificate names; ``None`` for the axes of the coordinates that the set bounds.
-
-    Raises
-    ------
-    Broken
-        Where not every direction in which the set is bounded is a combination of the normals.
-    """
+    ``data`` are the normals of the certificate; without them the axes of the coordinates that the set bounds serve.
+    Raise `Broken` where some direction in which the set is bounded is no combination of the normals."""
     shape, b, d = window.seen, window.seen.spanned, window.shape.dimension
     if data is None:
         return shape.lifted(np.eye(b))
@@ -252,19 +233,9 @@ def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
 def prove_on_cells(
     case: Case, window: ConstraintWindow, rows: tuple[Array, Array], work: Sequence[Work], cells: tuple[Array, Array]
 ) -> Proven:
-    """Show with `prove` that a constraint is kept on the given cells.
+    """Show with `prove` that a constraint is kept on the parts ``work`` of ``cells`` between lower and upper corners.
 
-    Parameters
-    ----------
-    case, window
-        The case, and its constraint.
-    rows
-        The vectors that the rows are combinations of: ``(b, d)`` on the state, ``(b, m)`` on the control.
-    work
-        The parts of the cells, with the rows to bound on each.
-    cells
-        The lower and the upper corners of all cells, ``(k, 1 + nu + b)`` each.
-    """
+    The rows to bound are combinations of ``rows``, ``(b, d)`` on the state and ``(b, m)`` on the control."""
     beside = case.beside(window, *rows)
     return prove(tubes(case, *rows, *cells), parameters_of(case), work, case.clock, beside)
 
@@ -272,16 +243,9 @@ def prove_on_cells(
 def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
     """Return a function that makes the reachable states over a box of parameters.
 
-    Parameters
-    ----------
-    case
-        The case.
-    basis, gains
-        The vectors that rows are combinations of: ``(b, d)`` on the state, ``(b, m)`` on the control.
-    lower, upper
-        The corners of all cells, ``(k, 1 + nu + b)`` each. Around a set of parameters that is no box, every box is
-        widened by a share `WIDER` of their extent.
-    """
+    Rows are combinations of ``basis (b, d)`` on the state and ``gains (b, m)`` on the control. All cells lie between
+    the corners ``lower`` and ``upper``, ``(k, 1 + nu + b)`` each. Around a set of parameters that is no box, every box
+    is widened by a share `WIDER` of their extent."""
     if case.answering:
         loop_tube = LoopTube(feedback_of(case).loop, basis, gains)
         return lambda _: loop_tube
@@ -304,18 +268,8 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
 def equalities(case: Case) -> str:
     """Show that every fixed state has its value at the end, for every parameter, disturbance and initial state.
 
-    Returns
-    -------
-    str
-        A sentence with the largest residual.
-
-    Raises
-    ------
-    Broken
-        Where a residual is not shown to be at most what is excused.
-    Unchecked
-        Where an uncertainty may reach a fixed state.
-    """
+    Return a sentence with the largest residual. Raise `Broken` where a residual is not shown to be at most what is
+    excused, `Unchecked` where an uncertainty may reach a fixed state."""
     worst, states = 0.0, np.eye(case.problem.system.states)[[state for state, _ in case.equalities]]
     sizes = nominal_sizes(case, states, np.zeros((len(states), 0))).tolist()
     for (state, value), (off, added), size, row in zip(case.equalities, missed(case), sizes, states, strict=True):

@@ -40,18 +40,8 @@ class FollowedRow:
     def prove(self, limit: float) -> tuple[int, float]:
         """Show that the row is at most ``limit`` at every time of its window.
 
-        Returns
-        -------
-        tuple of int and float
-            The number of cells that the proof took, and an upper bound of the row.
-
-        Raises
-        ------
-        Broken
-            Where the row is certainly larger than ``limit``.
-        Unchecked
-            Where neither could be shown with the cells and the time allowed.
-        """
+        Return the number of cells that the proof took, and an upper bound of the row. Raise `Broken` where the row is
+        certainly above ``limit``, and `Unchecked` where neither could be shown."""
         window = self.window
         times = self.worst.cuts([window.start, window.stop, *window.cuts(self.case.control.breakpoints.tolist())])
         times = times[(times >= window.start) & (times <= window.stop)]
@@ -97,8 +87,7 @@ class FollowedRow:
         return found
 
     def erring(self, times: Array) -> tuple[Array, Array]:
-        """Return lower and upper bounds ``(k,)`` of what the worst errors of execution add to the row at
-        ``times (k,)``."""
+        """Return bounds, ``(k,)`` below and above, of what the worst errors of execution add at ``times (k,)``."""
         delivered, none = self._delivered, np.zeros(times.size)
         return (none, none) if delivered is None else delivered.added_at(self.window.split(self.direction)[0], times)
 

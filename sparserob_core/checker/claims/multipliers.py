@@ -30,21 +30,10 @@ MOST_MULTIPLIERS = 100_000
 
 
 def multiplied(case: Case, priced: bool) -> arb:
-    """Return the lower bound that the certificate's multipliers prove.
+    """Return a ball whose lower end is the bound that the certificate's multipliers prove.
 
-    Parameters
-    ----------
-    case
-        The case.
-    priced
-        Whether the bound is one of the cost. Otherwise it is a bound of the weighted sum of constraints over all
-        controls; a positive bound proves that no control is feasible.
-
-    Returns
-    -------
-    arb
-        A ball; its lower end is the bound.
-    """
+    Where ``priced`` it bounds the cost. Otherwise it bounds the weighted sum of constraints over all controls; where
+    that is positive, no control is feasible."""
     data = case.certificate.get("multipliers")
     rows, pieces = weighted(case, data)
     price, touched = (case.price, touched_by(case, data)) if priced else (None, None)
@@ -68,13 +57,6 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         Each multiplier with its constraint.
     Array or None
         The multipliers ``(m, K)`` of the pieces; ``None`` where every piece has a function of its own.
-
-    Raises
-    ------
-    Broken
-        Where an entry is malformed or names no constraint of the problem.
-    Unchecked
-        Where there are no multipliers.
     """
     if data is None:
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
@@ -191,8 +173,7 @@ def _rows_of(case: Case) -> dict[tuple[object, ...], ConstraintRow]:
 def _undisturbed(
     case: Case, window: ConstraintWindow | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
 ) -> ConstraintRow:
-    """Return the constraint on the state for the worst deviations, or without deviations where the control answers
-    them."""
+    """Return the constraint on the state for the worst deviations, or without any where the control answers them."""
     _, direction, time, parameter = said
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
@@ -246,8 +227,7 @@ def _of_control(case: Case, name: str, direction: Array, time: float, named: Nam
 
 
 def _of_effort(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:
-    """Return the constraint that the control at deviations, each entry times a share of ``[-1, 1]``, is at most the
-    effort."""
+    """Return the constraint that the control, each entry times a share of ``[-1, 1]``, is at most the effort."""
     K, m = case.control.pieces, case.problem.system.controls
     if shares.shape != (m * K,) or not (np.abs(shares) <= 1.0).all():
         raise Broken(f"{EFFORT}: expected {m * K} numbers from -1 to 1")
@@ -287,8 +267,7 @@ def admissible(case: Case, window: ConstraintWindow, time: float, parameter: Arr
 
 
 def asked(case: Case, window: ConstraintWindow, time: float, parameter: Array) -> None:
-    """Raise `Broken` unless the time is in the window of a constraint and the parameter has as many numbers as it
-    needs."""
+    """Raise `Broken` unless the time is in the window of a constraint and the parameter has the right size."""
     sized(parameter, case.problem.system.parameter_count, f"{window.name}: parameter")
     if not window.start <= time <= window.stop:
         raise Broken(f"{window.name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")

@@ -1,4 +1,4 @@
-"""One time of a run: the state under an admissible disturbance and parameter, and the excess over a constraint there.
+"""The state at one time under an admissible disturbance and parameter, and its excess over a constraint.
 
 The excess is that of a witness, or that of the worst disturbance."""
 
@@ -41,6 +41,9 @@ ROUNDED = 1e-11
 def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
     """Return the state at a time under the control of the case, ``(d,)`` balls.
 
+    Raise `Broken` where the disturbance or the deviation is not shown to be admissible, and `Unchecked` where the
+    disturbance is given on another grid.
+
     Parameters
     ----------
     case
@@ -53,13 +56,6 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
         The disturbance ``(mw, pieces)`` on the pieces of the common grid; not read where the problem has none.
     deviation
         The deviation ``(d,)`` from the centre of the initial states; not read where these are one point.
-
-    Raises
-    ------
-    Broken
-        Where the disturbance or the deviation is not shown to be in its set.
-    Unchecked
-        Where the disturbance is given on another grid.
     """
     w = _admissible(case, signal) if case.problem.disturbance is not None else None
     weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.timing.grid[1:-1] if t < time), time])
@@ -84,15 +80,8 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
     """Return the excess of a witness over the constraint that it names, and how closely a figure of it must agree.
 
     The witness names the time, the direction, the disturbance and the initial state, which must be admissible. Where
-    the control is delivered with errors, the worst errors are added.
-
-    Raises
-    ------
-    Broken
-        Where the witness is not admissible, or names no constraint of the problem.
-    Unchecked
-        Where the witness holds no disturbance that can be followed.
-    """
+    the control is delivered with errors, the worst errors are added. Raise `Broken` where the witness is not
+    admissible, and `Unchecked` where it holds no disturbance that can be followed."""
     name, time, direction = (
         str(data.get("constraint")),
         number(data, "time"),
@@ -178,28 +167,18 @@ def _along(direction: Array, named: NamedDeviations | None, rows: Sequence[list[
 def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None) -> tuple[list[float], float]:
     """Return the excess of the worst disturbance over each row of a constraint at one time, with its accuracy.
 
+    A mixed constraint at a jump of the control has its rows on both sides. Raise `Broken` where ``said`` names no
+    constraint of the problem, or no time of it. Raise `Unchecked` for a curved set, whose worst direction is not
+    reported.
+
     Parameters
     ----------
     case
         The case.
     said
-        What a result says, with the keys ``constraint``, ``time``, ``parameter`` and ``violation``.
+        A report with the keys ``constraint``, ``time``, ``parameter`` and ``violation``.
     begun
         The initial state ``(d,)``; by default the worst one. It is not used under feedback.
-
-    Returns
-    -------
-    list of float
-        The excess of each row; where the control jumps in a mixed constraint, of each row on both sides.
-    float
-        How closely these numbers are known.
-
-    Raises
-    ------
-    Broken
-        Where ``said`` names no constraint of the problem, no time of it or no numbers.
-    Unchecked
-        For a curved set, whose worst direction is not reported.
     """
     name, time, held = str(said.get("constraint")), number(said, "time"), commanded(case, str(said.get("constraint")))
     number(said, "violation")

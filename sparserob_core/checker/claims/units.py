@@ -113,7 +113,7 @@ class WindowUnits:
         across, thin = np.array(widths(flat)), THIN * sums[: heights.size]
         both = np.where(across > thin, np.stack([heights, across]), 0.0)
         near = np.array([smallest(pair) for pair in np.where(both > thin, both, 0.0).T.tolist()])
-        if (reach[: near.size] < np.where(near > 0.0, near, np.inf)).any():  # elsewhere a row may reach further
+        if (reach[: near.size] < np.where(near > 0.0, near, np.inf)).any():  # another parameter may take a row further
             others = [self._measured(point, states=False)[0] for point in self._elsewhere]
             reach = np.max([reach, *others], axis=0)
         unit = [smallest(pair) for pair in zip(near.tolist(), reach.tolist(), strict=False)]
@@ -139,7 +139,7 @@ class WindowUnits:
         )
 
     def excused(self, direction: Array, limit: arb) -> float:
-        """Return the violation that a claim excuses in a direction ``c (d,)``, as in `slack` (decision 0088)."""
+        """Return the violation that a claim excuses in a direction ``c (d,)`` with ``c'x <= limit`` (decision 0088)."""
         return self._share(direction, limit, lambda: self.rows, lambda width: self.least(direction, width))
 
     def _share(
@@ -189,8 +189,7 @@ class WindowUnits:
         return found
 
     def _rows_of(self, states: bool) -> tuple[Array, Array]:
-        """Return the normals of the facets on state ``(k, d)`` and control ``(k, m)``, or the axes of the
-        ``states``."""
+        """Return the facets' normals on state ``(k, d)`` and control ``(k, m)``, or the axes of the ``states``."""
         d = self.problem.system.states
         if states:
             return np.eye(d), np.zeros((d, 0))

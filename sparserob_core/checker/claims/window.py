@@ -1,5 +1,4 @@
-"""A constraint on the state, which may follow a reference and may include the control, and the terms that this adds to
-its rows."""
+"""A constraint on the state, which may follow a reference and include the control, and the terms that these add."""
 
 from __future__ import annotations
 
