@@ -42,8 +42,8 @@ def acted(case: Case) -> float:
 def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
     """Return multipliers of the cost as multipliers of the count, with those of the pieces, ``(m, K)`` or ``None``.
 
-    Both are divided by the largest absolute value of a channel times the factor ``l1`` of the cost. This is best where
-    all channels have the same largest value; any factor that is not negative gives a valid bound."""
+    The multipliers are divided by the largest absolute value of a channel times the factor ``l1`` of the cost. This
+    divisor is best where all channels have the same largest value; any positive divisor gives a valid bound."""
     most = max((max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _ranges(case)), default=1.0)
     most = most * case.problem.cost.l1 or 1.0
     rest = pieces if pieces is None else (np.asarray(pieces, dtype=float) / most).tolist()
@@ -174,7 +174,7 @@ ANY: Part = (-np.inf, np.inf, False)
 def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, Any]], Rows]) -> float:
     """Return the time that every control acts at least, by the leaves of a tree of parts of the controls.
 
-    It is infinite where every leaf proves that its part holds no feasible control.
+    The bound is infinite where every leaf proves that its part holds no feasible control.
 
     Parameters
     ----------
@@ -215,8 +215,8 @@ def _divided(
 ) -> tuple[dict[tuple[int, int], Part], dict[tuple[int, int], Part]]:
     """Return two halves that together hold every control of a part.
 
-    They divide the values of one channel on a piece between two letters. Without letters, one half has the vector of
-    the channel at 0 on the piece, and the other half counts it whatever its value."""
+    With an alphabet, the values of one channel on a piece are divided between two letters. Without letters, one half
+    has the vector of the channel at 0 on the piece, and the other half counts it whatever its value."""
     channel, piece = node.get("channel"), node.get("piece")
     m, K = case.problem.system.controls, case.control.pieces
     if type(channel) is not int or type(piece) is not int or not (0 <= channel < m and 0 <= piece < K):
@@ -271,8 +271,7 @@ def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: 
 def _values(case: Case, part: Part, low: float, high: float) -> list[float]:
     """Return the values among which the count of an entry plus any slope has its minimum.
 
-    They are the ends of the range of the entry, and 0 in between; with an alphabet they are the letters in the
-    range."""
+    The values are the ends of the range of the entry, and 0 in between; with an alphabet, the letters in the range."""
     if case.letters is not None:
         return [letter for letter in case.letters if part[0] <= letter <= part[1]]
     least, most = max(low, part[0]), min(high, part[1])

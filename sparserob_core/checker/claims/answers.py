@@ -1,8 +1,8 @@
 """The answers of a control to deviations, derived anew from its gains in ball arithmetic.
 
 This module has the closed loop of the system with the gains, the deviations that a certificate names, and their
-innovations. It also bounds how far all gains together can lower a weighted sum of constraints. A control that answers
-nothing has no deviations here, and no innovations."""
+innovations. The module also bounds how far all gains together can lower a weighted sum of constraints. A control that
+answers nothing has no deviations here, and no innovations."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ class VerifiedFeedback:
     def added(self, state: int) -> float:
         """Return the size of the numbers that are added up to a state at the end.
 
-        They are the state without control, the state with it, and what deviations add to both."""
+        The numbers are the state without control, the state with it, and what deviations add to both."""
         total = 0.0
         for loop in (self.loop_at_rest, self.loop):
             first, *responses = (float(abs(x).upper()) for x in loop.nodes[-1].tolist()[state])
@@ -214,9 +214,9 @@ class VerifiedFeedback:
     def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
         """Return a lower bound of what gains, and charged peaks or an effort, add to the sum of weighted ``rows``.
 
-        It is 0 where nothing is answered. ``priced`` says whether the cost is part of the sum. Peaks and the effort are
-        bounded by the set of the control alone. For the gains, the control that they cause is no wider than its set:
-        ``h(F_kl) + h(-F_kl) <= width``, summed over the blocks ``l``."""
+        The bound is 0 where nothing is answered. ``priced`` says whether the cost is part of the sum. Peaks and the
+        effort are bounded by the set of the control alone. For the gains, the control that they cause is no wider than
+        its set: ``h(F_kl) + h(-F_kl) <= width``, summed over the blocks ``l``."""
         case, total, most = self.case, ball(0), ball(0)
         for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
             for i, price in enumerate(costs):

@@ -5,12 +5,13 @@ by then, whatever is measured. So it is one vector for all signals that agree un
 
 Where outputs with noise are measured, a control depends on these alone. Each signal then names its outputs relative to
 the nominal ones, as exact numbers. The noise is the difference between these outputs and the effect of the signal's
-disturbance and initial state. It is derived in balls and must be proven to be in its set. The control is one vector for
-all signals whose known outputs are the same numbers. This holds piece by piece, since the same controls so far lead to
-the same outputs.
+disturbance and initial state. This noise is derived in balls and must be proven to be in its set. The control is one
+vector for all signals whose known outputs are the same numbers. The argument holds piece by piece, since the same
+controls so far lead to the same outputs.
 
-So for every causal policy a weighted sum of constraints under the signals has a lower bound. It is the constant part of
-the sum, plus the minimum over each such vector in the set of the control, with the vector's part of the cost."""
+So for every causal policy a weighted sum of constraints under the signals has a lower bound. The bound is the constant
+part of the sum, plus the minimum over each such vector in the set of the control, with the vector's part of the
+cost."""
 
 from __future__ import annotations
 
@@ -191,7 +192,8 @@ def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
 def _begun(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
     """Return for every signal the deviation ``(d,)`` of its initial state from the middle of the set.
 
-    It is empty where there is no set. Raise `Broken` unless every initial state is shown to be in the set."""
+    The deviations are empty where there is no set. Raise `Broken` unless every initial state is shown to be in the
+    set."""
     shape, told = case.problem.initial_set, listed(data, "initial_states")
     if len(told) != count:
         raise Broken(f"causal: {len(told)} initial states of {count} signals")

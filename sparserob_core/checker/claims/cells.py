@@ -128,7 +128,7 @@ class Place:
     beside: Beside | None = None
 
     def cells(self, interval: Interval, z: Array, sharp: bool) -> list[Polynomial]:
-        """Return the polynomials of the rows ``z (k, b)`` on an interval, with the terms `beside` the state."""
+        """Return the polynomials of the rows ``z (k, b)`` on an interval, with the added terms of `beside`."""
         found = self.tube.cells(*interval, z, sharp)
         if self.beside is None:
             return found
@@ -209,7 +209,7 @@ def _turn(
     """Return whether a cell fails, by at most ``worst``, because its directions differ too much.
 
     The direction in the middle of the cell must not fail. The other directions must exceed it by more than smaller
-    cells of time and parameters could gain. That gain may be twice the error, because neighbours on both sides of a
+    cells of time and parameters could gain. Such a gain may be twice the error, because neighbours on both sides of a
     switch have different worst disturbances. Raise `Broken` where the constraint is certainly violated at the start of
     the cell."""
     middle = sides.centre
@@ -226,7 +226,8 @@ def _turn(
 def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
     """Raise `Broken` where a row certainly exceeds its limit by more than its slack.
 
-    It is evaluated at the start of the interval and at the centre of the box, if that is proven to be a parameter."""
+    The row is evaluated at the start of the interval and at the centre of the box, if that is proven to be a
+    parameter."""
     for row, poly in rows:
         least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
         if least > row.slack and place.parameters.holds(np.array(place.tube.flow.centre)):
@@ -291,9 +292,9 @@ def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
 def _to_blame(poly: Polynomial, top: float, interval: Interval) -> bool:
     """Return whether a smaller box of parameters helps more than a shorter time against an excess of ``top``.
 
-    It does at a single time, and where the box or a chord in time causes more than a small share of the error. Where
-    the excess is more than errors explain, the larger change of the polynomial decides: over the box or over the time.
-    Halving then leads to a refutation, or to parameters outside their set."""
+    A smaller box helps more at a single time, and where the box or a chord in time causes more than a small share of
+    the error. Where the excess is more than errors explain, the larger change of the polynomial decides: over the box
+    or over the time. Halving then leads to a refutation, or to parameters outside their set."""
     if interval[1] == interval[2] or poly.expansion + poly.turning > BLAME * poly.error:
         return True
     if top <= 2.0 * poly.error + poly.kinks:
@@ -304,8 +305,8 @@ def _to_blame(poly: Polynomial, top: float, interval: Interval) -> bool:
 def _influence(tube: Reached, poly: Polynomial) -> Array:
     """Return how much each parameter contributes to what is left open, ``(nu,)``.
 
-    It is measured by the coefficients of the system where the expansion causes the error, else by those of the
-    polynomial. Where the size of the box in bounded inputs causes it, the share ``poly.bent`` of each parameter is
+    The influence is measured by the coefficients of the system where the expansion causes the error, else by those of
+    the polynomial. Where the size of the box in bounded inputs causes it, the share ``poly.bent`` of each parameter is
     returned."""
     expansion = poly.expansion > BLAME * poly.error
     sizes = tube.flow.sizes if expansion else np.abs(poly.coefficients).sum(axis=0)

@@ -85,7 +85,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
 def derived_bound(case: Case) -> float:
     """Return the lower bound of the cost that the certificate's multipliers prove, rounded down.
 
-    Raise `Broken` or `Unchecked` where they prove none."""
+    Raise `Broken` or `Unchecked` where the multipliers prove none."""
     from flint import ctx
 
     with ctx.workprec(precision_of(case)):
@@ -499,15 +499,15 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
 def relative_gap(case: Case, cost: float, lower: float) -> float:
     """Return the gap between the cost and the lower bound relative to the larger of their absolute values.
 
-    Where a millionth of what is added up to the cost is larger, the gap is relative to that. It is 0 where the bounds
-    meet."""
+    Where a millionth of what is added up to the cost is larger, the gap is relative to that. The gap is 0 where the
+    bounds meet."""
     return 0.0 if cost <= lower else (cost - lower) / max(abs(cost), abs(lower), SMALL_COST * added_up(case))
 
 
 def added_up(case: Case) -> float:
     """Return the size of the numbers that are added up to the claimed cost.
 
-    It is the cost itself, except for quadratic costs, whose terms may cancel."""
+    This size is the cost itself, except for quadratic costs, whose terms may cancel."""
     cost = number(case.certificate, "cost")
     if case.counts or not case.price.is_quadratic:
         return abs(cost)
@@ -518,7 +518,7 @@ def added_up(case: Case) -> float:
 def compared(case: Case) -> float:
     """Return the size of the numbers that the rounding error of a cost is relative to.
 
-    All products that are added up to the cost count. They may be more than `added_up` where they cancel within the
+    All products that are added up to the cost count. Their sum may be more than `added_up` where they cancel within the
     matrix of one term."""
     return max(added_up(case), 0.0 if case.counts else case.price.terms(case.pieces))
 

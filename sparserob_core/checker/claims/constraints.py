@@ -132,8 +132,8 @@ def parameters_of(case: Case) -> Parameters:
 def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> None:
     """Raise `Broken` unless the cells fill the window in time and the set of parameters.
 
-    For a curved set they must do so with every face of the cube of directions. ``lower`` and ``upper`` are the corners
-    of the cells, ``(k, 1 + nu + b)`` each, ``b = 0`` for a flat set."""
+    For a curved set the cells must also fill every face of the cube of directions. ``lower`` and ``upper`` are the
+    corners of the cells, ``(k, 1 + nu + b)`` each, ``b = 0`` for a flat set."""
     nu = case.problem.system.parameter_count
     b = 0 if window.seen.facets is not None else window.seen.spanned
     if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1] != 1 + nu + b:
@@ -154,8 +154,8 @@ def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
 def _extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return the lower and the upper corner of the times and parameters that the cells must fill, ``(1 + nu,)`` each.
 
-    For a set of parameters that is no box it is the box around the cells. This box must hold the set, up to a share
-    `WIDER` of its width."""
+    For a set of parameters that is no box, the corners are those of the box around the cells. This box must hold the
+    set, up to a share `WIDER` of its width."""
     nu, bound = case.problem.system.parameter_count, case.problem.system.parameters
     if bound is None:
         return np.array([window.start]), np.array([window.stop])
@@ -243,9 +243,9 @@ def prove_on_cells(
 def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
     """Return a function that makes the reachable states over a box of parameters.
 
-    Rows are combinations of ``basis (b, d)`` on the state and ``gains (b, m)`` on the control. All cells lie between
-    the corners ``lower`` and ``upper``, ``(k, 1 + nu + b)`` each. Around a set of parameters that is no box, every box
-    is widened by a share `WIDER` of their extent."""
+    Rows are combinations of ``basis (b, d)`` on the state and ``gains (b, m)`` on the control. ``lower`` and ``upper``
+    are the corners of the cells, ``(k, 1 + nu + b)`` each. For a set of parameters that is no box, every box is widened
+    by a share `WIDER` of the extent of all cells."""
     if case.answering:
         loop_tube = LoopTube(feedback_of(case).loop, basis, gains)
         return lambda _: loop_tube

@@ -87,8 +87,8 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
 def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
     """Return the control ``(m, 1)`` on every piece at which the certificate replaces the cost by its tangent.
 
-    It is ``None`` where the cost has neither quadratic terms nor norms of groups. Raise `Broken` where a quadratic term
-    is not convex."""
+    The control is ``None`` where the cost has neither quadratic terms nor norms of groups. Raise `Broken` where a
+    quadratic term is not convex."""
     if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
         return None
     said = data if isinstance(data, Mapping) else {}
@@ -107,9 +107,9 @@ def norms_of(case: Case, data: object) -> Array | None:
 def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     """Return an entry's multiplier with its constraint, which must be one of the problem's.
 
-    Under feedback, a step across the seam of a plan that repeats gives two constraints with the same multiplier. One is
-    on the last control of a period and the other on the first control of the next, which answer innovations of two
-    periods."""
+    Under feedback, a step across the seam of a plan that repeats gives two constraints with the same multiplier. The
+    first constraint is on the last control of a period, the second on the first control of the next. These controls
+    answer innovations of two different periods."""
     case.clock.check()
     if not isinstance(entry, Mapping):
         raise Broken("multipliers: expected a constraint, a time, a parameter, a direction and a number each")
@@ -214,7 +214,7 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
 
 
 def _of_control(case: Case, name: str, direction: Array, time: float, named: NamedDeviations | None) -> ConstraintRow:
-    """Return the constraint on the control of one piece: that it is in its set, or at most its peak."""
+    """Return the constraint on the control of one piece: it is in its set, or a channel is at most its peak."""
     row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
     if named is not None:
         seen = named.innovations

@@ -178,7 +178,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     said
         A report with the keys ``constraint``, ``time``, ``parameter`` and ``violation``.
     begun
-        The initial state ``(d,)``; by default the worst one. It is not used under feedback.
+        The initial state ``(d,)``; by default the worst one; not used under feedback.
     """
     name, time, held = str(said.get("constraint")), number(said, "time"), commanded(case, str(said.get("constraint")))
     number(said, "violation")

@@ -55,7 +55,7 @@ class WindowUnits:
     and the width of the slab where the opposite row exists. A row whose width is `THIN` has the reach alone. The unit
     of a curved set in a direction ``c`` is ``h(c) - c'm``, ``m`` its centre.
 
-    A unit is at least what double precision resolves of the numbers that are added up. It is never more than what a
+    A unit is at least what double precision resolves of the numbers that are added up. A unit is never more than what a
     user can read: the largest of ``|b|``, the width, and the values of the row along the nominal trajectory (decision
     0088). Units are no claims, so they are computed in floating point."""
 
@@ -84,8 +84,8 @@ class WindowUnits:
     def least(self, direction: Array, width: float) -> float:
         """Return the least unit of a direction ``c (d,)``, along which a curved set reaches ``width`` from its centre.
 
-        It is what double precision resolves, but never more than the values of the states along the nominal trajectory.
-        Where the set is `THIN`, it is these values alone."""
+        The least unit is what double precision resolves, but never more than the values of the states along the nominal
+        trajectory. Where the set is `THIN`, these values alone count."""
         size = np.abs(direction)
         floors = self._seen if width < THIN * float(size @ self.sums) else self._floors
         return float(size @ floors)
@@ -105,7 +105,7 @@ class WindowUnits:
     def resolved(self) -> Array:
         """The unit ``(k,)`` of every facet of a flat set as far as double precision resolves it, large or small.
 
-        It says how closely figures must agree; nothing is excused by it."""
+        This unit says how closely figures must agree; no violation is excused by it."""
         flat = known(self.shape).facets
         assert flat is not None
         heights = np.array([abs(float(b)) for _, b in flat])
