@@ -102,8 +102,8 @@ class VerifiedLoop:
         return int(self.system.states) if self.measured is None else self.measured.outputs
 
     def _places(self, piece: int) -> tuple[int, int]:
-        """Return the index of the piece of the control that acts on a piece of the grid, -1 before the delay is over,
-        and the index of the block of the disturbance."""
+        """Return the indices of the piece of the control and of the block of the disturbance that act on a piece of the
+        grid. The piece of the control is -1 before the delay is over."""
         inside = (self.grid[piece] + self.grid[piece + 1]) / 2
         return bisect_right(self.acting, inside) - 1, bisect_right(self.changes, inside) - 1
 

@@ -1,7 +1,7 @@
 """Errors of execution in a known system that does not change with time: the delivered control differs from the command.
 
-These errors are measurable disturbances through ``B`` whose size is a share of the command. Integration by parts turns
-the worst case into a sum over the jumps of ``share_j |u_j|``, each times ``F_j(t - t_k)`` with
+These errors are measurable disturbances through ``B`` whose size is a share of the command. Integration by parts
+rewrites the worst case as a sum over the jumps of ``share_j |u_j|``, each times ``F_j(t - t_k)`` with
 ``F_j(a) = int_0^a |c'e^{A s} B_j| ds``. The rows ``c'e^{A s}`` are computed by their adjoints, so that neither many
 states nor fast modes are expensive.
 """

@@ -45,8 +45,7 @@ KEPT = 4096  # intervals from the beginning of a piece to a time in it, whose ke
 @final
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of the sets whose sum is the set of the deviations, by its ``corners (v, mw)`` with error bounds
-    ``rad (v, mw)``."""
+    """A summand of the set of the deviations, by its ``corners (v, mw)`` with error bounds ``rad (v, mw)``."""
 
     corners: Array
     rad: Array
