@@ -336,6 +336,7 @@ class MeasurableDeviations(Deviations):
         return rounded_radii(found, self.sets)
 
     def supports(self, every: Sequence[list[arb]]) -> list[arb]:
+        """Return the support values at every ``a (Q,)``: sums of integrals of support functions."""
         from flint import arb
 
         d, blocks = self.flow.states, self.blocks
@@ -371,6 +372,8 @@ class MeasurableLoop(VerifiedLoop):
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
+        """The transitions ``D_jl`` from the end of every piece ``l`` to the next breakpoint ``j`` of the control,
+        ``(d, d)``."""
         K = len(self.breakpoints) - 1
         found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
@@ -391,6 +394,7 @@ class MeasurableLoop(VerifiedLoop):
         """Leave the rows as they are: a disturbance within a piece counts at the end of the piece."""
 
     def _ended(self, piece: int, state: arb_mat) -> arb_mat:
+        """Return the state and the responses after a piece of the grid, with the effect of the disturbance on it."""
         rows, unit = state.tolist(), identity(self.system.states)
         for i, row in enumerate(rows):
             for j in range(len(rows)):
@@ -406,6 +410,7 @@ class MeasurableLoop(VerifiedLoop):
         return Phi * self.nodes[piece] + added
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
+        """Return the `heights` of ``rows (r, d)`` at a time in a piece, with the disturbance up to this time."""
         from flint import arb
 
         found = super().highest(piece, time, rows, beside)

@@ -235,7 +235,7 @@ class States:
 
     @remembered(lambda: PATHS_KEPT, lambda self, segment, basis: (segment, basis.tobytes()))
     def _lines(self, segment: VerifiedSegment, basis: Array) -> Lines:
-        """Return the rows ``basis`` of a segment."""
+        """Return the rows ``basis (b, d)`` of the flow on a segment."""
         return Lines.of(segment, basis)
 
     def blur(self, place: int) -> Array:
