@@ -1,1 +1,1 @@
-"""The verification of a finished run in ball arithmetic; it shares no code with what solved the problem."""
+"""The verification of a finished run in ball arithmetic; it shares no code with the solvers."""

@@ -32,7 +32,7 @@ class Unchecked(Exception):
 
 
 class Broken(Exception):
-    """The exception for a claim that is wrong, or for a certificate that lacks what it must say.
+    """The exception for a claim that is wrong, or for a certificate without the entries that it must have.
 
     Its sentence says why. It never leaves the checker.
     """

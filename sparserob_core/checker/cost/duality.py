@@ -2,8 +2,8 @@
 
 Let ``y >= 0`` be multipliers of constraints ``c'x(t) + sigma <= h(c)``, and ``nu`` any multipliers of equalities. Then
 no admissible control costs less than ``sum_i y_i (c_i'e^{A t_i} x(0) + sigma_i - h(c_i)) + min_u J(u) + sum_i y_i g_i
-u``. The minimum is over the controls' set alone, piece by piece. With ``J`` left out, a positive number proves that
-nothing is feasible (Farkas).
+u``. The minimum is over the controls' set alone, piece by piece. Without ``J``, a positive number proves that nothing
+is feasible (Farkas).
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ class Duality:
         rows
             Multipliers ``y``, each with its row.
         pieces
-            The certificate's slopes ``(m, K)`` where a dictionary has fewer functions than pieces.
+            The negated slopes ``(m, K)`` of the certificate, for a dictionary with fewer functions than pieces.
         price
             The cost; ``None`` to prove infeasibility.
         touched
@@ -251,7 +251,8 @@ class Duality:
         tangent: Tangent | None = None,
     ) -> tuple[arb, list[list[arb]]]:
         """Return the sum of ``rows`` times their multipliers ``y``, plus a ``tangent``: its constant, and its slopes on
-        every piece. Where the dictionary has fewer functions than pieces, the slopes are those of ``pieces``."""
+        every piece. Where the dictionary has fewer functions than pieces, the slopes are those of ``pieces`` with the
+        opposite sign."""
         constant = sum((ball(y) * row.constant for y, row in rows), ball(0.0))
         m, K = self.problem.system.controls, self.control.pieces
         slopes = [

@@ -46,7 +46,8 @@ def at_most(
 
     Returns
     -------
-    The number of parts that were examined.
+    int
+        The number of parts that were examined.
 
     Raises
     ------

@@ -73,7 +73,8 @@ class GainsBound:
 
         Returns
         -------
-        For every cluster its breakpoints, the matrix of `_inverse`, and its blocks.
+        list[tuple[list[int], arb_mat, list[int]]]
+            For every cluster its breakpoints, the matrix of `_inverse`, and its blocks.
         """
         groups: list[tuple[list[int], set[int]]] = []
         for j in np.flatnonzero(self.answers[k, : k + 1]).tolist():

@@ -1,5 +1,5 @@
 """The integrals of a quadratic cost along the nominal trajectory, and their slopes, in balls. They are computed from
-the polynomials of the flow, and share nothing with what solves."""
+the polynomials of the flow, and share no code with the solvers."""
 
 from __future__ import annotations
 

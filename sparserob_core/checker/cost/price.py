@@ -1,5 +1,5 @@
-"""The cost of a control, in balls: norms of groups, and quadratic terms of the nominal trajectory. It shares nothing
-with what solves."""
+"""The cost of a control, in balls: norms of groups, and quadratic terms of the nominal trajectory. It shares no code
+with the solvers."""
 
 from __future__ import annotations
 

@@ -54,8 +54,8 @@ class StateWeights:
 @final
 @dataclass(frozen=True, eq=False)
 class FlowPart:
-    """A ``share`` of a ``segment``, which takes a time of this ``length``, and the number of ``doublings``: each
-    doubling applies the flow twice, for twice the time."""
+    """A part of an interval of time: a ``share`` of a ``segment``, of this ``length``, and a number of ``doublings``.
+    Each doubling applies the flow twice, for twice the time."""
 
     segment: VerifiedSegment
     share: arb
@@ -143,7 +143,8 @@ class VerifiedFlow:
         return found
 
     def segment(self, start: float, stop: float) -> tuple[VerifiedSegment, arb]:
-        """Return a segment that begins at ``start``, and the share of its time that has passed at ``stop``."""
+        """Return the verified segment of the flow from ``start`` on, and the share of its time that has passed at
+        ``stop``."""
         stretch = self.law.stretches[self._place(start, stop)]
         if stretch.is_still:
             share = (ball(stop) - ball(start)) / stretch.stride
@@ -234,9 +235,9 @@ class VerifiedFlow:
 
         Returns
         -------
-        The first ``order`` coefficients ``(d, d + w)`` of ``[Phi Gamma]``, in powers of the share of ``[start, stop]``;
-        and an
-        upper bound ``(d, d + w)`` of their error.
+        tuple[list[Series], Array]
+            The first ``order`` coefficients ``(d, d + w)`` of ``[Phi Gamma]``, in powers of the share of ``[start,
+            stop]``; and an upper bound ``(d, d + w)`` of their error.
         """
         segment, share = self.segment(begin, end)
         if begin == end:
@@ -253,9 +254,9 @@ class VerifiedFlow:
 
         Returns
         -------
-        Coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and an upper bound ``(d,
-        w)`` of
-        their error.
+        tuple[list[Series], Array]
+            Coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and an upper bound
+            ``(d, w)`` of their error.
         """
         stretch = self.law.stretches[self._place(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
@@ -300,9 +301,9 @@ class VerifiedFlow:
 
         Returns
         -------
-        The largest absolute values of ``[A B E]`` and of its derivative in time, ``(d, d + w)`` each. The third value
-        is the
-        units ``(d,)`` of the states, in which the law is small there.
+        tuple[Array, Array, Array]
+            The largest absolute values of ``[A B E]`` and of its derivative in time, ``(d, d + w)`` each. The third
+            value is the units ``(d,)`` of the states, in which the law is small there.
         """
         stretch = self.law.stretches[self._place(start, stop)]
         return *stretch.sizes, stretch.units

@@ -50,7 +50,8 @@ class Powers:
 
         Returns
         -------
-        The first ``order`` coefficients ``(d, n)``, and an upper bound ``(d, n)`` of their error.
+        tuple[list[Series], Array]
+            The first ``order`` coefficients ``(d, n)``, and an upper bound ``(d, n)`` of their error.
         """
         from flint import arb, arb_mat
 
@@ -142,7 +143,8 @@ def shifted(start: float, width: float, count: int) -> Array:
 
     Returns
     -------
-    The matrix ``(power of y, power)``. Each entry is rounded outward for ``4 count`` terms.
+    Array
+        The matrix ``(power of y, power)``. Each entry is rounded outward for ``4 count`` terms.
     """
     n = np.arange(count)
     table = _binomials(count) * np.power(start, np.maximum(n[None] - n[:, None], 0)) * np.power(width, n)[:, None]

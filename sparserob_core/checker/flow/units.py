@@ -25,8 +25,8 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
     1960).
 
     The sources take part as one more state. Where one state drives another but not the reverse, a small rate stands for
-    the reverse: the rate that makes the two as large as one becomes through the other within the horizon. A source that
-    is a negligible part of what moves a state through the others does not count.
+    the reverse: the rate that makes the two as large as one becomes through the other within the horizon. A source does
+    not count where its effect on a state is negligible relative to the effect through other states.
 
     Parameters
     ----------
@@ -35,11 +35,12 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
     horizon
         The length of time.
     speed
-        Rates ``(d,)`` at which the sources move the states.
+        Rates ``(d,)`` at which the sources change the states.
 
     Returns
     -------
-    Units ``(d,)``.
+    Array
+        Units ``(d,)``.
     """
     rates = np.zeros((speed.size + 1, speed.size + 1))
     rates[:-1, :-1], rates[:-1, -1] = np.abs(A), speed

@@ -125,9 +125,9 @@ def _coordinates(
 
     Returns
     -------
-    The coordinates; and for every integral its name, the time when it is judged, and for every row the coordinates that
-    are
-    added up, with their bounds.
+    tuple[list[Coordinate], list]
+        The coordinates; and for every integral its name, the time when it is judged, and for every row the coordinates
+        that are added up, with their bounds.
     """
     d, m = problem.system.states, problem.system.controls
     coordinates, windows = list[Coordinate](), list[tuple[str, float, list[tuple[list[int], float, float]]]]()

@@ -81,6 +81,11 @@ class Lasting:
             The coefficients ``(pieces, ..., mw, b)`` of the first pieces of the disturbance.
         rad
             Their error bounds, of the same shape.
+
+        Returns
+        -------
+        tuple[Array, Array]
+            Both, of the same shapes: the sum of an interval is at its first piece, and its other pieces are 0.
         """
         mid, rad = mid.copy(), rad.copy()
         for columns, firsts in self.parts:

@@ -105,7 +105,8 @@ class ParameterExpansion:
 
         Returns
         -------
-        Booleans ``(rows, columns)`` and ``(nu, rows, columns)``.
+        tuple[np.ndarray, np.ndarray]
+            Booleans ``(rows, columns)`` and ``(nu, rows, columns)``.
 
         Raises
         ------

@@ -40,7 +40,7 @@ class Timing:
     @cached_property
     def grid(self) -> list[float]:
         """The breakpoints of both dictionaries, those of the control later by the delay, and the switches of the
-        system."""
+        system; also the breakpoints at which an answering control measures."""
         self.clock.check()
         ends, last = (self.control[-1], self.disturbance[-1]), self.until
         measured = self.control.tolist() if self.answering else []

@@ -71,9 +71,9 @@ class CurvedSide:
 
         Returns
         -------
-        Values, upper bounds of how much more and how much less the integral may be, and the largest support values,
-        ``(n,)``
-        each.
+        tuple[Array, Array, Array, Array]
+            Values, upper bounds of how much more and how much less the integral may be, and the largest support values,
+            ``(n,)`` each.
         """
         found = [np.zeros(0)] * 3
         for first in range(0, len(plain), AT_ONCE):

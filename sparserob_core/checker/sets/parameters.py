@@ -55,9 +55,9 @@ class Parameters:
 
         Returns
         -------
-        Normals ``a (k, nu)``, limits ``s (k,)`` with ``a p <= s`` on the set, and weights ``(k,) >= 0``. The weighted
-        normals
-        add up to ``slope`` as nearly as they can.
+        list[tuple[Array, Array, Array]]
+            Normals ``a (k, nu)``, limits ``s (k,)`` with ``a p <= s`` on the set, and weights ``(k,) >= 0``. The
+            weighted normals add up to ``slope`` as nearly as they can.
         """
         if self.is_box or self.shape is None or not slope.any():
             return []

@@ -118,8 +118,9 @@ def _pairs(monomials: Monomials) -> tuple[Array, Array, Array, Array]:
 
     Returns
     -------
-    The first and the second monomial of each pair, the matrix from pairs to products, and the matrix from monomials to
-    degrees.
+    tuple[Array, Array, Array, Array]
+        The first and the second monomial of each pair, the matrix from pairs to products, and the matrix from monomials
+        to degrees.
     """
     products = np.array(monomials.products)
     gather, degrees = np.zeros((len(products), monomials.size)), np.zeros((monomials.size, monomials.degree + 1))
@@ -136,8 +137,9 @@ def lengths(monomials: Monomials, parts: Array) -> tuple[Array, Array, Array]:
 
     Returns
     -------
-    Coefficients ``(n, J + 1, M)``, their errors ``(n,)``, and how far the bound may be above the length in addition,
-    ``(n,)``; infinite where a vector may come near 0.
+    tuple[Array, Array, Array]
+        Coefficients ``(n, J + 1, M)``, their errors ``(n,)``, and how far the bound may be above the length in
+        addition, ``(n,)``; infinite where a vector may come near 0.
     """
     none = np.zeros(len(parts))
     with np.errstate(over="ignore", invalid="ignore"):

@@ -118,9 +118,9 @@ class Shape(ABC):
 
         Returns
         -------
-        Points ``w (k, d)`` and ``excess (k,)`` with ``h(f) <= w'f + excess`` for every ``f`` within ``spread`` of
-        ``value``.
-        The bound is sharp where ``spread`` is 0.
+        tuple[Array, Array]
+            Points ``w (k, d)`` and ``excess (k,)`` with ``h(f) <= w'f + excess`` for every ``f`` within ``spread`` of
+            ``value``. The bound is sharp where ``spread`` is 0.
         """
 
     @property
