@@ -10,7 +10,9 @@ from typing import Literal, TypeAlias, TypeVar, final
 
 TOLERANCE = 1e-9  # relative to a constraint's own unit: a violation of at most this counts as none
 EQUALITY = 1e-12  # relative to the terms of an equality: the largest residual that double precision may leave
-FIGURES = 1e-11  # relative to max(|figure|, 1): how closely a written figure must agree with the derived one
+# How closely a written figure must agree with the derived one. The difference is relative to the figure, or, where that
+# is larger, to 1; for a cost, to a share of its terms in place of 1.
+FIGURES = 1e-11
 # A share of the terms of a cost. Where terms cancel, a cost must agree to `FIGURES` times this share of its terms: to
 # 1e-14 of the terms, some forty rounding errors. A value ten times smaller would refuse honest costs of 0, because
 # their terms were rounded. Whether a gap is closed is judged by the larger of the derived and the written cost.
