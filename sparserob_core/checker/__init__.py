@@ -1,1 +1,1 @@
-"""Verification of a finished run in ball arithmetic; shares no code with what solved it."""
+"""The verification of a finished run in ball arithmetic; it shares no code with the solvers."""

@@ -1,4 +1,4 @@
-"""What the checker says: one verdict per claim."""
+"""The outcome of a check: one verdict per claim, the tolerances of a comparison, and the time limit."""
 
 from __future__ import annotations
 
@@ -8,37 +8,43 @@ from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Literal, TypeAlias, TypeVar, final
 
-TOLERANCE = 1e-9  # of a constraint's own unit: a violation of at most this counts as none
-EQUALITY = 1e-12  # of the numbers that are added up: what double precision leaves of an equality, at most
-FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
-# Of what is added up to a cost: so much must agree to `FIGURES` where terms cancel, that is, to 1e-14 of the terms,
-# some forty roundings. Ten times smaller, and honest costs of 0 are refused, whose terms were rounded. Whether a gap is
-# closed is judged by the cost that is derived, where that is the larger one.
+TOLERANCE = 1e-9  # relative to a constraint's own unit: a violation of at most this counts as none
+EQUALITY = 1e-12  # relative to the terms of an equality: the largest residual that double precision may leave
+# How closely a written figure must agree with the derived one. The difference is relative to the figure, or, where that
+# is larger, to 1; for a cost, to a share of its terms in place of 1.
+FIGURES = 1e-11
+# A share of the terms of a cost. Where terms cancel, a cost must agree to `FIGURES` times this share of its terms: to
+# 1e-14 of the terms, some forty rounding errors. A value ten times smaller would refuse honest costs of 0, because
+# their terms were rounded. Whether a gap is closed is judged by the larger of the derived and the written cost.
 CANCELLED = 1e-3
-RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: TOLERANCE of it is 17 units of rounding
-# Of the numbers that are added up: a set that is thinner is a point to any solver that computes in doubles, and is
-# judged as one, by what is excused of a point. A run's own number is an eighth of it, since sums differ a little.
+RESOLVED = 2.0**-18  # relative to the terms of a sum: the least unit; TOLERANCE of it is 17 units of rounding
+# Relative to the terms of a sum: a thinner set is a point to any solver that computes in doubles. The checker judges
+# it as a point, with the tolerance of a point. A run's own threshold is an eighth of this, since sums differ a little.
 THIN = 2.0**-34
 
-LOOKED = 1024  # items between two looks at the time: some ms; ten times as many may be late, a tenth costs time itself
+LOOKED = 1024  # items between two looks at the clock, some ms; ten times more may stop late, a tenth costs time itself
 
 Item = TypeVar("Item")
 Verdict: TypeAlias = Literal["holds", "fails", "not checked"]
 
 
 class Unchecked(Exception):
-    """A claim that the checker has no means to judge; the sentence says why. Never leaves the checker."""
+    """The exception for a claim that the checker has no means to judge; its sentence says why. It never leaves the
+    checker."""
 
 
 class Broken(Exception):
-    """A claim that is wrong, or a certificate that does not say what it must; the sentence says why. Never leaves the
-    checker."""
+    """The exception for a claim that is wrong, or for a certificate without the entries that it must have.
+
+    Its sentence says why. It never leaves the checker.
+    """
 
 
 @final
 @dataclass(frozen=True)
 class Finding:
-    """What was found about one claim of a run: its ``name``, the ``verdict`` and a sentence with the figures."""
+    """The result for one claim of a run: the ``name`` of the claim, the ``verdict``, and a sentence with the
+    figures."""
 
     name: str
     verdict: Verdict
@@ -48,7 +54,8 @@ class Finding:
 @final
 @dataclass(frozen=True)
 class Clock:
-    """When to stop: ``seconds`` after it was made. What is not decided by then is `Unchecked`."""
+    """The time limit of a check, ``seconds`` after the clock was made. A claim that is undecided by then is
+    `Unchecked`."""
 
     seconds: float = math.inf
     started: float = field(default_factory=perf_counter)
@@ -59,7 +66,7 @@ class Clock:
             raise Unchecked(f"the time limit of {self.seconds:g} s was reached")
 
     def each(self, items: Iterable[Item]) -> Iterator[Item]:
-        """The items one by one, with a look at the time after every `LOOKED` of them: fewer take no time."""
+        """Yield the items one by one, and check the time after every `LOOKED` of them; fewer items cost no time."""
         for number, item in enumerate(items):
             if number and number % LOOKED == 0:
                 self.check()

@@ -1,1 +1,1 @@
-"""Balls, power series of ball matrices, Bernstein maxima."""
+"""Balls, power series of ball matrices, and upper bounds by Bernstein's form."""

@@ -1,10 +1,12 @@
 """Proven upper bounds of polynomials on a box, by Bernstein's form.
 
-On ``[0, 1]^v`` a polynomial is a convex combination of its Bernstein coefficients; the corner ones are values (Farouki
-2012). Halving a box averages coefficients, so the bound converges quadratically, and is exact where the maximum is at a
-corner. Rounding: a conversion is a sum of products, whose error is bounded by the same sum of absolute values; a
-halving is a chain of averages, each with one rounding of numbers no larger than those. A thousand roundings are at most
-`ROUNDING` of them (Higham 2002, section 3.1).
+On ``[0, 1]^v`` a polynomial is a convex combination of its Bernstein coefficients; the corner coefficients are values
+of the polynomial (Farouki 2012). Halving a box averages coefficients. Hence the bound converges quadratically, and is
+exact where the maximum is at a corner.
+
+Rounding: a conversion is a sum of products, whose rounding error is bounded by the same sum of absolute values. A
+halving is a chain of averages of numbers no larger than those, each rounded once. The rounding error of a thousand
+operations is at most `ROUNDING` times the absolute values (Higham 2002, section 3.1).
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ MOST_BOXES = 20_000
 
 @lru_cache(maxsize=32)
 def _conversion(degree: int, symmetric: bool) -> Array:
-    """From powers to Bernstein coefficients on ``[0, 1]``, ``(degree + 1, degree + 1)``; with ``symmetric`` from powers
-    on ``[-1, 1]``."""
+    """Return the matrix ``(degree + 1, degree + 1)`` from powers to Bernstein coefficients on ``[0, 1]``; with
+    ``symmetric`` from powers on ``[-1, 1]``."""
     rows = np.array(
         [[comb(i, j) / comb(degree, j) if j <= i else 0.0 for j in range(degree + 1)] for i in range(degree + 1)]
     )
@@ -42,10 +44,16 @@ def _conversion(degree: int, symmetric: bool) -> Array:
 
 
 def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = False) -> Array:
-    """Bernstein coefficients of polynomials ``(k, n_1, ..., n_v)`` given by powers; axis ``i`` runs over ``[-1, 1]``
-    where symmetric.
+    """Return the Bernstein coefficients of polynomials that are given by the coefficients of powers.
 
-    ``absolute``: every number in the sums by its absolute value instead, which bounds what rounding may do.
+    Parameters
+    ----------
+    coefficients
+        Coefficients ``(k, n_1, ..., n_v)`` of powers of the ``v`` variables.
+    symmetric
+        For each variable, True where it runs over ``[-1, 1]``, and False where it runs over ``[0, 1]``.
+    absolute
+        True to add up absolute values instead, which bound the rounding error.
     """
     b = np.abs(coefficients) if absolute else coefficients
     for axis, both in enumerate(symmetric):
@@ -56,21 +64,24 @@ def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = F
 
 
 def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit: float) -> Array:
-    """Upper bounds ``(k,)`` of each polynomial plus its ``errors (k,)``: at most ``limit`` where halving boxes shows
-    that, else not sharp."""
+    """Return upper bounds ``(k,)`` of each polynomial plus its ``errors (k,)``.
+
+    A bound is at most ``limit`` where halving boxes can show that; otherwise it is not sharp, and ``inf`` where the
+    coefficients overflow.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         slack = errors + ROUNDING * bernstein(coefficients, symmetric, absolute=True).reshape(
             coefficients.shape[0], -1
         ).max(axis=1)
         b = bernstein(coefficients, symmetric)
-    tame = np.isfinite(b).reshape(b.shape[0], -1).all(axis=1) & np.isfinite(slack)  # of the others nothing is proven
+    tame = np.isfinite(b).reshape(b.shape[0], -1).all(axis=1) & np.isfinite(slack)  # the other bounds are infinite
     owner, b = np.flatnonzero(tame), b[tame]
     bounds = np.where(tame, -np.inf, np.inf)
     for step in range(HALVINGS if owner.size else 0):
         top = b.reshape(b.shape[0], -1).max(axis=1)
         done = top + slack[owner] <= limit
         reached = _corners(b).max(axis=1)
-        hopeless = reached + slack[owner] > limit  # a value that is attained
+        hopeless = reached + slack[owner] > limit  # the polynomial attains this value
         stop = (
             np.zeros(owner.size, dtype=bool)
             if step < HALVINGS - 1 and owner.size <= MOST_BOXES
@@ -94,8 +105,8 @@ def _corners(b: Array) -> Array:
 
 
 def _halved(b: Array) -> Array:
-    """Both halves of every box, along the axis on which the coefficients vary most (de Casteljau), the lower halves
-    first."""
+    """Return both halves of every box, the lower halves first. Each box is halved along the axis on which its
+    coefficients vary most (de Casteljau)."""
     spread = np.stack(
         [np.abs(np.diff(b, axis=axis)).reshape(b.shape[0], -1).max(axis=1, initial=0.0) for axis in range(1, b.ndim)],
         axis=1,

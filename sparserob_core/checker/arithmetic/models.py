@@ -16,9 +16,9 @@ from sparserob_core.checker.outcome import Unchecked
 if TYPE_CHECKING:
     from flint import arb, arb_poly, arb_series
 
-LARGEST_POWER = 64  # of a natural number, what is multiplied out
-ENOUGH = 2.0**-110  # of a function, what its series may leave out: less takes terms that nothing shows
-NEWTON = 80  # steps, each halves at least; with a tenth of them long ellipses get wide balls
+LARGEST_POWER = 64  # the largest integer exponent for which a power is multiplied out
+ENOUGH = 2.0**-110  # the relative remainder of a function's series: a smaller one takes terms without a visible effect
+NEWTON = 80  # steps, each at least halves the error; with a tenth of them long ellipses get wide balls
 
 Part: TypeAlias = "arb_poly | None"
 
@@ -26,22 +26,25 @@ Part: TypeAlias = "arb_poly | None"
 @final
 @dataclass(frozen=True)
 class Frame:
-    """What models are polynomials of: the time, from -1 to 1 across an interval, up to an ``order``; and the
-    ``monomials`` of parameters, from -1 to 1 across a box."""
+    """The variables of models, and the degrees that models keep.
+
+    The time runs from -1 to 1 across an interval, up to an ``order``. The ``monomials`` are those of parameters, which
+    run from -1 to 1 across a box.
+    """
 
     monomials: Monomials
     order: int
 
     def number(self, value: arb) -> Model:
-        """The model of what depends on nothing."""
+        """Return the model of a constant."""
         return self._of([value])
 
     def time(self, middle: arb, half: arb) -> Model:
-        """The model of ``middle + half r``."""
+        """Return the model of ``middle + half r``, with the time ``r`` in ``[-1, 1]``."""
         return self._of([middle, half])
 
     def parameter(self, place: int, middle: arb, half: arb) -> Model:
-        """The model of ``middle + half s_place``."""
+        """Return the model of ``middle + half s_place``, with the parameter ``s_place`` in ``[-1, 1]``."""
         from flint import arb_poly
 
         found = self.number(middle)
@@ -57,9 +60,11 @@ class Frame:
 
 @final
 class Model:
-    """``sum_k parts_k(r) s^k``, ``r`` the time and ``s`` the parameters: at every ``(r, s)`` the number is one that the
-    balls allow. What products have beyond the frame is in the balls before their lowest powers, since ``|r|, |s| <=
-    1``."""
+    """A number ``sum_k parts_k(r) s^k`` that depends on the time ``r`` and the parameters ``s``.
+
+    At every ``(r, s)`` the true number lies in the ball that the coefficients give. Terms of a product beyond the
+    degrees of the frame are bounded, since ``|r|, |s| <= 1``, and added to the radius of the lowest coefficient.
+    """
 
     __slots__ = ("frame", "parts")
 
@@ -68,13 +73,13 @@ class Model:
 
     @property
     def constant(self) -> arb:
-        """What does not depend on anything."""
+        """The term that depends on neither the time nor a parameter."""
         first = self.parts[0]
         return ball(0) if first is None else first[0]
 
     @property
     def size(self) -> arb:
-        """The most that it can be."""
+        """The upper bound of the absolute value."""
         return sum((_size(part) for part in self.parts if part is not None), ball(0))
 
     def _other(self, value: object) -> Model:
@@ -113,7 +118,7 @@ class Model:
         return Model(self.frame, found)._within(_beyond(monomials, self.parts, right))
 
     def _within(self, beyond: arb) -> Model:
-        """The model up to its order in the time, and a number that is at most so large."""
+        """Return the model up to its order in the time, with a remainder of at most ``beyond`` added."""
         from flint import arb, arb_poly
 
         parts = list(self.parts)
@@ -148,7 +153,8 @@ class Model:
     __radd__, __rmul__ = __add__, __mul__
 
     def _through(self, function: Callable[[arb_series], Any]) -> Model:
-        """A function of it: its Taylor polynomial at an exact number in the middle, with Lagrange's remainder."""
+        """Return a function of the model: its Taylor polynomial at an exact number in the middle, with Lagrange's
+        remainder."""
         from flint import arb, arb_series, ctx
 
         c = arb(self.constant.mid())
@@ -197,7 +203,7 @@ class Model:
         return self._through(lambda s: _steep(s, s[0].tanh(), s[0].sech() ** 2, -1))
 
     def kepler(self, eccentricity: float) -> Model:
-        """The ``E`` with ``E - e sin E`` equal to it."""
+        """Return the ``E`` that solves Kepler's equation ``E - e sin E = M``, where the model is ``M``."""
         return self._through(lambda s: kepler_series(s, eccentricity, s.prec))
 
 
@@ -206,7 +212,7 @@ def _size(part: arb_poly) -> arb:
 
 
 def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -> arb:
-    """How large the terms of a product are whose degree in the parameters is more than is kept."""
+    """Return an upper bound of the terms of a product whose degree in the parameters is above the kept degree."""
     if not monomials.degree:
         return ball(0)
     sizes = [[ball(0)] * (monomials.degree + 1) for _ in range(2)]
@@ -222,8 +228,12 @@ def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -
 
 
 def _steep(argument: arb_series, value: arb, slope: arb, sign: int) -> arb_series:
-    """The tangent of ``c + s``, or with the ``sign`` -1 the hyperbolic one, from its value and its slope at ``c``: ``g'
-    = h`` and ``h = 1 + sign g g``, so that ``h' = 2 sign g h``; of wide balls less is lost than by quotients."""
+    """Return the tangent of ``c + s``, or with the ``sign`` -1 the hyperbolic one, from its value and its slope at
+    ``c``.
+
+    With ``g' = h`` and ``h = 1 + sign g g`` it is ``h' = 2 sign g h``. For wide balls this recursion is sharper than
+    quotients.
+    """
     from flint import arb_series
 
     g, h = [value], [slope]
@@ -234,8 +244,10 @@ def _steep(argument: arb_series, value: arb, slope: arb, sign: int) -> arb_serie
 
 
 def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_series:
-    """The first ``length`` terms of the ``E`` with ``E - e sin E`` equal to a series ``M``, whatever number of a ball
-    its constant is: from ``E' = M' + e E' cos E``, term by term."""
+    """Return the first ``length`` terms of the ``E`` with ``E - e sin E`` equal to a series ``M``.
+
+    The constant of ``M`` may be any number of a ball. The terms follow from ``E' = M' + e E' cos E``, one by one.
+    """
     from flint import arb, arb_series
 
     e, M = arb(eccentricity), anomaly[0]
@@ -253,8 +265,11 @@ def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_
 
 
 def kepler_root(anomaly: arb, e: arb) -> arb:
-    """A ball around the ``E`` with ``E - e sin E = M`` of a number ``M``: by Newton's method, and then as far to either
-    side as the sign of the equation shows."""
+    """Return a ball that contains the ``E`` with ``E - e sin E = M`` for a number ``M``.
+
+    Newton's method finds the middle. The radius is one at which the sign of the residual changes; raise `Unchecked`
+    where none is found.
+    """
     from flint import arb, ctx
 
     E = anomaly

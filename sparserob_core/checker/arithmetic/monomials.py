@@ -13,40 +13,40 @@ import numpy as np
 @final
 @dataclass(frozen=True)
 class Monomials:
-    """The monomials of at most ``degree`` in ``count`` variables, by degree; number 0 is the constant."""
+    """The monomials of at most ``degree`` in ``count`` variables, in increasing degree; number 0 is the constant."""
 
     count: int
     degree: int
 
     @property
     def exponents(self) -> list[tuple[int, ...]]:
-        """Exponent vectors, in increasing degree."""
+        """The exponent vectors, in increasing degree."""
         return _exponents(self.count, self.degree)
 
     @property
     def number(self) -> dict[tuple[int, ...], int]:
-        """The place of an exponent vector."""
+        """The number of the monomial with an exponent vector."""
         return _places(self.count, self.degree)
 
     @property
     def products(self) -> list[tuple[int, int, int]]:
-        """All ``(i, j, k)`` with monomial ``i`` times monomial ``j`` equal to monomial ``k``."""
+        """All ``(i, j, k)`` where monomial ``i`` times monomial ``j`` is monomial ``k``."""
         return _products(self.count, self.degree)
 
     @property
     def products_with(self) -> list[list[tuple[int, int]]]:
-        """The same for every monomial ``i``: all ``(j, k)``."""
+        """For every monomial ``i``, all ``(j, k)`` where monomial ``i`` times monomial ``j`` is monomial ``k``."""
         return _products_with(self.count, self.degree)
 
     @property
     def quotients(self) -> np.ndarray:
-        """By which monomial a first one has to be multiplied for a second one, ``(size, size)``: its number; -1: by
-        none."""
+        """The table ``(size, size)`` of quotients: entry ``(i, k)`` is the ``j`` where monomial ``i`` times monomial
+        ``j`` is monomial ``k``, and -1 where none is."""
         return _quotients(self.count, self.degree)
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """The number of monomials."""
         return len(self.exponents)
 
     @property
@@ -56,11 +56,11 @@ class Monomials:
 
     @property
     def firsts(self) -> list[int]:
-        """The place of the first monomial of every degree."""
+        """The number of the first monomial of every degree."""
         return _firsts(self.count, self.degree)
 
     def linear(self, variable: int) -> int:
-        """The place of a variable alone."""
+        """Return the number of the monomial that is one variable alone."""
         return self.number[tuple(int(i == variable) for i in range(self.count))]
 
 

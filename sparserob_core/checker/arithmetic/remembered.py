@@ -1,4 +1,4 @@
-"""Methods whose latest values are remembered."""
+"""The decorator of methods whose latest values are remembered."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ T = TypeVar("T")
 def remembered(
     most: Callable[[], int] | None = None, key: Callable[..., Hashable] | None = None
 ) -> Callable[[Callable[Concatenate[S, P], T]], Callable[Concatenate[S, P], T]]:
-    """Return a decorator that remembers so many values of a method with every object: then the oldest are forgotten.
+    """Return a decorator that remembers values of a method on each object; beyond the limit the oldest are forgotten.
 
     Parameters
     ----------
     most
-        How many values, asked for whenever one is made; all of them without it.
+        A function that returns the limit, called whenever a value is made; without it all values are remembered.
     key
-        What values are told apart by, from the object and the arguments; by the arguments themselves without it.
+        A function of the object and the arguments that returns what a value is stored under; without it the arguments.
     """
 
     def of(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:

@@ -16,26 +16,29 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-OUTWARD = 1.0 + 1e-12  # on sums of a few hundred numbers, each rounded
-TINY = 1e-300  # for what is too small to be a float
+OUTWARD = 1.0 + 1e-12  # factor on sums of a few hundred numbers, above their rounding error
+TINY = 1e-300  # bound of a positive number that is too small to be a float
 
 
 @final
 class Series:
-    """``sum_k parts_k s^k``: at all parameters ``s`` from -1 to 1 the matrix is one that the balls allow. What products
-    have beyond the degree of the ``monomials`` is in the balls of the first part."""
+    """A matrix ``sum_k parts_k s^k`` that depends on the parameters ``s``, each from -1 to 1.
+
+    At every ``s`` the true matrix lies in the balls that the coefficients give. Terms of products beyond the degree of
+    the ``monomials`` are in the balls of the first part.
+    """
 
     def __init__(self, monomials: Monomials, parts: Sequence[arb_mat]) -> None:
         self.monomials, self.parts = monomials, list(parts)
 
     @staticmethod
     def constant(monomials: Monomials, value: arb_mat) -> Series:
-        """A matrix that does not depend on the parameters."""
+        """Return a matrix that does not depend on the parameters."""
         return Series(monomials, [value] + [value * 0] * (monomials.size - 1))
 
     @staticmethod
     def known(value: arb_mat) -> Series:
-        """A matrix where there are no parameters."""
+        """Return a matrix where there are no parameters."""
         return Series(NONE, [value])
 
     @property
@@ -46,20 +49,20 @@ class Series:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """How many rows and columns it has."""
+        """The numbers of rows and of columns."""
         return self.parts[0].nrows(), self.parts[0].ncols()
 
     @cached_property
     def there(self) -> list[bool]:
-        """Which coefficients are not exactly 0: those of a system are few."""
+        """The coefficients that are not exactly 0, as Booleans: those of a system are few."""
         zero = self.parts[0] * 0
         absent = [part == zero for part in self.parts]  # certainly equal; != is certainly different
         return [not gone for gone in absent]
 
     @cached_property
     def sizes(self) -> Array:
-        """Of every degree how large the entries of its coefficients are together at most, ``(D + 1, rows,
-        columns)``."""
+        """For every degree, upper bounds ``(D + 1, rows, columns)`` of the sums of the absolute values of its
+        coefficients."""
         there = [part for part, here in zip(self.parts, self.there, strict=True) if here]
         entries = np.array([float(x.abs_upper()) for part in there for x in part.entries()])
         found = np.zeros((self.monomials.size, *self.shape))
@@ -68,14 +71,14 @@ class Series:
 
     @cached_property
     def size(self) -> Array:
-        """How large the entries are at most, ``(rows, columns)``."""
+        """The upper bounds ``(rows, columns)`` of the absolute values of the entries."""
         entries = np.array([float(x.abs_upper()) for part in self.parts for x in part.entries()])
         found = np.where(entries > 0.0, entries + TINY, 0.0)
         return np.asarray(found.reshape(len(self.parts), *self.shape).sum(axis=0) * OUTWARD)
 
     @property
     def middle(self) -> Series:
-        """The same with the middles of the balls."""
+        """The series of the middles of the balls."""
         return Series(self.monomials, [part.mid() for part in self.parts])
 
     def __add__(self, other: Series) -> Series:
@@ -96,31 +99,33 @@ class Series:
                     total[k] = term if so_far is None else so_far + term
         zero = zeros(self.shape[0], other.shape[1])
         found = Series(self.monomials, [zero if part is None else part for part in total])
-        later = np.cumsum(other.sizes[:0:-1], axis=0)  # of the last degree, the last two, ...
+        later = np.cumsum(other.sizes[:0:-1], axis=0)  # sums over the last degree, the last two, ...
         beyond = sum((self.sizes[i] @ later[i - 1] for i in range(1, len(self.sizes))), np.zeros(found.shape))
         return found.within(beyond * OUTWARD) if beyond.any() else found
 
     def within(self, off: Array) -> Series:
-        """All that are off from it by at most ``off (rows, columns)`` at every parameter."""
+        """Return the series with radii that contain every matrix within ``off (rows, columns)`` of it at every
+        parameter."""
         return Series(self.monomials, [self.parts[0] + around(off), *self.parts[1:]])
 
     def scaled(self, factor: arb | arb_mat) -> Series:
-        """Every coefficient times a number, or a matrix, that does not depend on the parameters."""
+        """Return the series times a number, or times a matrix from the right, that does not depend on the
+        parameters."""
         return Series(self.monomials, [part * factor for part in self.parts])
 
     def along(self, rows: arb_mat) -> Series:
-        """The product of a matrix that does not depend on the parameters with it."""
+        """Return the product of a matrix that does not depend on the parameters with the series."""
         return Series(self.monomials, [rows * part for part in self.parts])
 
     def columns(self, first: int, last: int | None) -> Series:
-        """Some of the columns."""
+        """Return the columns from ``first`` up to, but without, ``last``."""
         from flint import arb_mat
 
         n, tables = self.shape[0], [[row[first:last] for row in part.tolist()] for part in self.parts]
         return Series(self.monomials, [arb_mat(n, len(rows[0]), [x for row in rows for x in row]) for rows in tables])
 
     def beside(self, other: Series) -> Series:
-        """With another one at its right."""
+        """Return the series with the columns of another one at its right."""
         from flint import arb_mat
 
         (n, p), q = self.shape, other.shape[1]
@@ -129,25 +134,25 @@ class Series:
         return Series(self.monomials, [arb_mat(n, p + q, entries) for entries in every])
 
     def above(self, below: arb_mat) -> Series:
-        """With the rows of a matrix below that does not depend on the parameters."""
+        """Return the series with the rows of a matrix below it that does not depend on the parameters."""
         none = (below * 0).tolist()
         first, *others = (part.tolist() for part in self.parts)
         return Series(self.monomials, [stacked(first + below.tolist()), *(stacked(part + none) for part in others)])
 
     def transpose(self) -> Series:
-        """The transposed one."""
+        """Return the transpose."""
         return Series(self.monomials, [part.transpose() for part in self.parts])
 
 
 def sizes_of(series: Sequence[Series]) -> Array:
-    """How large the entries of series of one shape are at most, ``(n, rows, columns)``."""
+    """Return upper bounds ``(n, rows, columns)`` of the absolute values of the entries of series of one shape."""
     return np.array([one.size for one in series])
 
 
 def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
-    """The sum of the products of some series with others."""
+    """Return the sum of the products of some series with others."""
     pairs = [(a, b) for a, b in zip(left, right, strict=True) if any(a.there)] or [(left[0], right[0])]
-    if left[0].monomials.size == 1:  # ten times as quick as series are
+    if left[0].monomials.size == 1:  # plain products are ten times as quick
         total = pairs[0][0].parts[0] * pairs[0][1].parts[0]
         for a, b in pairs[1:]:
             total = total + a.parts[0] * b.parts[0]
@@ -159,33 +164,33 @@ def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
 
 
 def identity(count: int) -> arb_mat:
-    """The matrix of ones on the diagonal."""
+    """Return the identity matrix."""
     from flint import arb_mat
 
     return arb_mat(count, count, [int(i == j) for i in range(count) for j in range(count)])
 
 
 def zeros(rows: int, columns: int) -> arb_mat:
-    """A matrix of zeros."""
+    """Return a matrix of zeros."""
     from flint import arb_mat
 
     return arb_mat(rows, columns)
 
 
 def stacked(table: Sequence[Sequence[arb]]) -> arb_mat:
-    """A ball matrix from its rows."""
+    """Return a ball matrix from its rows."""
     from flint import arb_mat
 
     return arb_mat([list(row) for row in table])
 
 
 def exactly(rows: Array | arb_mat) -> arb_mat:
-    """Rows of floats as balls."""
+    """Return rows of floats as a ball matrix; a ball matrix is returned as it is."""
     return stacked([balls(row) for row in rows]) if isinstance(rows, np.ndarray) else rows
 
 
 def around(off: Array) -> arb_mat:
-    """Balls around 0 with these radii."""
+    """Return balls around 0 with these radii; raise `Unchecked` where a radius is not finite."""
     from flint import arb, arb_mat
 
     if not np.isfinite(off).all():
@@ -195,23 +200,25 @@ def around(off: Array) -> arb_mat:
 
 
 def middles(matrix: arb_mat) -> Array:
-    """The middles of balls."""
+    """Return the middles of the balls of a matrix as floats."""
     return np.array([[float(x) for x in row] for row in matrix.tolist()])
 
 
 def norm(matrix: arb_mat) -> arb:
-    """The Frobenius norm, which bounds the 2-norm."""
+    """Return the Frobenius norm, which bounds the 2-norm."""
     return (matrix.transpose() * matrix).trace().nonnegative_part().sqrt()
 
 
 def products(steps: Sequence[Series]) -> list[Series]:
-    """``Z_k = Phi_N ... Phi_{k+1}`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``: from the products of pairs
-    of them, each of which is made of at most twice as many products as there are levels."""
+    """Return ``Z_k = Phi_N ... Phi_{k+1}`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``.
+
+    Products are made in pairs, level by level. Each ``Z_k`` is then made of at most two products for each level.
+    """
     unit = Series.constant(steps[0].monomials, identity(steps[0].shape[0]))
     if len(steps) == 1:
         return [steps[0], unit]
     odd = len(steps) % 2
-    made = dict[tuple[int, int], Series]()  # steps that are one object have products that are one
+    made = dict[tuple[int, int], Series]()  # equal pairs of objects share one product
     pairs = []
     for first, second in zip(steps[:-1:2], steps[1::2], strict=False):
         key = id(first), id(second)

@@ -1,4 +1,4 @@
-"""Whether cells fill a box: exact, in rational arithmetic."""
+"""The test for whether cells fill a box: exact, in rational arithmetic."""
 
 from __future__ import annotations
 
@@ -15,9 +15,15 @@ MOST_CELLS = 100_000
 def fill(lower: Array, upper: Array, low: Array, high: Array, clock: Clock = NO_LIMIT) -> None:
     """Raise `Broken` unless the cells ``[lower_i, upper_i]`` (``(k, d)``) fill the box ``[low, high]`` without overlap.
 
-    Cells inside the box, disjoint but for their faces, with the box's volume between them, fill it. A coordinate in
-    which the box is a point is left out of the volume, and must be that point in every cell. Raises `Unchecked` when
-    the time is up.
+    Cells fill the box where they lie inside, share no more than faces, and have the volume of the box together. A
+    coordinate in which the box is a point does not count in the volume, and must be that point in every cell.
+
+    Raises
+    ------
+    Broken
+        Where a cell lies outside, two cells overlap, or a part of the box is not covered.
+    Unchecked
+        Where the time is up, or there are too many cells.
     """
     if (
         lower.ndim != 2
@@ -39,7 +45,7 @@ def fill(lower: Array, upper: Array, low: Array, high: Array, clock: Clock = NO_
     if _overlap(a, b, clock):
         raise Broken("two cells overlap")
     missing = _volume(low[thick], high[thick])
-    if a.shape[1] == 1:  # in order, without overlap: what is left out lies between neighbours and before the first
+    if a.shape[1] == 1:  # gaps lie between neighbours in order, before the first or after the last
         order = np.lexsort((b[:, 0], a[:, 0]))
         starts, stops = np.append(a[order, 0], high[thick]), np.append(low[thick], b[order, 0])
         missing = sum((Fraction(x) - Fraction(y) for x, y in zip(starts, stops, strict=True) if x != y), Fraction(0))
@@ -52,8 +58,8 @@ def fill(lower: Array, upper: Array, low: Array, high: Array, clock: Clock = NO_
 
 
 def _overlap(a: Array, b: Array, clock: Clock) -> bool:
-    """Whether two of the cells ``[a_i, b_i]`` share more than a face."""
-    if a.shape[1] == 1:  # in order, only neighbours can; of two that begin at once, the shorter is first
+    """Return True where two of the cells ``[a_i, b_i]`` share more than a face."""
+    if a.shape[1] == 1:  # in order, only neighbours can overlap; of two with one start, the shorter is first
         order = np.lexsort((b[:, 0], a[:, 0]))
         return bool((b[order[:-1], 0] > a[order[1:], 0]).any())
     return any(

@@ -1,9 +1,9 @@
 """Weak duality in ball arithmetic: a lower bound of the cost, or the proof that no control is feasible.
 
-For multipliers ``y >= 0`` of constraints ``c'x(t) + sigma <= h(c)`` and any ``nu`` of equalities, no admissible control
-costs less than ``sum_i y_i (c_i'e^{A t_i} x(0) + sigma_i - h(c_i)) + min_u J(u) + sum_i y_i g_i u``, the minimum over
-the controls' set alone, piece by piece. With ``J`` left out, a positive number proves that nothing is feasible
-(Farkas).
+Let ``y >= 0`` be multipliers of constraints ``c'x(t) + sigma <= h(c)``, and ``nu`` any multipliers of equalities. Then
+no admissible control costs less than ``sum_i y_i (c_i'e^{A t_i} x(0) + sigma_i - h(c_i)) + min_u J(u) + sum_i y_i g_i
+u``. The minimum is over the controls' set alone, piece by piece. Without ``J``, a positive number proves that nothing
+is feasible (Farkas).
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ EFFORT = "effort"
 @final
 @dataclass(frozen=True, eq=False)
 class ConstraintRow:
-    """``constant + sum_k slope_k u_k + sizes_k |u_k| <= charged`` for every feasible control; ``slope`` is a list of
-    ``m`` balls per piece of the control, ``sizes (K, m)`` are numbers that are not negative, or there are none.
+    """The inequality ``constant + sum_k slope_k u_k + sizes_k |u_k| <= charged`` of every feasible control.
 
-    A control that answers is ``u_k = v_k + sum_j M_kj innovations_j`` at the deviations that a certificate names, with
-    ``innovations (K, p)``; of one that answers nothing there are none, and the row is that of the worst deviations.
+    ``slope`` is a list of ``m`` balls per piece of the control; ``sizes (K, m)`` are nonnegative numbers, or ``None``.
+
+    A control with feedback is ``u_k = v_k + sum_j M_kj innovations_j`` at the deviations that a certificate names, with
+    ``innovations (K, p)``. A control without feedback has no innovations, and its row is that of the worst deviations.
     ``charged`` is 0, or with ``(k, i)`` the peak of that piece and channel, or with `EFFORT` the effort.
     """
 
@@ -57,9 +58,12 @@ class ConstraintRow:
 @final
 @dataclass(frozen=True, eq=False)
 class Duality:
-    """The data that bounds are derived from. ``changes``: where the disturbance may jump, ``None`` when there is
-    none, and ``held`` the set of what of it stays the same between these; ``flows``: those of the system;
-    ``lasting``: which components stay longer what they are."""
+    """The data from which lower bounds are derived.
+
+    ``changes`` are the times at which the disturbance may jump, ``None`` without a disturbance. ``held`` is the set of
+    the disturbances that are constant between these times. ``flows`` are those of the system. ``lasting`` says which
+    components are held over several intervals.
+    """
 
     problem: OptimalControlProblem
     control: Dictionary
@@ -69,19 +73,26 @@ class Duality:
     lasting: Lasting | None = None
 
     def control_piece(self, time: float) -> int:
-        """The piece of the control that is commanded at a time."""
+        """Return the piece of the control that is commanded at a time."""
         place = int(np.searchsorted(self.control.breakpoints, time, side="right")) - 1
         return min(max(place, 0), self.control.pieces - 1)
 
     def control_row(self, direction: Array, time: float) -> ConstraintRow:
-        """``c'u(t) <= h(c)`` for the set of controls."""
+        """Return the row of ``c'u(t) <= h(c)`` for the set of controls."""
         piece = self.control_piece(time)
         slope = [[ball(0.0)] * direction.size for _ in range(self.control.pieces)]
         slope[piece] = [ball(c) for c in direction]
         return ConstraintRow(-known(self.problem.control).limit(direction), slope)
 
     def step_row(self, direction: Array, time: float) -> ConstraintRow:
-        """``c'(u_k - u_{k-1}) <= h(c)`` for the step at a breakpoint, ``u_{-1}`` the control before time 0."""
+        """Return the row of ``c'(u_k - u_{k-1}) <= h(c)`` for the step at a breakpoint, ``u_{-1}`` the control before
+        time 0.
+
+        Raises
+        ------
+        Broken
+            Where the problem has no such constraint, or no step at the time.
+        """
         if self.problem.control_step is None:
             raise Broken("the problem has no constraint 'control_step'")
         found = [k for k in steps(self.problem, self.control) if float(self.control.breakpoints[k]) == time]
@@ -89,7 +100,7 @@ class Duality:
             raise Broken(f"control_step: there is no step at t = {time!r}")
         (k,) = found
         slope = [[ball(0.0)] * direction.size for _ in range(self.control.pieces)]
-        after = k % self.control.pieces  # after the last piece comes the first one
+        after = k % self.control.pieces  # the first piece follows the last one
         slope[after] = [ball(c) for c in direction]
         constant = -known(self.problem.control_step).limit(direction)
         if k > 0:
@@ -102,11 +113,13 @@ class Duality:
     def row(
         self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True
     ) -> ConstraintRow:
-        """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
-        it."""
+        """Return the row of ``c'x(t) <= limit`` at one parameter.
+
+        With ``disturbed`` it is the row of the worst disturbance and initial state; otherwise of none.
+        """
         m, problem = self.problem.system.controls, self.problem
         delay, jumps = problem.system.delay, self.changes or []
-        breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
+        breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # times at which a piece begins to act
         begins = sorted({0.0, *(s for s in (*breaks, *jumps) if s < time)})
         weights = self.flows.at(parameter).weights([*begins, time])
         row, start = exactly(direction[None]), np.asarray(problem.initial_state)
@@ -132,8 +145,10 @@ class Duality:
         return ConstraintRow(constant, slope)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:
-        """What every block of the disturbance gives to ``c'x(t)`` of a known system, ``(mw,)`` each; the blocks begin
-        at ``jumps``, or where those of the problem do."""
+        """Return the coefficients ``(mw,)`` of every block of the disturbance in ``c'x(t)``, for a known system.
+
+        The blocks begin at ``jumps``, or by default at the `changes` of the problem.
+        """
         jumps = self.changes if jumps is None else jumps
         if not jumps:
             return []
@@ -144,7 +159,7 @@ class Duality:
         return [given[s] if s < time else late for s in jumps]
 
     def carried(self, direction: Array, time: float) -> list[arb]:
-        """What the initial state of a known system gives to ``c'x(t)``, ``(d,)``."""
+        """Return the coefficients ``(d,)`` of the initial state in ``c'x(t)``, for a known system."""
         row = exactly(direction[None])
         return list((row * self.flows.at(()).weights([0.0, time]).free).entries())
 
@@ -157,10 +172,23 @@ class Duality:
         lengths: bool = True,
         norms: Array | None = None,
     ) -> arb:
-        """The bound that multipliers ``y`` of ``rows`` give; with the ``price``, or without as a proof of
-        infeasibility. Quadratic terms, and norms, are replaced by their tangents at the control ``touched (m, 1)`` on
-        every piece, norms also by the vectors ``norms (m, K)``. ``lengths``: whether absolute values of this control
-        are charged, or of another one."""
+        """Return the lower bound that multipliers of rows prove.
+
+        Parameters
+        ----------
+        rows
+            Multipliers ``y``, each with its row.
+        pieces
+            The negated slopes ``(m, K)`` of the certificate, for a dictionary with fewer functions than pieces.
+        price
+            The cost; ``None`` to prove infeasibility.
+        touched
+            The control ``(m, 1)`` on every piece at which quadratic terms, and norms, are replaced by their tangents.
+        lengths
+            True where absolute values of this control are charged, False where those of another one are.
+        norms
+            Vectors ``(m, K)`` for tangents of norms, besides those at ``touched``.
+        """
         tangent = None if price is None or touched is None or not price.is_quadratic else price.tangent(touched)
         constant, slopes = self.summed(rows, pieces, tangent)
         charges = price if lengths else None
@@ -186,13 +214,14 @@ class Duality:
         at: Sequence[arb],
         offered: Sequence[arb] | None,
     ) -> arb:
-        """At most the least cost with norms of groups: ``weight |s| >= d's`` for any ``|d| <= weight``, that which the
-        slope asks for, that of the tangent or one that is ``offered``; each group the best one, for a set that is a
-        box, else all the same. What absolute values cost beside them, ``sizes``, is taken from what is asked for and
-        offered.
+        """Return a lower bound of the least cost with norms of groups: ``weight |s| >= d's`` for any ``|d| <= weight``.
 
-        In a corner of slanted sides the one that bounds most is between these two: the multipliers of the sides take a
-        part of what the slope asks for, and a tangent at a control that is off by a little tilts the corner.
+        The vector ``d`` is the one that balances the slope, that of the tangent, or one that is ``offered``. For a box
+        each group has the best of the three; for another set all groups have the same. The cost ``sizes`` of absolute
+        values is subtracted from the balancing and the offered vectors.
+
+        In a corner of oblique facets the best vector is between the first two. The multipliers of the facets compensate
+        a part of the slope, and a tangent at a slightly wrong control tilts the corner.
         """
         asked = _shrunk([ball(-float(s)) for s in slope], sizes)
         given = [] if offered is None else [(_within, _shrunk(offered, sizes))]
@@ -221,8 +250,9 @@ class Duality:
         pieces: Sequence[Sequence[float]] | None,
         tangent: Tangent | None = None,
     ) -> tuple[arb, list[list[arb]]]:
-        """The sum of ``rows`` times their multipliers ``y``, and of a ``tangent``: its constant, and its slopes on
-        every piece; with fewer functions than ``pieces``, in the slopes of these."""
+        """Return the sum of ``rows`` times their multipliers ``y``, plus a ``tangent``: its constant, and its slopes on
+        every piece. Where the dictionary has fewer functions than pieces, the slopes are those of ``pieces`` with the
+        opposite sign."""
         constant = sum((ball(y) * row.constant for y, row in rows), ball(0.0))
         m, K = self.problem.system.controls, self.control.pieces
         slopes = [
@@ -243,8 +273,8 @@ class Duality:
         return constant, slopes
 
     def charged(self, rows: Sequence[tuple[float, ConstraintRow]], costs: list[list[arb]]) -> list[list[arb]]:
-        """What absolute values cost on every piece, ``m`` balls each, with what ``rows`` times their multipliers say of
-        them."""
+        """Return the cost of absolute values on every piece, ``m`` balls each: ``costs`` plus ``sizes`` of ``rows``
+        times their multipliers."""
         found = costs
         for y, row in rows:
             if row.sizes is not None:
@@ -253,10 +283,10 @@ class Duality:
         return found
 
     def _moved(self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]) -> tuple[list[list[arb]], arb]:
-        """With fewer functions than pieces, slopes that act alike on every control of the dictionary are as good: those
-        of the certificate.
+        """Return the slopes of the certificate in place of the derived ones, and a bound of the difference.
 
-        What they act differently is bounded by the largest coefficients.
+        With fewer functions than pieces, different slopes have the same effect on every control of the dictionary. The
+        difference of their effects is bounded by the largest coefficients.
         """
         m, K, N = self.problem.system.controls, self.control.pieces, self.control.functions
         mine = [[-ball(pieces[c][k]) for c in range(m)] for k in range(K)]
@@ -279,31 +309,31 @@ class Duality:
 
     @cached_property
     def _pseudoinverse(self) -> list[list[arb]]:
-        """``(V V')^-1 V``: the coefficients of a control in the span of the dictionary."""
+        """The matrix ``(V V')^-1 V``, which gives the coefficients of a control in the span of the dictionary."""
         V = exactly(self.control.values)
         table: list[list[arb]] = ((V * V.transpose()).inv() * V).tolist()
         return table
 
 
 def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
-    """The pieces of a control whose beginning is a step from what was before; of a plan that repeats the end of the
-    last piece too."""
+    """Return the breakpoints of a control at which it steps: the beginnings of its pieces, and for a plan that repeats
+    the end of the last piece. The beginning counts only where an initial control is given."""
     return range(0 if problem.initial_control is not None else 1, control.pieces + bool(problem.repeat))
 
 
 def _shrunk(vector: Sequence[arb], sizes: Sequence[arb]) -> list[arb]:
-    """Exact numbers, each nearer to 0 by a size, or 0."""
+    """Return exact numbers, each moved towards 0 by a size, but not across 0."""
     about = [(float(v), float(size)) for v, size in zip(vector, sizes, strict=True)]
     return [ball(np.sign(v) * max(abs(v) - size, 0.0)) for v, size in about]
 
 
 def _within(vector: Sequence[arb], length: arb) -> Sequence[arb]:
-    """A vector of exact numbers, or where it is longer one in its direction that is as long as that."""
+    """Return a vector of exact numbers, shortened to a length where it is longer."""
     return vector if _squares(vector) <= length * length else _lengthened(vector, length)
 
 
 def _lengthened(vector: Sequence[arb], length: arb) -> list[arb]:
-    """The vector in a direction, of its middle, that is as long as that; 0 where the direction is 0."""
+    """Return the vector of a length in the direction of the middle of another one; 0 where that is 0."""
     vector = [ball(float(v)) for v in vector]
     size = _squares(vector)
     return [length * v / size.sqrt() for v in vector] if size > 0 else [ball(0.0) for _ in vector]

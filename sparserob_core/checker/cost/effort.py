@@ -1,9 +1,10 @@
-"""The largest effort that any deviation causes, bounded in balls: ``max_z sum_k |a_k + A_k z|``.
+"""The largest effort over all deviations, bounded in balls: ``max_z sum_k |a_k + A_k z|``.
 
-The sum is at most ``sum_k (s_k (a_k + A_k z) + h_k)`` where ``s_k`` is the sign of the entry and ``h_k = 0``, or any
-number of ``[-1, 1]`` and ``h_k`` the larger of ``high (1 - s_k)`` and ``-low (1 + s_k)``, for an entry from ``low`` to
-``high``: an absolute value less a line is convex, so largest at an end. The largest value of the right side is in
-closed form. Both signs of one entry after the other are gone through until that is small enough.
+The sum is at most ``sum_k (s_k (a_k + A_k z) + h_k)``. Either ``s_k`` is the sign of the entry and ``h_k = 0``. Or
+``s_k`` is any number of ``[-1, 1]`` and ``h_k`` the larger of ``high (1 - s_k)`` and ``-low (1 + s_k)``, for an entry
+from ``low`` to ``high``: an absolute value minus a linear function is convex, hence largest at an end. The maximum of
+the right side has a closed form. The search branches on the sign of one entry after the other, until the bound is small
+enough.
 """
 
 from __future__ import annotations
@@ -21,17 +22,39 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-MOST = 200_000  # parts that are examined
-TOGETHER = 200
+MOST = 200_000  # parts of the search that are examined at most
+TOGETHER = 200  # parts that are bounded by one product of matrices
 
 
 def at_most(
     a: list[arb], A: list[list[arb]], support: Callable[[list[arb]], arb], reach: Array, limit: arb, clock: Clock
 ) -> int:
-    """Show that the largest effort of ``a (n,)`` and ``A (n, Q)`` is at most the ``limit``; how many parts it took.
+    """Show that the largest effort ``max_z sum_k |a_k + A_k z|`` is at most a limit.
 
-    ``support``: the largest ``z'b`` of ``b (Q,)``; ``reach (Q,)``: about how far deviations go, which decides the order
-    only. Raises `Broken` where the effort is certainly larger, `Unchecked` where that was not decided.
+    Parameters
+    ----------
+    a, A
+        Balls ``(n,)`` and ``(n, Q)``.
+    support
+        The support function of the deviations: the largest ``z'b`` for ``b (Q,)``.
+    reach
+        Approximate bounds ``(Q,)`` of the deviations, which decide only the order of the search.
+    limit
+        The limit to be shown.
+    clock
+        The time limit.
+
+    Returns
+    -------
+    int
+        The number of parts that were examined.
+
+    Raises
+    ------
+    Broken
+        Where the effort is certainly larger.
+    Unchecked
+        Where the question remains undecided.
     """
     high = [x + support(row) for x, row in zip(a, A, strict=True)]
     low = [x - support([-y for y in row]) for x, row in zip(a, A, strict=True)]
@@ -71,7 +94,7 @@ def at_most(
 
 
 def _slope(high: float, low: float) -> float:
-    """The slope of the chord of an absolute value, within ``[-1, 1]``."""
+    """Return the slope of the chord of the absolute value, within ``[-1, 1]``."""
     if low >= 0.0 or high <= 0.0:
         return 1.0 if low >= 0.0 else -1.0
     return float(np.clip((high + low) / (high - low), -1.0, 1.0))

@@ -1,4 +1,4 @@
-"""How far all gains of a control that answers can lower a weighted sum of constraints together."""
+"""The upper bound of how much all gains of a control with feedback can lower a weighted sum of constraints together."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True, eq=False)
 class GainsBound:
-    """The gains with which a control in a set answers, ``answers (K, K)``, what is measured of a ``loop`` at rest."""
+    """The gains with which a control answers the measurements of a ``loop`` at rest.
+
+    ``answers (K, K)`` says which pieces answer which breakpoints, and ``control`` is the set of the control.
+    """
 
     loop: VerifiedLoop
     answers: np.ndarray
@@ -38,7 +41,7 @@ class GainsBound:
     _pushes: dict[tuple[tuple[Fraction, ...], ...], Pushed] = field(default_factory=dict, repr=False)
 
     def of(self, rows: Sequence[tuple[float, ConstraintRow]]) -> arb:
-        """How much the gains can lower the sum of ``rows`` times their multipliers, at most."""
+        """Return an upper bound of how much the gains can lower the sum of ``rows`` times their multipliers."""
         total = ball(0)
         rows = [(y, row) for y, row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
         if not rows:
@@ -65,8 +68,14 @@ class GainsBound:
         return total
 
     def _clusters(self, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
-        """The breakpoints that the control on a piece answers, those that see a block in common together; for each what
-        gives, from a combination of the states seen there, a combination of the blocks, ``(q, J d)``."""
+        """Return the breakpoints that the control on a piece answers, in clusters: those that measure a common block
+        are together.
+
+        Returns
+        -------
+        list[tuple[list[int], arb_mat, list[int]]]
+            For every cluster its breakpoints, the matrix of `_inverse`, and its blocks.
+        """
         groups: list[tuple[list[int], set[int]]] = []
         for j in np.flatnonzero(self.answers[k, : k + 1]).tolist():
             seen = {block for block in self.loop.seen[j] if self._segments[block]}
@@ -82,7 +91,12 @@ class GainsBound:
         return [(sorted(members), *self._inverse(tuple(sorted(members)))) for members, _ in groups]
 
     def _inverse(self, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
-        """What gives, of any combination of the states seen at these breakpoints, one of the blocks that is seen so."""
+        """Return a generalised inverse ``(q, J d)`` of the matrix from the blocks to the states measured at these
+        breakpoints.
+
+        From the measurements of any deviations it gives deviations of the blocks with the same measurements. The second
+        value is the numbers of the blocks.
+        """
         if members not in self._inverses:
             blocks = sorted({block for j in members for block in self.loop.seen[j] if self._segments[block]})
             d = self.loop.outputs
@@ -108,13 +122,13 @@ class GainsBound:
         return self._inverses[members]
 
     def _none_of(self, block: int) -> list[arb]:
-        """Nothing of any of the segments of a block."""
+        """Return zeros, one for each of the segments of a block."""
         return [balls([0.0])[0]] * len(self._segments[block])
 
     def _pushed(self, block: int) -> Pushed:
-        """Who can see the deviations of a block; of the initial state everyone sees its own."""
+        """Return which states can measure the deviations of a block; each state measures its own initial deviation."""
         loop, vectors = self.loop, [vector for vector, _ in self._segments[block]]
-        if loop.measured is not None:  # outputs see what the observer makes of everything: as many as there are
+        if loop.measured is not None:  # through the observer every output may measure every deviation
             return Pushed(np.ones((loop.outputs, len(vectors)), dtype=bool), loop.outputs, len(vectors))
         if loop.initial is not None and block == loop.deviations.begun:
             return Pushed(np.array([[bool(v) for v in row] for row in vectors]).T, len(vectors), len(vectors))
@@ -125,8 +139,8 @@ class GainsBound:
 
     @cached_property
     def _segments(self) -> list[list[tuple[list[Fraction], arb]]]:
-        """Of every block the directions along which its set is long, and how long; none of what cannot deviate, which
-        is never seen."""
+        """For every block the directions along which its set is long, with the lengths; empty for a block that cannot
+        deviate, which is never measured."""
         loop = self.loop
         found = {id(shape): _segments(shape, about) for shape, about in loop.deviations.sets}
         return [found[id(shape)] for shape, _ in loop.deviations.sets]
@@ -141,13 +155,17 @@ def _width(shape: ConvexSet, channel: int) -> arb:
 
 
 def reach(shape: ConvexSet, channel: int) -> arb:
-    """How far a set goes from 0 along a channel, to either side."""
+    """Return the largest absolute value of a channel over a set."""
     return _axis(shape, channel, 1.0).max(_axis(shape, channel, -1.0)).max(_axis(shape, channel, 1.0) * 0)
 
 
 def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb]]:
-    """Vectors ``v (d,)`` that span the directions along which points of a set differ, and numbers ``c > 0`` such that
-    its width along any ``a`` is at least ``c |a'v|``: along the axes, but of a set without an interior."""
+    """Return vectors ``v (d,)`` that span the directions along which points of a set differ, each with a number ``c >
+    0``.
+
+    The width of the set along any ``a`` is at least ``c |a'v|``. The vectors are along the axes, except for a set
+    without an interior.
+    """
     if isinstance(shape, Product):
         return [
             ([*[Fraction(0)] * place.start, *vector, *[Fraction(0)] * (shape.dimension - place.stop)], length)
@@ -166,15 +184,15 @@ def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb
 
 
 def _parts(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]]:
-    """Every part of a product with its part of a point, and its place."""
+    """Return every part of a product, each with its part of a point and its place."""
     ends = np.cumsum([0, *(part.dimension for part in shape.parts)]).tolist()
     places = [slice(begin, end) for begin, end in pairwise(ends)]
     return [(part, middle[place], place) for part, place in zip(shape.parts, places, strict=True)]
 
 
 def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
-    """Numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: how long it is along the
-    axes through its middle."""
+    """Return numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: the lengths of its
+    chords along the axes through its middle."""
     if isinstance(shape, Product):
         return [chord for part, own in shape.split(middle) for chord in _chords(part, own)]
     if isinstance(shape, NormBall):
@@ -196,7 +214,7 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
 
 
 def _onto(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
-    """What every entry is of some segments of a block, that is this of its coordinates."""
+    """Return the matrix of a block times its segments: the coefficients of the segments in every entry."""
     rows, columns = push.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
     return [
         [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in one), ball(0)) for one in columns] for row in rows

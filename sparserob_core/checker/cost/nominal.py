@@ -1,5 +1,5 @@
-"""The integrals of a quadratic cost along the nominal trajectory, and their slopes, in balls: of the polynomials that
-the flow is, none of it shared with what solves."""
+"""The integrals of a quadratic cost along the nominal trajectory, and their slopes, in balls. They are computed from
+the polynomials of the flow, and share no code with the solvers."""
 
 from __future__ import annotations
 
@@ -25,14 +25,18 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-KEPT = 8  # tables of segments, each of which is as large as a hundred matrices
+KEPT = 8  # tables of segments that are remembered, each as large as a hundred matrices
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """The quadratic terms at a control, their derivatives on every piece, the largest radius of them, relative to the
-    sizes that are added up, and ``terms``: the absolute values of all products that are added up to the value."""
+    """The quadratic terms of the cost at a control: their ``value``, and their derivatives ``slope``, ``m`` balls per
+    piece.
+
+    ``blurred`` is the largest radius of these, relative to the largest absolute value of them. ``terms`` is the sum of
+    the absolute values of all products that are added up to the value.
+    """
 
     value: arb
     slope: list[list[arb]]
@@ -41,8 +45,11 @@ class Walk:
 
 
 def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> Walk:
-    """``z = (x, 1, u)`` along the nominal trajectory, and back with the costates of what it costs; a control acts on
-    the state as late as the system says, and costs when it is given."""
+    """Return the quadratic terms of the cost at a control ``(m, 1)`` on every piece, and their derivatives.
+
+    ``z = (x, 1, u)`` is propagated along the nominal trajectory, and the costates of its cost backwards. A control acts
+    on the state after the delay of the system, and costs when it is commanded.
+    """
     from flint import arb, arb_mat
 
     problem, x, walked = nominal.problem, nominal.begin, []
@@ -80,7 +87,7 @@ def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat
 def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
     """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and at the end.
 
-    Every uncertainty is at its nominal point; ``u = 0`` before the first piece acts, and at the end.
+    Every uncertainty is at its nominal point. ``u = 0`` before the first piece acts, and at the end.
     """
     from flint import arb_mat
 
@@ -93,15 +100,17 @@ def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence
 
 
 def _terms(z: arb_mat, M: arb_mat) -> float:
-    """``|z|' |M| |z|``."""
+    """Return ``|z|' |M| |z|``, the sum of the absolute values of all products in ``z'M z``."""
     size = np.array([abs(float(entry)) for entry in z.entries()])
     weight = np.abs([float(entry) for entry in M.entries()]).reshape(size.size, size.size)
     return float(size @ weight @ size)
 
 
 def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[float, float, int]]:
-    """The intervals of time on which one piece of the control acts on one of the systems that take turns, with its
-    number; -1 before the first piece acts."""
+    """Return the intervals of time on which one piece of the control acts in one phase of the system.
+
+    Each interval has the number of its piece; -1 before the first piece acts.
+    """
     delay, horizon = problem.system.delay, float(control.breakpoints[-1])
     begins = [(float(t) + delay, k) for k, t in enumerate(control.breakpoints[:-1]) if float(t) + delay < horizon]
     begins = begins if delay == 0.0 else [(0.0, -1), *begins]
@@ -113,15 +122,18 @@ def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[f
 @final
 @dataclass(frozen=True, eq=False)
 class NominalMotion:
-    """The motion of ``z = (x, 1, u)`` with every uncertainty at its nominal point, of which ``flow`` is the flow there,
-    and the cost of the states. A control stays the same; before the first piece acts it is ``before (m, 1)``."""
+    """The motion of ``z = (x, 1, u)`` with every uncertainty at its nominal point, and the cost of the states.
+
+    ``flow`` is the flow at the nominal parameter. A control is constant on its pieces; before the first piece acts it
+    is ``before (m, 1)``.
+    """
 
     problem: OptimalControlProblem
     flow: VerifiedFlow
 
     @cached_property
     def begin(self) -> arb_mat:
-        """``(x, 1)`` at time 0."""
+        """The vector ``(x, 1)`` at time 0."""
         x, deviations = balls(np.asarray(self.problem.initial_state)), self.problem.initial_set
         if deviations is not None:
             x = [a + b for a, b in zip(x, balls(nominal_point(deviations)), strict=True)]
@@ -129,7 +141,7 @@ class NominalMotion:
 
     @cached_property
     def before(self) -> arb_mat:
-        """The control that acts before the first piece does."""
+        """The control ``(m, 1)`` that acts before the first piece acts."""
         known = self.problem.initial_control
         u = np.zeros(self.problem.system.controls) if known is None else np.asarray(known)
         return stacked([[x] for x in balls(u)])
@@ -146,7 +158,7 @@ class NominalMotion:
         return self._deviation(2)
 
     def _deviation(self, which: int) -> arb_mat:
-        """A term ``(x - r)'Q (x - r)`` of the cost as a matrix on ``(x, 1)``."""
+        """Return a term ``(x - r)'Q (x - r)`` of the cost as a matrix on ``(x, 1)``."""
         term, d = self.problem.cost.terms[which], self.problem.system.states
         if term is None:
             return zeros(d + 1, d + 1)
@@ -156,13 +168,13 @@ class NominalMotion:
 
     @remembered(key=lambda self, start, stop: self.flow.alike(start, stop))
     def step(self, start: float, stop: float) -> arb_mat:
-        """Return what an interval makes of ``z``, a square matrix."""
+        """Return the square matrix that maps ``z`` at the beginning of an interval to ``z`` at its end."""
         Phi, Gamma, Delta = self.flow.over(start, stop)
         return self._lift(Phi.beside(Gamma).beside(Delta).matrix, 1)
 
     @remembered(key=lambda self, start, stop: self.flow.alike(start, stop))
     def weight(self, start: float, stop: float) -> arb_mat:
-        """Return what an interval costs as a quadratic form of the ``z`` at its beginning."""
+        """Return the cost of an interval as a quadratic form of the ``z`` at its beginning."""
         size = self.running.nrows()
         whole, passed = zeros(size, size), identity(size)
         for part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():
@@ -173,10 +185,10 @@ class NominalMotion:
         return whole
 
     def _integrate(self, part: FlowPart) -> tuple[arb_mat, arb_mat]:
-        """Return what a share of a segment makes of ``z``, and what that costs.
+        """Return the square matrix of ``z`` over a share of a segment, and the cost of that time as a quadratic form.
 
-        Up to the share the flow is ``sum_n X_n x^n``, and what this leaves out is in a ball at every ``x``. With ``M``
-        the cost per time, the terms cost ``sum_ij X_i' M X_j x^(i + j) / (i + j + 1)`` per time.
+        Up to the share the flow is ``sum_n X_n x^n``, with a remainder in a ball at every ``x``. With ``M`` the cost
+        per time, the terms cost ``sum_ij X_i' M X_j x^(i + j) / (i + j + 1)`` per time.
         """
         from flint import arb, arb_mat
 
@@ -192,8 +204,8 @@ class NominalMotion:
 
     @remembered(lambda: KEPT)
     def _tabulate(self, segment: VerifiedSegment) -> tuple[arb_mat, arb_mat, arb_mat]:
-        """Return the terms of a segment's flow on ``z`` and their products with the cost per time, a row for each; and
-        what they leave out."""
+        """Return the terms of a segment's flow on ``z``, their products with the cost per time, one row for each term,
+        and the error of the terms."""
         from flint import arb_mat
 
         terms = [self._lift(X.matrix, int(not n)) for n, X in enumerate(segment.terms)]
@@ -201,8 +213,10 @@ class NominalMotion:
         return arb_mat(table), arb_mat(priced), self._lift(around(segment.off), 0)
 
     def _lift(self, term: arb_mat, one: int) -> arb_mat:
-        """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square one on ``z``, of
-        which the 1 and the control are multiplied by ``one``."""
+        """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square matrix on ``z``.
+
+        The rows of the 1 and of the control are those of the identity times ``one``.
+        """
         system, bound = self.problem.system, self.problem.disturbance
         d, m, mw = system.states, system.controls, system.disturbances
         w = np.zeros(mw) if bound is None else nominal_point(bound)

@@ -1,5 +1,5 @@
-"""The cost of a control, in balls: norms of groups, and quadratic terms of the nominal trajectory; none of it shared
-with what solves."""
+"""The cost of a control, in balls: norms of groups, and quadratic terms of the nominal trajectory. It shares no code
+with the solvers."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-ENOUGH = 1e-20  # of the sizes that are added up: how closely the quadratic terms are wanted
-MOST_BITS = 512  # a guess of the flow has no more terms than show in half of them
-KEPT = 3  # walks: of the control, of another one beside it, and of the one that stays 0
+ENOUGH = 1e-20  # the largest relative radius of the quadratic terms and their slopes
+MOST_BITS = 512  # the largest working precision: the terms of a guess of the flow determine half of these bits
+KEPT = 3  # walks that are remembered: of the control, of another control, and of the control 0
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """``constant + sum_k slope_k u_k`` lies below the quadratic terms of the cost and touches them at one control;
-    ``slope`` has ``m`` balls per piece of the control."""
+    """The tangent ``constant + sum_k slope_k u_k`` of the quadratic terms of the cost: below them, and equal at one
+    control. ``slope`` has ``m`` balls per piece of the control."""
 
     constant: arb
     slope: list[list[arb]]
@@ -64,7 +64,7 @@ class Price:
 
     @cached_property
     def costs(self) -> list[list[arb]]:
-        """What a channel's absolute value costs on every piece, ``(K, m)``: its weights, integrated."""
+        """The cost of the absolute value of every channel on every piece, ``(K, m)``: the integrals of its weights."""
         l1, ends = ball(self.problem.cost.l1), [Fraction(t) for t in self.control.breakpoints.tolist()]
         times = [Fraction(t) for t in self._changes[0]]
         rows = [balls(row) for row in self._changes[1]]
@@ -82,23 +82,23 @@ class Price:
 
     @cached_property
     def counts(self) -> np.ndarray:
-        """What a channel counts per time that it acts ``(m,)``: its weight, and 1 where weights change with time."""
+        """The weight of every channel in the time of action, ``(m,)``: 1 where weights change with time."""
         return self._changes[1][0] if np.asarray(self.problem.weights).ndim == 1 else np.ones(self._changes[1].shape[1])
 
     @property
     def highest(self) -> np.ndarray:
-        """The highest of all weights of every channel ``(m,)``."""
+        """The largest of all weights of every channel, ``(m,)``."""
         return np.asarray(self._changes[1].max(axis=0))
 
     @cached_property
     def _changes(self) -> tuple[list[float], np.ndarray]:
-        """The times from which weights count, and these ``(r, m)``."""
+        """The times from which weights apply, and the weights ``(r, m)``."""
         rows = np.asarray(self.problem.weights, dtype=float)
         return ([0.0], rows[None]) if rows.ndim == 1 else (rows[:, 0].tolist(), rows[:, 1:])
 
     @cached_property
     def blocks(self) -> list[list[int]]:
-        """The channels that count together, those alone as groups of one."""
+        """The groups of channels; a channel that is in no group is a group of its own."""
         groups: list[list[int]] = []
         if isinstance(self.problem.cost.group, tuple):
             groups = [[int(channel) - 1 for channel in group] for group in self.problem.cost.group]
@@ -106,14 +106,14 @@ class Price:
         return groups + [[c] for c in range(self.problem.system.controls) if c not in taken]
 
     def of(self, pieces: Sequence[arb_mat]) -> arb:
-        """``J`` of a control ``(m, 1)`` on every piece."""
+        """Return the cost ``J`` of a control ``(m, 1)`` on every piece."""
         total = ball(0)
         for costs, piece in self.clock.each(zip(self.costs, pieces, strict=True)):
             total = total + self._norms(costs, piece.entries())
         return total + self.squares(pieces)
 
     def squares(self, pieces: Sequence[arb_mat]) -> arb:
-        """The quadratic terms of a control ``(m, 1)`` on every piece."""
+        """Return the quadratic terms of a control ``(m, 1)`` on every piece."""
         return self._quadratic(pieces).value if self.is_quadratic else ball(0)
 
     def _norms(self, costs: Sequence[arb], u: Sequence[arb]) -> arb:
@@ -124,7 +124,7 @@ class Price:
         return found
 
     def tangent(self, pieces: Sequence[arb_mat]) -> Tangent:
-        """The tangent of the quadratic terms at a control ``(m, 1)`` on every piece."""
+        """Return the tangent of the quadratic terms at a control ``(m, 1)`` on every piece."""
         found = self._quadratic(pieces)
         constant = found.value
         for piece, slope in self.clock.each(zip(pieces, found.slope, strict=True)):
@@ -132,8 +132,11 @@ class Price:
         return Tangent(constant, found.slope)
 
     def added(self, pieces: Sequence[arb_mat], lengths: arb | None = None) -> float:
-        """The absolute values of what the program adds up to the cost of a control: its norms, unless its ``lengths``
-        cost something else, and of the quadratic terms the linear, the quadratic and the constant part."""
+        """Return the sum of the absolute values of what the program adds up to the cost of a control.
+
+        It adds up the norms, or ``lengths`` where those are charged instead, and the linear, the quadratic and the
+        constant part of the quadratic terms.
+        """
         parts = zip(self.costs, pieces, strict=True)
         norms = lengths
         if norms is None:
@@ -149,14 +152,19 @@ class Price:
         return float((norms + abs(linear) + abs(bent) + abs(constant)).mid())
 
     def terms(self, pieces: Sequence[arb_mat]) -> float:
-        """The absolute values of all products that are added up to the quadratic terms of a control: what rounding is a
-        share of, also where they cancel within one matrix."""
+        """Return the sum of the absolute values of all products in the quadratic terms of a control.
+
+        Rounding errors are relative to this sum, also where products cancel within one matrix.
+        """
         return self._quadratic(pieces).terms if self.is_quadratic else 0.0
 
     @cached_property
     def largest(self) -> float:
-        """What a gap is relative to: the largest cost of the absolute values, and the largest of the quadratic terms
-        at a control that stays 0, or stays at one end of one channel."""
+        """The scale of a gap: the largest cost of absolute values, plus the largest value of the quadratic terms at
+        some controls.
+
+        These controls stay 0, or stay at one end of one channel.
+        """
         m = self.problem.system.controls
         axes = np.eye(m)
         ends = [
@@ -177,7 +185,7 @@ class Price:
 
     @property
     def _nominal(self) -> NominalMotion:
-        """The nominal motion, in numbers of as many bits as are used now, or more."""
+        """The nominal motion, at the present working precision or a higher one."""
         from flint import ctx
 
         if not any(bits >= ctx.prec for bits in self._nominals):
@@ -190,7 +198,7 @@ class Price:
         return nominal_states(self._nominal, self.control, pieces)
 
     def convex(self) -> None:
-        """Show that every matrix is positive semidefinite; raises `Broken`."""
+        """Raise `Broken` unless every matrix of the cost is positive semidefinite."""
         for name, term in zip(("state", "control", "final"), self._terms, strict=True):
             if term is not None and not _semidefinite(term):
                 raise Broken(f"the matrix of the cost's {name} term is not positive semidefinite")
@@ -201,8 +209,10 @@ class Price:
         return [stacked([[ball(0)]] * self.problem.system.controls)] * len(self._lengths)
 
     def _quadratic(self, pieces: Sequence[arb_mat]) -> Walk:
-        """The quadratic terms and their slopes, with as many bits as it takes, or more. The latest are kept: a cost,
-        what is added up to it and what rounding is a share of are asked of one control."""
+        """Return the quadratic terms and their slopes, at the working precision that they need.
+
+        The latest are remembered, since the cost, its terms and its rounding error are needed for the same control.
+        """
         from flint import ctx
 
         for control, bits, found in self._latest:
@@ -225,7 +235,8 @@ class Price:
 
 
 def _semidefinite(term: Quadratic) -> bool:
-    """Symmetric elimination in rational numbers: no pivot is negative, and none is 0 beside an entry that is not."""
+    """Return True where a matrix is positive semidefinite, by symmetric elimination in rational numbers: no pivot is
+    negative, and the row of a zero pivot is zero."""
     from flint import fmpq
 
     exact = [[Fraction(float(entry)) for entry in row] for row in term.Q]

@@ -1,1 +1,1 @@
-"""The flow of the system: guessed in numbers, verified in balls."""
+"""The flow of the system: a polynomial guess in numbers, verified in balls."""

@@ -1,5 +1,5 @@
-"""The flow of a system over one box of parameters: what any time makes of its states and of inputs that stay the
-same."""
+"""The verified flow of a system over one box of parameters: its states at any time, from earlier states and constant
+inputs."""
 
 from __future__ import annotations
 
@@ -27,21 +27,24 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-# States from which transitions that no claim rests on are made of floats: of 348 states one in balls takes as long as
-# the rest of a check; of few states that is nothing, and what grows by many digits has them right.
+# From this number of states on, transitions that no claim rests on are computed in floats. With 348 states a transition
+# in balls takes as long as the rest of a check. With few states balls cost nothing, and are right to many digits even
+# where the system grows fast.
 COARSE = 16
-MOST_MARKS = 2**17  # of the horizon
+MOST_MARKS = 2**17  # the largest number of marks on the horizon
 KEPT = 4096  # parts of the horizon whose flows are remembered
-WEIGHTS_KEPT = 64  # times whose states are known as sums: of a thousand pieces each takes megabytes
-POINTS_KEPT = 256  # flows at single parameters
-ENOUGH = 2.0**-64  # of a kernel, which goes on as numbers of 53 bits, what its last terms may be: 2^-54 would show
+WEIGHTS_KEPT = 64  # times whose `StateWeights` are remembered: with a thousand pieces each takes megabytes
+POINTS_KEPT = 256  # flows at single parameters that are remembered
+# The relative size of the terms that a kernel may drop. The kernel is later rounded to 53 bits, where an error of 2^-54
+# would be visible.
+ENOUGH = 2.0**-64
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class StateWeights:
-    """What a state at a time is made of: ``free`` times the state at 0, and ``control`` and ``disturbance`` times the
-    inputs on every piece of a grid."""
+    """The matrices that make up the state at a time: the state is ``free`` times the state at 0, plus ``control`` and
+    ``disturbance`` times the inputs on every piece of a grid."""
 
     free: arb_mat
     control: list[arb_mat]
@@ -51,8 +54,8 @@ class StateWeights:
 @final
 @dataclass(frozen=True, eq=False)
 class FlowPart:
-    """A ``share`` of a ``segment``, which takes a time of this ``length``, so many ``doublings`` of it: the flow of two
-    times is that of one twice."""
+    """A part of an interval of time: a ``share`` of a ``segment``, of this ``length``, and a number of ``doublings``.
+    Each doubling applies the flow twice, for twice the time."""
 
     segment: VerifiedSegment
     share: arb
@@ -63,9 +66,12 @@ class FlowPart:
 @final
 @dataclass(eq=False)
 class VerifiedFlow:
-    """The system ``x' = A x + B u + E w`` from 0 to ``until``, at every parameter of a ``box``; a drift is one more
-    column of ``B``, whose input is always 1. To a ``degree`` in the parameters, of which there may be none; between
-    the marks of a ``timing`` where there is one. ``sharp``: of the states, what a guess may leave out."""
+    """The flow of ``x' = A x + B u + E w`` from 0 to ``until``, at every parameter of a ``box``.
+
+    A drift is one more column of ``B``, whose input is always 1. ``degree`` is that of the expansion in the parameters,
+    of which there may be none. With a ``timing`` the flow has the marks of that law. ``sharp`` is the relative
+    truncation error of the states that a guess may have.
+    """
 
     plant: Plant
     until: float
@@ -79,14 +85,14 @@ class VerifiedFlow:
 
     @remembered(lambda: POINTS_KEPT, lambda self, parameter: tuple(map(float, parameter)))
     def at(self, parameter: Sequence[float]) -> VerifiedFlow:
-        """The flow at one parameter."""
+        """Return the flow at one parameter."""
         point = tuple(map(float, parameter))
         if point == self.box.middle and not self.degree:
             return self
         return VerifiedFlow(self.plant, self.until, ParameterBox(point, (0.0,) * len(point)))
 
     def sharper(self, sharp: float) -> VerifiedFlow:
-        """The flow anew, of whose states a guess leaves out less."""
+        """Return a new flow whose guesses have a truncation error of at most ``sharp`` in the states."""
         return VerifiedFlow(self.plant, self.until, self.box, self.degree, self.timing, min(self.sharp, sharp))
 
     @cached_property
@@ -96,17 +102,17 @@ class VerifiedFlow:
 
     @property
     def monomials(self) -> Monomials:
-        """Those of the parameters."""
+        """The monomials of the parameters."""
         return self.law.monomials
 
     @property
     def states(self) -> int:
-        """How many states there are."""
+        """The number of states."""
         return self.plant.states
 
     @property
     def driven(self) -> int:
-        """How many inputs there are before the disturbances: controls, and a drift."""
+        """The number of inputs before the disturbances: the controls, and a drift."""
         return self.plant.driven
 
     @cached_property
@@ -114,7 +120,7 @@ class VerifiedFlow:
         return [one.start for one in self.law.stretches]
 
     def _place(self, start: float, stop: float) -> int:
-        """The stretch that holds an interval; raises `Unchecked` where none does."""
+        """Return the number of the stretch that holds an interval; raise `Unchecked` where none does."""
         if not 0.0 <= start <= stop <= self.until:
             raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
         place = max(0, bisect_right(self._begins, start) - 1)
@@ -123,7 +129,8 @@ class VerifiedFlow:
         return place
 
     def marks(self, times: Sequence[float]) -> list[float]:
-        """Increasing times with others between them, such that the flow is a polynomial from each to the next."""
+        """Return the increasing times with marks between them, such that the flow is a polynomial from each to the
+        next."""
         found = [times[0]]
         for start, stop in pairwise(times):
             ends = [one for one in self._begins if start < one < stop]
@@ -136,7 +143,8 @@ class VerifiedFlow:
         return found
 
     def segment(self, start: float, stop: float) -> tuple[VerifiedSegment, arb]:
-        """The flow from ``start`` on, and which share of it has passed at ``stop``."""
+        """Return the verified segment of the flow from ``start`` on, and the share of its time that has passed at
+        ``stop``."""
         stretch = self.law.stretches[self._place(start, stop)]
         if stretch.is_still:
             share = (ball(stop) - ball(start)) / stretch.stride
@@ -155,21 +163,22 @@ class VerifiedFlow:
         return self._segments[start, longest], (ball(stop) - ball(start)) / (ball(longest) - ball(start))
 
     def kind(self, start: float, stop: float) -> tuple[int, tuple[float, float]]:
-        """Intervals of one kind have one flow."""
+        """Return the kind of an interval: intervals of one kind have one flow."""
         place = self._place(start, stop)
         still = self.law.stretches[place].is_still
         return (place, difference(stop, start)) if still else (-1 - place, (start, stop))
 
     @remembered(lambda: KEPT, lambda self, start, stop: self.kind(start, stop))
     def step(self, start: float, stop: float) -> Series:
-        """``[Phi Gamma]``, what an interval from one mark to the next makes of states and of inputs."""
+        """Return ``[Phi Gamma]`` of an interval from one mark to the next: the factors of the states and of constant
+        inputs."""
         segment, share = self.segment(start, stop)
         return segment.at(share)
 
     @remembered(lambda: KEPT, lambda self, start, stop: self.alike(start, stop))
     def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
-        """What an interval makes of a state, of controls that stay the same (a drift among them), and of such
-        disturbances."""
+        """Return the factors of the state at its end on an interval: of the state at the beginning ``(d, d)``, of
+        constant controls with a drift ``(d, driven)``, and of constant disturbances ``(d, w - driven)``."""
         whole: tuple[Series, Series] | None = None
         for part in self.parts(start, stop):
             both = part.segment.at(part.share)
@@ -181,7 +190,8 @@ class VerifiedFlow:
         return whole[0], whole[1].columns(0, self.driven), whole[1].columns(self.driven, None)
 
     def about(self, start: float, stop: float) -> tuple[Array, Array, Array]:
-        """`over` in floats, off by their rounding, of which units of rows are made, and no claim."""
+        """Return the three factors of `over` as floats with rounding errors. Units of rows are made of them; no claim
+        rests on them."""
         phases, d = self.plant.phases, self.states
         if d < COARSE or self.plant.is_timed:
             of_states, of_controls, of_disturbances = (middles(one.matrix) for one in self.over(start, stop))
@@ -212,16 +222,23 @@ class VerifiedFlow:
             yield FlowPart(self._still(stretch), share, length, doublings)
 
     def _still(self, stretch: Stretch) -> VerifiedSegment:
-        """The flow of a stretch on which nothing changes with time."""
+        """Return the verified segment of a stretch on which nothing changes with time."""
         key = (-1.0, stretch.start)
         if key not in self._segments:
             self._segments[key] = solve(*stretch.between(0.0, stretch.stride), stretch.units, self.sharp)
         return self._segments[key]
 
     def within(self, begin: float, end: float, start: float, stop: float, order: int) -> tuple[list[Series], Array]:
-        """What the time from ``begin`` on makes of states and of inputs that stay the same, on ``[start, stop]`` within
-        ``[begin, end]``, on which the flow is a polynomial: so many terms in the share of the interval, ``(d, d + w)``
-        each, and by how much they are off at most."""
+        """Return the flow from ``begin`` to the times in ``[start, stop]`` as a polynomial.
+
+        The flow must be a polynomial on ``[begin, end]``, which contains ``[start, stop]``.
+
+        Returns
+        -------
+        tuple[list[Series], Array]
+            The first ``order`` coefficients ``(d, d + w)`` of ``[Phi Gamma]``, in powers of the share of ``[start,
+            stop]``; and an upper bound ``(d, d + w)`` of their error.
+        """
         segment, share = self.segment(begin, end)
         if begin == end:
             return segment.within(ball(0), ball(0), order)
@@ -230,9 +247,17 @@ class VerifiedFlow:
         return segment.within(first, width, order)
 
     def kernel(self, start: float, stop: float) -> tuple[list[Series], Array]:
-        """What inputs at any time ``s`` on an interval without marks make of the state at its end: ``h Phi(stop, s) [B
-        E](s)`` as terms ``(d, w)`` in the share of the interval that is left at ``s``, and by how much they are off at
-        most. The rows of ``Phi(stop, s)`` are the flow of the transposed system, backwards."""
+        """Return the kernel ``h Phi(stop, s) [B E](s)`` of inputs at any time ``s`` of an interval without marks.
+
+        ``h`` is the length of the interval, and the kernel is the effect of the inputs on the state at its end. The
+        rows of ``Phi(stop, s)`` are the flow of the transposed system, backwards.
+
+        Returns
+        -------
+        tuple[list[Series], Array]
+            Coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and an upper bound
+            ``(d, w)`` of their error.
+        """
         stretch = self.law.stretches[self._place(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
         back, lost = self._back(stretch, A, start, stop)
@@ -256,8 +281,8 @@ class VerifiedFlow:
         return found, off * OUTWARD
 
     def _back(self, stretch: Stretch, A: Sequence[Series], start: float, stop: float) -> tuple[list[Series], Array]:
-        """``Phi(stop, s)`` as terms in the share of an interval that is left at ``s``, and by how much they are off at
-        most; of what does not change with time it is the flow of what is left."""
+        """Return ``Phi(stop, s)`` as coefficients in powers of the share of an interval that is left at ``s``, with an
+        error bound ``(d, d)``. Where nothing changes with time, it is the flow over the time that is left."""
         if stretch.is_still:
             segment, share = self.segment(start, stop)
             terms = [one.columns(0, self.states).scaled(share**n) for n, one in enumerate(segment.terms)]
@@ -267,19 +292,25 @@ class VerifiedFlow:
         return [one.transpose() for one in rows.terms], rows.off.T
 
     def alike(self, start: float, stop: float) -> tuple[object, ...]:
-        """What intervals share of which the flow is the same."""
+        """Return a key that is equal for intervals with the same flow."""
         inside = not any(start < one < stop for one in self._begins)
         return self.kind(start, stop) if inside else (start, stop)
 
     def sizes(self, start: float, stop: float) -> tuple[Array, Array, Array]:
-        """The largest absolute values of ``[A B E]`` and of its derivative on the stretch that an interval is in, ``(d,
-        d + w)`` each, and the units of the states in which it is small there."""
+        """Return bounds of the law on the stretch that contains an interval.
+
+        Returns
+        -------
+        tuple[Array, Array, Array]
+            The largest absolute values of ``[A B E]`` and of its derivative in time, ``(d, d + w)`` each. The third
+            value is the units ``(d,)`` of the states, in which the law is small there.
+        """
         stretch = self.law.stretches[self._place(start, stop)]
         return *stretch.sizes, stretch.units
 
     @remembered(lambda: WEIGHTS_KEPT, lambda self, grid: tuple(grid))
     def weights(self, grid: Sequence[float]) -> StateWeights:
-        """What the state at the end of a grid, which begins at 0, is made of, where the parameters are known."""
+        """Return the matrices that make up the state at the end of a grid, which begins at 0, at known parameters."""
         parts = [self.over(*ends) for ends in pairwise(grid)]
         after = products([part[0] for part in parts])
         control, disturbance = (

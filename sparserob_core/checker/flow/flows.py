@@ -17,12 +17,12 @@ from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.system import System
 
-DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of expansions in so many parameters; 2 beyond
-WIDE = {1: 16, 2: 8, 3: 5, 4: 3}  # of those that are to serve many boxes
-CLOSE = 1e-11  # of transitions over the horizon, what an expansion may leave out that serves smaller boxes too
+DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # the degree of an expansion by the number of parameters; 2 for more
+WIDE = {1: 16, 2: 8, 3: 5, 4: 3}  # the degree of an expansion that serves many boxes
+CLOSE = 1e-11  # the relative remainder that an expansion over a larger box may have in transitions over the horizon
 HALVINGS = 10  # of the box of all parameters, until a box has a flow of its own
-KEPT = 64  # flows over boxes
-ASIDE = 0.3819  # of half the width of all parameters, from their middle
+KEPT = 64  # flows over boxes that are remembered
+ASIDE = 0.3819  # distance of `aside` from the middle of the parameters, as a share of half their width
 
 
 @final
@@ -36,13 +36,13 @@ class VerifiedFlows:
 
     @staticmethod
     def of(system: System, until: float) -> VerifiedFlows:
-        """Those of a system over the box around its parameters."""
+        """Return the flows of a system over the bounding box of its parameters."""
         bound = None if system.parameters is None else system.parameters.bounding_box()
         box = ParameterBox() if bound is None else ParameterBox.between(bound.lower.tolist(), bound.upper.tolist())
         return VerifiedFlows(Plant.of(system, until), until, box)
 
     def at(self, parameter: Sequence[float]) -> VerifiedFlow:
-        """The flow at one parameter, of which there may be none."""
+        """Return the flow at one parameter, of which there may be none."""
         return self._points.at(parameter)
 
     @cached_property
@@ -51,30 +51,32 @@ class VerifiedFlows:
 
     @property
     def degree(self) -> int:
-        """That of expansions over boxes."""
+        """The degree of the expansions over boxes."""
         return DEGREES.get(len(self.box.middle), 2)
 
     @remembered(lambda: KEPT)
     def over(self, box: ParameterBox, degree: int) -> VerifiedFlow:
-        """The flow over a box, to a degree."""
+        """Return the flow over a box, to a degree in the parameters."""
         return VerifiedFlow(self.plant, self.until, box, degree, self.timing) if degree else self.at(())
 
     @cached_property
     def timing(self) -> Law:
-        """The law at one place among all parameters, whose stretches are those of all boxes."""
+        """The law at a single parameter; the flows over all boxes use its stretches."""
         return self.at(self.aside).law
 
     @property
     def aside(self) -> tuple[float, ...]:
-        """A place where it would be a coincidence if what changes with time had a factor of 0."""
+        """A parameter off the middle, where a coefficient that changes with time is 0 only by coincidence."""
         return tuple(m + ASIDE * h for m, h in zip(self.box.middle, self.box.halves, strict=True))
 
     def marks(self, times: Sequence[float]) -> list[float]:
-        """`VerifiedFlow.marks` of every box."""
+        """Return the increasing times with marks between them, such that the flow over any box is a polynomial from
+        each to the next."""
         return self.at(self.aside).marks(times)
 
     def holding(self, box: ParameterBox) -> VerifiedFlow:
-        """A flow over a box, or over a larger one where the expansion is close over all of that."""
+        """Return a flow over a box, or over a larger box that contains it where the remainder of that expansion is
+        small."""
         if self._is_still:
             return self.over(box, self.degree)
         part, degree = self.box, WIDE.get(len(box.middle), 2)
@@ -86,12 +88,12 @@ class VerifiedFlows:
 
     @cached_property
     def _is_still(self) -> bool:
-        """Whether nothing changes with time, or nothing is uncertain: then flows are cheap."""
+        """True where nothing changes with time or nothing is uncertain: then flows are cheap."""
         return not self.box.middle or all(one.is_still for one in self.timing.stretches)
 
     @remembered()
     def _is_close(self, box: ParameterBox, degree: int) -> bool:
-        """Whether little is left out over a box, to a degree."""
+        """Return True where the expansion over a box, to a degree, has a small remainder."""
         try:
             flow = self.over(box, degree)
             Phi, units = flow.over(0.0, self.until)[0], flow.law.units
@@ -102,7 +104,7 @@ class VerifiedFlows:
         return bool(lost <= CLOSE * max(1.0, size))
 
     def _axis(self, box: ParameterBox) -> int:
-        """The parameter that moves the system most across a box."""
+        """Return the number of the parameter that changes the system most across a box."""
         try:
             law = Law(self.plant, self.until, box, 1, self.timing)
             sizes = np.zeros(len(box.middle))
@@ -117,8 +119,8 @@ class VerifiedFlows:
 
     @cached_property
     def links(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which entries of ``[A B E]`` are other than 0 at any time and parameter, and which depend on the
-        parameters."""
+        """The entries of ``[A B E]`` that are not always 0, and the entries that depend on the parameters: two Boolean
+        arrays ``(d, d + w)``."""
         law = Law(self.plant, self.until, self.box, min(1, self.degree), self.timing)
         moved = []
         for one in law.stretches:
@@ -129,5 +131,5 @@ class VerifiedFlows:
 
 
 def _is_wide(entry: object) -> bool:
-    """Whether a number is known less closely than rounding makes it."""
+    """Return True where a number is known less closely than rounding makes it."""
     return any(float(one.rad()) > 2.0**-60 * float(abs(one).upper()) for one in entry.coeffs())  # type: ignore[attr-defined]

@@ -1,5 +1,4 @@
-"""The law of a system, ``[A B c E]``, on stretches of time and over one box of parameters: polynomials that enclose
-it."""
+"""The law of a system, ``[A B c E]``: enclosing polynomials on stretches of time and over one box of parameters."""
 
 from __future__ import annotations
 
@@ -27,29 +26,30 @@ if TYPE_CHECKING:
     from flint import arb_poly
 
 ORDER = 24  # of the law in time on a stretch; with a tenth of it stretches are a million times shorter
-LONG = 2.0  # norm of the system times the length of a stretch; ten times more takes more terms than there are
-SHORTER = 0.5  # of `LONG`, to which a slow part is brought: ten times less doubles digits lost, 1 takes more terms
-FIRST = 8  # stretches of what changes with time, to begin with
-SHORTEST = 2.0**-30  # of the horizon: a shorter stretch holds a pole
+LONG = 2.0  # the largest norm of the system times the length of a stretch; ten times more takes more than `TERMS` terms
+SHORTER = 0.5  # the share of `LONG` that rescaled units aim at: a tenth doubles the digits lost, 1 takes more terms
+FIRST = 8  # stretches on the whole horizon of a law that changes with time, before any is halved
+SHORTEST = 2.0**-30  # of the horizon: a shorter stretch contains a pole
 
 
 @final
 @dataclass(frozen=True)
 class ParameterBox:
-    """A box of parameters: its ``middle (nu,)``, exact numbers, and ``halves (nu,)`` of its widths, or more."""
+    """A box of parameters: its ``middle (nu,)`` in exact numbers, and upper bounds ``halves (nu,)`` of half its
+    widths."""
 
     middle: tuple[float, ...] = ()
     halves: tuple[float, ...] = ()
 
     @staticmethod
     def between(low: Sequence[float], high: Sequence[float]) -> ParameterBox:
-        """That between two corners."""
+        """Return a box that contains all points between two corners."""
         ends = [(a, b, (a + b) / 2) for a, b in zip(map(float, low), map(float, high), strict=True)]
         halves = [0.0 if a == b else float(np.nextafter(max(b - m, m - a), np.inf)) for a, b, m in ends]
         return ParameterBox(tuple(m for _, _, m in ends), tuple(halves))
 
     def wider(self, extra: Sequence[float] | Array) -> ParameterBox:
-        """The box with so much more at either side."""
+        """Return the box with ``extra (nu,)`` added at either side of every parameter."""
         more = [h + float(x) for h, x in zip(self.halves, extra, strict=True)]
         return (
             ParameterBox(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more))
@@ -58,14 +58,15 @@ class ParameterBox:
         )
 
     def holds(self, other: ParameterBox) -> bool:
-        """Whether another box is in this one; exactly, where sums of two floats are rounded."""
+        """Return True where another box lies in this one; the test is exact, since sums of two floats would be
+        rounded."""
         for m, h, n, k in zip(self.middle, self.halves, other.middle, other.halves, strict=True):
             if abs(Fraction(n) - Fraction(m)) + Fraction(k) > Fraction(h):
                 return False
         return True
 
     def halved(self, axis: int) -> list[ParameterBox]:
-        """Both halves across a parameter, each a little larger than half."""
+        """Return the two halves of the box across one parameter, each a little larger than half."""
         found = []
         for sign in (-0.5, 0.5):
             middle, halves = list(self.middle), list(self.halves)
@@ -78,9 +79,12 @@ class ParameterBox:
 @final
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """The law from ``start`` to ``stop``: for every monomial of the parameters a table ``(d, d + w)`` of polynomials in
-    the time, from -1 to 1 across the stretch. ``units (d,)`` of the states, in which it is small there; within a
-    ``stride``, a power of two, it moves the states by little."""
+    """The law on an interval of time from ``start`` to ``stop``, on which it is a polynomial.
+
+    For every monomial of the parameters the ``table (d, d + w)`` holds polynomials in the time, which runs from -1 to 1
+    across the stretch. The law is small in the ``units (d,)`` of the states. Within a ``stride``, a power of two, it
+    changes the states by little.
+    """
 
     start: float
     stop: float
@@ -91,12 +95,15 @@ class Stretch:
 
     @cached_property
     def is_still(self) -> bool:
-        """Whether nothing changes with time."""
+        """True where nothing changes with time."""
         return all(entry.length() <= 1 for part in self.table for row in part for entry in row)
 
     def between(self, start: float, stop: float, backwards: bool = False) -> tuple[list[Series], list[Series]]:
-        """``A`` and ``[B c E]`` times the length of a part of the stretch, as polynomials in the share of it that has
-        passed, or ``backwards`` in that which is left: a series for each power."""
+        """Return ``A`` and ``[B c E]`` times the length of a part of the stretch, as one series for each power of a
+        share.
+
+        The polynomials are in the share of the part that has passed, or ``backwards`` in the share that is left.
+        """
         from flint import arb, arb_poly
 
         half, length = (arb(self.stop) - arb(self.start)) / 2, arb(stop) - arb(start)
@@ -125,17 +132,17 @@ class Stretch:
 
 
 def most(table: Sequence[Sequence[arb_poly]]) -> Array:
-    """About how large polynomials on [-1, 1] may be, ``(d, d + w)``."""
+    """Return approximate bounds ``(d, d + w)`` of the absolute values of polynomials on [-1, 1]."""
     return np.array([[sum(float(c.abs_upper()) for c in entry.coeffs()) for entry in row] for row in table])
 
 
 def _power(length: float) -> float:
-    """The least power of two that is not below it."""
+    """Return the least power of two that is not below the length."""
     return 2.0 ** ceil(log2(length))
 
 
 def _kept(A: list[Series], units: Array) -> list[Series]:
-    """The powers of which more is left than nothing; those beyond are in the balls of the first."""
+    """Return the leading powers of ``A``. The first one encloses the later powers, whose sum is at most `SHARP`."""
     sizes = [one.size for one in A]
     paces = [pace(size, units) for size in sizes]
     kept = len(A)
@@ -147,8 +154,8 @@ def _kept(A: list[Series], units: Array) -> list[Series]:
 @final
 @dataclass(frozen=True, eq=False)
 class Law:
-    """The law of a ``plant`` up to the time ``until`` over a ``box`` of parameters, to a ``degree`` in these; on the
-    stretches of a ``timing`` where there is one."""
+    """The law of a ``plant`` up to the time ``until`` over a ``box`` of parameters, to a ``degree`` in the parameters.
+    With a ``timing`` it has the stretches of that law."""
 
     plant: Plant
     until: float
@@ -158,19 +165,19 @@ class Law:
 
     @cached_property
     def monomials(self) -> Monomials:
-        """Those of the parameters."""
+        """The monomials of the parameters."""
         return Monomials(len(self.box.middle), self.degree) if self.degree else NONE
 
     @cached_property
     def units(self) -> Array:
-        """Units ``(d,)`` of the states, powers of two, in which the system is small."""
+        """The units ``(d,)`` of the states, powers of two, in which the system is small."""
         A = self._looks[0]
         return balanced(A, self.until, np.ones(A.shape[0]) / self.until)
 
     @cached_property
     def _looks(self) -> tuple[Array, Array]:
-        """The largest absolute values of the entries of ``A``, and of every column of ``[B c E]``, at some times in the
-        middle of the box; any would do."""
+        """The largest absolute values of the entries of ``A``, and of every column of ``[B c E]``, at sample times in
+        the middle of the box. Units are made of them; any values would be right."""
         every = np.array([np.abs(table) for table in self.plant.looked_at(self.box.middle)])
         with np.errstate(invalid="ignore"):
             A, inputs = every[..., : self.plant.states].max(axis=0), every[..., self.plant.states :].max(axis=(0, 1))
@@ -178,8 +185,13 @@ class Law:
 
     @cached_property
     def stretches(self) -> list[Stretch]:
-        """The law on parts of the horizon, one after another, each halved where it is too long; raises `Unchecked`
-        where it is not finite."""
+        """The law on consecutive parts of the horizon, each halved where it is too long.
+
+        Raises
+        ------
+        Unchecked
+            Where the law is not finite.
+        """
         if self.timing is not None:
             return [self._on_same(one) for one in self.timing.stretches]
         cut = [(phase.begin, min(phase.until, self.until), phase) for phase in self.plant.phases]
@@ -187,24 +199,24 @@ class Law:
 
     @property
     def is_still(self) -> bool:
-        """Whether no stretch changes with time."""
+        """True where no stretch changes with time."""
         return all(one.is_still for one in self.stretches)
 
     @cached_property
     def there(self) -> np.ndarray:
-        """Which entries of ``[A B c E]`` are other than 0 at any time or parameter, ``(d, d + w)``."""
+        """The entries of ``[A B c E]`` that differ from 0 at any time or parameter, Booleans ``(d, d + w)``."""
         return np.asarray(np.any([one.sizes[0] > 0.0 for one in self.stretches], axis=0))
 
     @cached_property
     def weights(self) -> Array:
-        """How much every monomial of the parameters has to do with the law, ``(M,)``, about."""
+        """The approximate size of the part of the law that belongs to each monomial of the parameters, ``(M,)``."""
         found = np.zeros(self.monomials.size)
         for one in self.stretches:
             found += [most(part).sum() for part in one.table]
         return found
 
     def _on_same(self, other: Stretch) -> Stretch:
-        """The law on a stretch of the timing."""
+        """Return the law on a stretch of the timing."""
         phase = next(one for one in reversed(self.plant.phases) if one.begin <= other.start)
         frame, table = self._table(other.start, other.stop, phase, self.monomials)
         return replace(other, frame=frame, table=table, stride=min(other.stride, _power(other.stop - other.start)))
@@ -228,7 +240,7 @@ class Law:
         return found
 
     def _still(self, begin: float, until: float, phase: Phase) -> Stretch | None:
-        """All of a law that does not change with time; ``None`` of another one."""
+        """Return a law that does not change with time as one stretch; ``None`` where it changes."""
         try:
             found = Stretch(begin, until, *self._table(begin, until, phase, self.monomials), self.units)
         except Unchecked:
@@ -241,7 +253,8 @@ class Law:
         return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / rate))) if rate > 0.0 else longest)
 
     def _hides(self, found: Stretch, phase: Phase) -> bool:
-        """Whether the balls of a law hold what changes with the time: those of one time are less wide."""
+        """Return True where wide balls hide a dependence on time: at a single time the balls are less than half as
+        wide."""
         time = (found.start + found.stop) / 2
         _, table = self._table(time, time, phase, self.monomials)
         return any(
@@ -252,7 +265,7 @@ class Law:
         )
 
     def _stretch(self, start: float, stop: float, phase: Phase) -> Stretch | None:
-        """The law from ``start`` to ``stop``; ``None`` where that is too long: by what it is in the middle of the
+        """Return the law from ``start`` to ``stop``; ``None`` where that is too long, judged in the middle of the
         box."""
         try:
             _, middle = self._table(start, stop, phase, NONE)
@@ -274,7 +287,7 @@ class Law:
     def _table(
         self, start: float, stop: float, phase: Phase, monomials: Monomials
     ) -> tuple[Frame, list[list[list[arb_poly]]]]:
-        """Every entry of the law from ``start`` to ``stop``, monomial by monomial."""
+        """Return every entry of the law from ``start`` to ``stop``, one table for each monomial."""
         from flint import arb, arb_poly
 
         frame = Frame(monomials, ORDER)
@@ -296,9 +309,12 @@ class Law:
 
 
 def _slow(most: Array) -> Array | None:
-    """Ratios of units of the states, in which a system that moves them by at most ``most (d, d)`` of the units that
-    they have is small enough, to those in which it is not: with ``g`` a share of `LONG`, ``u = (1 - M / g)^-1 1`` has
-    ``M u <= g u``; ``None`` where there are none."""
+    """Return factors ``(d,)`` of the units of the states in which the system is small enough; ``None`` where none
+    exist.
+
+    In the old units the system moves the states by at most ``M = most (d, d)``. With ``g``, a share of `LONG`, the
+    factors ``u = (1 - M / g)^-1 1`` satisfy ``M u <= g u``.
+    """
     M = most / (SHORTER * LONG)
     u = np.linalg.lstsq(np.eye(len(M)) - M, np.ones(len(M)), rcond=None)[0]
     if not (np.isfinite(u).all() and u.min() > 0.0):

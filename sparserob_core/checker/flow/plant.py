@@ -1,4 +1,5 @@
-"""Every system of a problem as one: phases of time, each with a law in the time and in the parameters."""
+"""The plant, one form for every system of a problem: phases of time, each with a law in the time and in the
+parameters."""
 
 from __future__ import annotations
 
@@ -15,14 +16,16 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 GOLDEN = 0.6180339887
-LOOKS = 17  # times of a phase at which its numbers are looked at, by which nothing is proven
+LOOKS = 17  # sample times of a phase; no claim rests on the samples
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """The ``phases`` of a system with ``states``, and with so many inputs that are ``driven``, controls and a drift,
-    before the disturbances, and all ``inputs``."""
+    """The ``phases`` of a system, and its numbers of ``states`` and of inputs.
+
+    The first ``driven`` inputs are the controls and a drift; the disturbances follow. ``inputs`` counts all of them.
+    """
 
     phases: tuple[Phase, ...]
     states: int
@@ -31,19 +34,19 @@ class Plant:
 
     @staticmethod
     def of(system: System, horizon: float) -> Plant:
-        """That of any system of a problem."""
+        """Return the plant of a system up to the horizon."""
         driven = int(system.controls + system.drifts)
         return Plant(system.until(horizon), int(system.states), driven, driven + int(system.disturbances))
 
     @property
     def is_timed(self) -> bool:
-        """Whether entries may depend on the time."""
+        """True where entries of the matrices may depend on the time."""
         return any(phase.timed for phase in self.phases)
 
     def looked_at(self, parameter: Sequence[float]) -> Iterator[Array]:
-        """``[A B c E]`` at some times, and a parameter."""
+        """Yield ``[A B c E]``, ``(d, d + w)``, at a few sample times of every phase and at one parameter."""
         for phase in self.phases:
-            for share in np.sort(np.arange(LOOKS) * GOLDEN % 1.0).tolist():  # none is a period of anything
+            for share in np.sort(np.arange(LOOKS) * GOLDEN % 1.0).tolist():  # they share no period with the law
                 time = phase.begin + share * (phase.until - phase.begin)
                 try:
                     yield called(phase, np.array([time, *parameter])).astype(float)
@@ -52,7 +55,8 @@ class Plant:
 
 
 def called(phase: Phase, p: np.ndarray) -> np.ndarray:
-    """``[A B c E]`` of a phase at the time and the parameters ``(1 + nu,)``, numbers of any kind."""
+    """Return ``[A B c E]``, ``(d, d + w)``, of a phase at the time and the parameters ``p (1 + nu,)``, numbers of any
+    kind."""
     given, parts = p if phase.timed else p[1:], [phase.entry(name) for name in ("A", "B", "c", "E")]
     return np.hstack([_called(part, given) for part in parts if part is not None])
 

@@ -1,9 +1,9 @@
-"""The flow of ``x' = A x + F u`` over a share of time from 0 to 1, and at every parameter: a polynomial that is
-guessed, and then verified.
+"""The flow of ``x' = A x + F u`` over a share of time from 0 to 1, at every parameter: a guessed and verified
+polynomial.
 
-Nothing about the guess is believed. The *defect* of a polynomial ``P`` is ``P' - A P - F``: what it leaves of the
-equation. It is bounded in balls, and by Gronwall's inequality the polynomial is off from the flow by at most what the
-defect adds up to, times ``e^(int |A|)``.
+Nothing about the guess is believed. The *defect* of a polynomial ``P`` is its residual ``P' - A P - F`` in the
+equation. The defect is bounded in balls. By Gronwall's inequality the error of the polynomial is at most the integral
+of the defect, times ``e^(int |A|)``.
 """
 
 from __future__ import annotations
@@ -26,27 +26,33 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-SHARP = 2.0**-100  # of the system's numbers, what a guess leaves out; 2^-10 would show in what states miss
-ROUGH = 2.0**-70  # the same over a box of parameters, where less is known anyway, and of kernels, which become floats
-AT_ONCE = 4  # terms after which it is looked whether more are needed
-TERMS = 64  # of a guess, at most
-LONGER = 1.0 + 2.0**-30  # than 1, shares for which a flow is verified: parts of time have ends that are rounded
-FAR = 300.0  # of the exponent in Gronwall's inequality: beyond, nothing is known
+SHARP = 2.0**-100  # relative truncation error of a guess; 2^-10 would be visible in the residuals of the states
+ROUGH = 2.0**-70  # the same over a box of parameters, which is less sharp anyway, and of kernels, which become floats
+AT_ONCE = 4  # terms between two tests for whether more are needed
+TERMS = 64  # the largest number of terms of a guess
+LONGER = 1.0 + 2.0**-30  # the largest share for which a flow is verified: ends of parts of time are rounded
+FAR = 300.0  # the largest exponent in Gronwall's inequality: with a larger one the bound is useless
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Powers:
-    """A matrix ``(d, n)`` that is a polynomial in a share of time, with ``count`` coefficients, one above the other in
-    a ``stack``, and off by at most ``off (d, n)`` at every share and parameter."""
+    """A matrix ``(d, n)`` that is a polynomial in a share of time. The ``stack`` holds its ``count`` coefficients, one
+    above the other. ``off (d, n)`` bounds the error at every share and parameter."""
 
     stack: Series
     count: int
     off: Array
 
     def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
-        """The matrix on shares from ``start`` on, as so many terms of a polynomial in the share of the ``width``; and
-        by how much that is off at most."""
+        """Return the matrix on the shares from ``start`` to ``start + width`` as a polynomial in the share of the
+        ``width``.
+
+        Returns
+        -------
+        tuple[list[Series], Array]
+            The first ``order`` coefficients ``(d, n)``, and an upper bound ``(d, n)`` of their error.
+        """
         from flint import arb, arb_mat
 
         (d, columns), count, kept = self.off.shape, self.count, min(order, self.count)
@@ -61,7 +67,7 @@ class Powers:
 
     @cached_property
     def _table(self) -> arb_mat:
-        """Every entry of every coefficient, a row for each power."""
+        """All entries of all coefficients, one row for each power."""
         from flint import arb_mat
 
         entries, size = [part.entries() for part in self.stack.parts], self.off.size
@@ -69,36 +75,39 @@ class Powers:
 
     @cached_property
     def sizes(self) -> Array:
-        """How large the entries of every coefficient are at most, ``(N, d, n)``."""
+        """The upper bounds of the absolute values of the entries of every coefficient, ``(N, d, n)``."""
         return self.stack.size.reshape(self.count, *self.off.shape)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class VerifiedSegment:
-    """``[Phi Gamma]``, what a share ``x`` of the time makes of the states at its beginning and of inputs that stay the
-    same: ``sum_n terms_n x^n``, off by at most ``off (d, d + w)`` at every share up to `LONGER` and every parameter."""
+    """The flow ``[Phi Gamma]`` at a share ``x`` of the time: the factors of the states at its beginning and of constant
+    inputs. It is ``sum_n terms_n x^n``, with an error of at most ``off (d, d + w)`` at every share up to `LONGER` and
+    every parameter."""
 
     terms: list[Series]
     off: Array
     _stacks: dict[int, Series] = field(default_factory=dict, repr=False)
 
     def at(self, share: arb) -> Series:
-        """The flow at a share of the time."""
+        """Return the flow at a share of the time, ``(d, d + w)``."""
         (value,), off = self.within(share, share * 0, 1)
         return value.within(off)
 
     def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
-        """`Powers.within` of the flow."""
+        """Return the flow on the shares from ``start`` to ``start + width``: ``order`` coefficients, and an error
+        bound."""
         return self.powers.within(start, width, order)
 
     def first(self, count: int) -> tuple[list[Series], Array]:
-        """The first terms, and by how much their sum is off from the flow at most."""
+        """Return the first ``count`` terms, and an upper bound ``(d, d + w)`` of the difference between their sum and
+        the flow."""
         return self.terms[:count], (sum((one.size for one in self.terms[count:]), self.off)) * OUTWARD
 
     @property
     def end(self) -> Series:
-        """The flow over all of the time; the smallest terms are added up first, which rounds less."""
+        """The flow over all of the time. The smallest terms are added first, which reduces the rounding error."""
         return reduce(add, reversed(self.terms)).within(self.off)
 
     @cached_property
@@ -114,7 +123,7 @@ class VerifiedSegment:
         return Powers(Series(first.monomials, parts), len(self.terms), self.off)
 
     def applied(self, columns: Series) -> Powers:
-        """The flow of some columns of states and of the first inputs."""
+        """Return the flow times some columns of states and of the first inputs."""
         used = columns.shape[0]
         if used not in self._stacks:
             self._stacks[used] = self.powers.stack.columns(0, used)
@@ -123,8 +132,20 @@ class VerifiedSegment:
 
 
 def shifted(start: float, width: float, count: int) -> Array:
-    """What makes of the first ``count`` powers of ``start + width y`` those of ``y``, numbers from 0 on, ``(power of y,
-    power)``, each up to rounding of ``4 count`` terms."""
+    """Return the matrix that turns coefficients of powers of ``start + width y`` into coefficients of powers of ``y``.
+
+    Parameters
+    ----------
+    start, width
+        Nonnegative numbers.
+    count
+        The number of powers.
+
+    Returns
+    -------
+    Array
+        The matrix ``(power of y, power)``. Each entry is rounded outward for ``4 count`` terms.
+    """
     n = np.arange(count)
     table = _binomials(count) * np.power(start, np.maximum(n[None] - n[:, None], 0)) * np.power(width, n)[:, None]
     return np.asarray(table * (1.0 + 8.0 * count * 2.0**-53))
@@ -136,15 +157,24 @@ def _binomials(count: int) -> Array:
 
 
 def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float = SHARP) -> VerifiedSegment:
-    """The flow of ``sum_k A_k x^k`` and ``sum_k F_k x^k`` for ``x`` from 0 to 1; ``units (d,)`` are those of the
-    states, in which the system is small. ``sharp``: of the states, what the guess may leave out."""
+    """Return the verified flow of ``x' = A x + F u`` with ``A = sum_k A_k x^k`` and ``F = sum_k F_k x^k``, from 0 to 1.
+
+    Parameters
+    ----------
+    A, F
+        Coefficients ``(d, d)`` and ``(d, w)`` in powers of the share of time.
+    units
+        Units ``(d,)`` of the states, in which the system is small.
+    sharp
+        The relative truncation error of the states that the guess may have.
+    """
     equation = Equation(A, F)
     terms = guess(equation, units, max(sharp, ROUGH) if A[0].monomials.degree else sharp)
     return VerifiedSegment(terms, verify(equation, terms, units))
 
 
 def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series]:
-    """The first terms of the flow's power series, rounded."""
+    """Return the first terms of the flow's power series, rounded."""
     d, w = len(units), equation.F[0].shape[1]
     terms = [equation.begin]
     scale = np.concatenate([1.0 / units, np.ones(w)]) * units[:, None]
@@ -162,8 +192,13 @@ def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series
 
 
 def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
-    """By how much a polynomial is off from the flow at most up to a share of `LONGER`, ``(d, d + w)``; raises
-    `Unchecked` where that is not known."""
+    """Return an upper bound ``(d, d + w)`` of the error of a polynomial up to a share of `LONGER`.
+
+    Raises
+    ------
+    Unchecked
+        Where the exponent of Gronwall's inequality is too large for a bound.
+    """
     A, F, last, d = equation.A, equation.F, len(terms) - 1, len(units)
     longer = LONGER ** (last + max(len(A), len(F)) + 1) * OUTWARD
     defects = [terms[n + 1].scaled(ball(n + 1)) - equation.slope(terms, n) for n in range(last)]
@@ -185,7 +220,7 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
 @final
 @dataclass(frozen=True, eq=False)
 class Equation:
-    """``P' = A P + [0 F]``, ``P(0) = [1 0]``, with polynomials ``A`` and ``F`` of the share of time."""
+    """The equation ``P' = A P + [0 F]``, ``P(0) = [1 0]``, with polynomials ``A`` and ``F`` of the share of time."""
 
     A: Sequence[Series]
     F: Sequence[Series]
@@ -193,7 +228,7 @@ class Equation:
 
     @cached_property
     def begin(self) -> Series:
-        """The flow in no time."""
+        """The flow at the share 0."""
         d, monomials = self.A[0].shape[0], self.A[0].monomials
         return Series.constant(monomials, identity(d)).beside(Series.constant(monomials, zeros(d, self.F[0].shape[1])))
 
@@ -204,7 +239,7 @@ class Equation:
         return [none.beside(one) for one in self.F]
 
     def slope(self, terms: Sequence[Series], n: int) -> Series:
-        """The term of order ``n`` of ``A P + [0 F]``; of the same terms of ``P`` it is remembered."""
+        """Return the term of order ``n`` of ``A P + [0 F]``; for the same terms of ``P`` it is remembered."""
         count = min(n + 1, len(self.A))
         factors = [terms[n - k] for k in range(count)]
         known = self._known.get(n)

@@ -1,4 +1,4 @@
-"""What does not change with time, at one parameter: its matrices in balls, and what they make of a time."""
+"""Systems that do not change with time, at one parameter: their matrices in balls, and their flow in floats."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from flint import arb_mat
 
 POINT = Frame(NONE, 0)
-TERMS = 18  # of the series of a transition in floats, at a norm of at most a half: more are below rounding
+TERMS = 18  # of the power series of a transition in floats, at a norm of at most 1/2: further terms round away
 
 
 def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_mat]]:
-    """``A``, ``B`` with the drift beside it, and ``E`` of the systems that take turns."""
+    """Return the ball matrices ``A``, ``B`` with the drift as its last column, and ``E`` of every mode of a switched
+    system."""
     p = np.empty(1 + len(parameter), dtype=object)
     p[:] = [POINT.number(ball(value)) for value in (0.0, *parameter)]
     found = []
@@ -38,8 +39,10 @@ def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_m
 
 
 def held_about(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
-    """``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats: the series over a short time, and what that makes
-    of twice the time, again and again."""
+    """Return ``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats.
+
+    The power series is summed over a short time, and the result is doubled until it covers ``time``.
+    """
     d, size = A.shape[0], float(np.abs(A).sum(axis=1).max(initial=0.0)) * time
     halvings = max(0, int(np.ceil(np.log2(2.0 * size)))) if 0.0 < size < np.inf else 0
     short = time / 2.0**halvings

@@ -1,5 +1,5 @@
-"""Units of the states, powers of two, in which a system is small: what is left of an expansion is bounded in them. Any
-would be right."""
+"""Units of the states, powers of two, in which the rates of a system are small. Remainders are bounded in these units;
+any units would be right."""
 
 from __future__ import annotations
 
@@ -14,17 +14,33 @@ if TYPE_CHECKING:
     from flint import arb_mat
 
 SWEEPS = 12  # of balancing
-FAINT = 1e-6  # with 1 a state's own source would be overlooked beside others, with 0 its unit may be that of a speck
-LEAST = 2.0**-900  # rate that takes part in it; units end at 2^-500
+# A source below this share of what a state receives through other states does not count. With 1 a state's own source
+# would be ignored, with 0 a negligible source may determine the unit.
+FAINT = 1e-6
+LEAST = 2.0**-900  # the smallest rate that takes part in the balancing; units end at 2^-500
 
 
 def balanced(A: Array, horizon: float, speed: Array) -> Array:
-    """Units ``(d,)`` of the states, powers of two, in which rows and columns of ``A`` are about as large as each other
-    (Osborne 1960).
+    """Return units of the states, powers of two, in which each row of ``A`` is about as large as its column (Osborne
+    1960).
 
-    The sources take part as one more state, and where one state drives another but not the reverse, a small number
-    stands for the reverse: what makes the two of the size that one reaches through the other within the horizon. A
-    source that moves a state by next to nothing of what it is moved by through others does not count.
+    The sources take part as one more state. Where one state drives another but not the reverse, a small rate stands for
+    the reverse: the rate that makes the two as large as one becomes through the other within the horizon. A source does
+    not count where its effect on a state is negligible relative to the effect through other states.
+
+    Parameters
+    ----------
+    A
+        Rates ``(d, d)`` between the states.
+    horizon
+        The length of time.
+    speed
+        Rates ``(d,)`` at which the sources change the states.
+
+    Returns
+    -------
+    Array
+        Units ``(d,)``.
     """
     rates = np.zeros((speed.size + 1, speed.size + 1))
     rates[:-1, :-1], rates[:-1, -1] = np.abs(A), speed
@@ -35,7 +51,7 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
             reached = horizon / turn * (rates[:-1, :-1] @ reached)
             through = through + reached
         rates[:-1, -1] = np.where(speed < FAINT * through, 0.0, speed)
-    rates[rates < LEAST] = 0.0  # such are what outward rounding makes of no drive at all; they have no reciprocal
+    rates[rates < LEAST] = 0.0  # outward rounding makes such rates of zeros; they have no reciprocal
     driven = np.where(rates > 0.0, rates, np.inf)
     rates = np.maximum(rates, (1.0 / horizon / horizon / driven).T)
     exponents = np.zeros(speed.size + 1)
@@ -44,17 +60,17 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
             scaled = np.exp2(exponents)
             row, column = (rates[i] * scaled).max() / scaled[i], (rates[:, i] / scaled).max() * scaled[i]
             if row > 0.0 and column > 0.0:
-                exponents[i] += (np.log2(row) - np.log2(column)) / 2  # apart: their quotient may overflow
+                exponents[i] += (np.log2(row) - np.log2(column)) / 2  # the quotient may overflow
     return np.asarray(np.exp2(np.clip(np.round(exponents[:-1] - exponents[-1]), -500, 500)), dtype=float)
 
 
 def pace(rates: Array, units: Array) -> float:
-    """The largest sum of a row of ``rates (d, d)``, none of them negative, between states in these units."""
+    """Return the largest row sum of nonnegative ``rates (d, d)`` between states in these ``units (d,)``."""
     return float((rates * units / units[:, None]).sum(axis=1).max(initial=0.0))
 
 
 def scaled(matrix: arb_mat, rows: Array, columns: Array) -> arb_mat:
-    """A ball matrix with its rows and its columns multiplied by powers of two, which is exact."""
+    """Return a ball matrix with its rows and its columns multiplied by powers of two, which is exact."""
     factors = list(map(float, columns))
     return stacked(
         [

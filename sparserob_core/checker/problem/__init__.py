@@ -1,1 +1,1 @@
-"""A problem as the checker follows it: integrals and parameters as states, one grid for all disturbances."""
+"""The problem in the checker's form: integrals and parameters as states, one grid for all disturbances."""

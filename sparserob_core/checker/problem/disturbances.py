@@ -1,4 +1,4 @@
-"""The disturbances of a problem: where each may jump, and which of them stay the same between these times."""
+"""The disturbances of a problem: where each may jump, and which of them stay constant between these times."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class Disturbances:
 
     @cached_property
     def lasting(self) -> Lasting | None:
-        """Which components of the disturbance stay what they are for several of its pieces, ``None`` where none do."""
+        """The components of the disturbance that are held over several of its pieces, ``None`` where there are none."""
         return Lasting.of(self.problem, self.changes or [])
 
     @property
     def alike(self) -> bool:
-        """Whether all disturbances are of one class, and constant on the same pieces where they are on pieces."""
+        """True where all disturbances are of one class, and those on pieces are constant on the same pieces."""
         return not self.several and self.lasting is None
 
     def may_jump(self, time: float) -> np.ndarray:
-        """Which components of the disturbance ``(mw,)`` may have another value from a time on, of those that are
-        constant on pieces."""
+        """Return which components ``(mw,)`` of the disturbance may have another value from a time on, among those that
+        are constant on pieces."""
         assert self.problem.disturbance is not None
         if self.lasting is not None:
             return self.lasting.may_jump(time)
@@ -48,13 +48,16 @@ class Disturbances:
 
     @property
     def several(self) -> bool:
-        """Whether there are others beside measurable ones, which are constant on pieces."""
+        """True where some disturbances are measurable and others are constant on pieces."""
         return not isinstance(self.problem.disturbance_class, str)
 
     @cached_property
     def changes(self) -> list[float] | None:
-        """Where the disturbance may jump; ``None`` when there is none. Other classes than piecewise constant ones are
-        not checked; of measurable ones, where those jump by which rows are measured."""
+        """The times at which the disturbance may jump; ``None`` without a disturbance.
+
+        For measurable disturbances they are the jumps of those by which rows are measured. Other classes than these and
+        piecewise constant ones raise `Unchecked`.
+        """
         if self.problem.disturbance is None:
             return None
         if self.problem.measurable is not None and not self.several:
@@ -74,14 +77,17 @@ class Disturbances:
 
     @cached_property
     def middle(self) -> Array:
-        """The middle of the set of the disturbances, ``(mw,)``; 0 where there are none."""
+        """The middle ``(mw,)`` of the set of the disturbances; 0 where there are none."""
         bound = self.problem.disturbance
         return np.zeros(self.problem.system.disturbances) if bound is None else middle(bound)
 
     @cached_property
     def held(self) -> ConvexSet | None:
-        """The set of the disturbances of which every one stays the same between `changes`: where nothing answers
-        them, measurable ones are in the middle of their set, and bounded inputs say how far they may be from that."""
+        """The set of the disturbances that stay constant between `changes`.
+
+        Without feedback, a measurable disturbance is at the middle of its set here, and a bounded input contains its
+        deviations from the middle.
+        """
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
         if self.timing.answering or self.problem.measurable is None or bound is None:
             return bound

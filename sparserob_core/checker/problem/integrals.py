@@ -1,8 +1,8 @@
-"""Integrals that are bounded, as coordinates of a larger state: derived from the problem's records alone.
+"""Bounded integrals, as coordinates of a larger state: derived from the problem's records alone.
 
-After the ``d`` states of the problem comes one for each row of each integral, in their order, whose derivative is
-``h'x + g'u`` while the row is integrated, and 0 else. With a delay ``u`` is what acts, so that a row of both is two
-coordinates, first that of ``h``, and the second is integrated as much later.
+After the ``d`` states of the problem comes one coordinate for each row of each integral, in their order. Its derivative
+is ``h'x + g'u`` while the row is integrated, and 0 otherwise. With a delay, ``u`` is the control that acts. A row with
+both ``h`` and ``g`` is then two coordinates, first that of ``h``, and the second is integrated later by the delay.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Equality,
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
-APART = 1e-12  # of the horizon: times that are nearer are one; ten times more would join what a clock tells apart
+APART = 1e-12  # relative to the horizon: nearer times are one; ten times more would join times that a clock separates
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Coordinate:
-    """What is integrated, of the state ``h (d,)`` and of the control that acts ``g (m,)``, and when; ``name`` and
-    ``unit`` are those that files may use."""
+    """The integrand ``h'x + g'u`` of one coordinate, ``h (d,)`` of the state and ``g (m,)`` of the control that acts,
+    and its window of time. Files use its ``name`` and ``unit``."""
 
     h: Array
     g: Array
@@ -47,7 +47,7 @@ class Coordinate:
 @final
 @dataclass(frozen=True, eq=False)
 class Above:
-    """A matrix of a system with zeros at its right, ``more`` of them, and numbers below, at any parameter."""
+    """A matrix of a system at any parameter, enlarged by zeros at its right and by the rows ``below``."""
 
     top: object
     below: Array
@@ -65,12 +65,17 @@ DERIVED: dict[type, Callable[[Any, str], Rows]] = {
     kind: lambda entry, called: [replace(entry, name=called)]
     for kind in (PathConstraint, MixedConstraint, Return, Accumulated, IntegralConstraint)
 }
-"""Which windows and integrals a constraint is, by its exact kind, under what it is called."""
+"""The function that writes a constraint as windows and integrals with a given name, by the exact kind of constraint."""
 
 
 def spelt(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with windows and integrals alone; it itself where it has no others. Raises `InputError` for a
-    constraint that is not among the `DERIVED` ones, so that none is left out."""
+    """Return the problem with all constraints written as windows and integrals; the problem itself where they are.
+
+    Raises
+    ------
+    InputError
+        For a constraint that is not among the `DERIVED` ones, so that no constraint is ignored.
+    """
     every = [(name, entry) for name, entries in problem.lists.items() for entry in entries]
     for name, entry in every:
         if type(entry) not in DERIVED:
@@ -88,7 +93,7 @@ def spelt(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 
 def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with a coordinate for every integral; it itself where there is none."""
+    """Return the problem with one more coordinate for every integral; the problem itself where there is none."""
     if not problem.integral:
         return problem
     d, (coordinates, windows) = problem.system.states, _coordinates(problem)
@@ -116,8 +121,14 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
 def _coordinates(
     problem: OptimalControlProblem,
 ) -> tuple[list[Coordinate], list[tuple[str, float, list[tuple[list[int], float, float]]]]]:
-    """The coordinates of all integrals; and what each is called, when it is judged, and of every row which coordinates
-    are added up, between which bounds."""
+    """Return the coordinates of all integrals, and how they are judged.
+
+    Returns
+    -------
+    tuple[list[Coordinate], list]
+        The coordinates; and for every integral its name, the time when it is judged, and for every row the coordinates
+        that are added up, with their bounds.
+    """
     d, m = problem.system.states, problem.system.controls
     coordinates, windows = list[Coordinate](), list[tuple[str, float, list[tuple[list[int], float, float]]]]()
     for number, entry in enumerate(problem.integral):
@@ -130,7 +141,7 @@ def _coordinates(
         for row, (h, g, (lower, upper)) in enumerate(zip(H, G, bounds, strict=True)):
             name, unit = called + (f" {row + 1}" if len(H) > 1 else ""), _unit(problem.names, h, g)
             made = [Coordinate(h, g, entry.start, entry.stop, name, unit)]
-            if g.any() and (late or problem.execution is not None):  # errors are no part of what is counted
+            if g.any() and (late or problem.execution is not None):  # commands count, their errors do not
                 both = [f"{name} of states", f"{name} of controls"] if h.any() else [name]
                 made = [Coordinate(0.0 * h, g, entry.start + late, judged, both[-1], unit)]
                 made = [Coordinate(h, 0.0 * g, entry.start, entry.stop, both[0], unit)] * (len(both) - 1) + made
@@ -138,16 +149,18 @@ def _coordinates(
             coordinates += made
         windows.append((called, judged, sums))
     if not problem.system.switches and not any(one.begin > 0.0 for one in coordinates):
-        coordinates = [replace(one, end=problem.horizon) for one in coordinates]  # a system without pieces stays so
+        coordinates = [replace(one, end=problem.horizon) for one in coordinates]  # a system of one phase remains one
     return coordinates, windows
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class RunningIntegrals:
-    """What a problem with integrals is of where nothing changes with time but what is integrated: the ``system`` whose
-    coordinates are integrated all along. What is integrated from ``begins (k,)`` to ``ends (k,)`` is what has been
-    until the end, less what had been at the beginning."""
+    """A problem with integrals, in which nothing changes with time but which coordinates are integrated.
+
+    In its ``system`` all coordinates are integrated all the time. The integral from ``begins (k,)`` to ``ends (k,)`` is
+    the coordinate at the end minus the coordinate at the beginning.
+    """
 
     system: System
     begins: Array
@@ -155,7 +168,8 @@ class RunningIntegrals:
 
     @staticmethod
     def of(problem: OptimalControlProblem) -> RunningIntegrals | None:
-        """That of a problem as it is stated, of which one known system acts; ``None`` for others."""
+        """Return the running integrals of a problem as given by the user, with one known system; ``None`` for other
+        problems."""
         system = problem.system
         if not problem.integral or system.varies or system.switches or system.parameters is not None:
             return None
@@ -165,14 +179,16 @@ class RunningIntegrals:
         return RunningIntegrals(System((whole,), None, system.delay), *ends.T)
 
     def is_beside(self, phase: Phase, d: int) -> bool:
-        """Whether a phase is the same of the first ``d`` states, whatever is integrated beside them."""
+        """Return True where a phase agrees with this system in the first ``d`` states, whatever is integrated with
+        them."""
         pairs = [(phase.entry(name), self.system.phases[0].entry(name)) for name in ("A", "B", "E", "c")]
         if phase.domain is not None or any((one is None) != (other is None) for one, other in pairs):
             return False
         return all(one is None or np.array_equal(np.asarray(one)[:d], np.asarray(other)[:d]) for one, other in pairs)
 
     def parts(self, c: Array) -> list[tuple[Array, float]]:
-        """Rows ``(d + k,)`` of that system, and until when each goes on, that are together a row ``c (d + k,)``."""
+        """Return rows ``(d + k,)`` of that system, each with the time when it ends, which add up to a row ``c (d +
+        k,)``."""
         d = c.size - self.begins.size
         found, ends = [(np.append(c[:d], np.zeros(self.begins.size)), np.inf)], np.stack([self.begins, self.ends])
         for begin, end in np.unique(ends[:, c[d:] != 0.0], axis=1).T.tolist():
@@ -183,7 +199,7 @@ class RunningIntegrals:
 
 
 def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> System:
-    """The system with its coordinates, cut where one of them begins or ends."""
+    """Return the system with its coordinates, divided where one of them begins or ends."""
     switches = [phase.begin for phase in system.phases[1:]]
     turns = [*switches, horizon]
     for time in sorted({t for one in coordinates for t in (one.begin, one.end)}):
@@ -197,7 +213,8 @@ def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> Sy
 
 
 def _acting(coordinates: list[Coordinate], begin: float, until: float) -> Iterator[tuple[Array, Array]]:
-    """The rates of the coordinates on a piece of time, which is in the window of each or outside of it."""
+    """Yield the rates of the coordinates on an interval of time, which lies inside the window of each or outside of
+    it."""
     middle = (begin + until) / 2
     for one in coordinates:
         share = float(one.begin < middle < one.end)
@@ -229,7 +246,7 @@ def _freed(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint
 
 
 def _free(bound: ConvexSet, size: int) -> ConvexSet:
-    """The set of the first coordinates, whatever the others are."""
+    """Return a set of more coordinates: the first ones are in the given set, the others are free."""
     more = size - bound.dimension
     if isinstance(bound, Box):
         ends = ((bound.lower, -np.inf), (bound.upper, np.inf))
@@ -241,8 +258,10 @@ def _free(bound: ConvexSet, size: int) -> ConvexSet:
 
 
 def with_zeros(problem: OptimalControlProblem, more: int) -> dict[str, Any]:
-    """What a problem says of its initial states, its cost and its measurements, where so many states that begin at 0
-    and cost nothing are after its own."""
+    """Return the initial states, the cost and the measurements of a problem with additional states.
+
+    The ``more`` states follow those of the problem, begin at 0 and cost nothing.
+    """
     begun, zero, d = problem.initial_set, np.zeros(more), problem.system.states
     if isinstance(begun, Box):
         begun = Box(np.append(begun.lower, zero), np.append(begun.upper, zero))
@@ -262,7 +281,7 @@ def with_zeros(problem: OptimalControlProblem, more: int) -> dict[str, Any]:
 
 
 def _summed(sums: list[tuple[list[int], float, float]], size: int) -> ConvexSet:
-    """Bounds of sums of coordinates."""
+    """Return the set in which sums of coordinates are between their bounds."""
     if all(len(which) == 1 for which, _, _ in sums):
         lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
         for (place,), low, high in sums:
@@ -282,7 +301,8 @@ def _named(problem: OptimalControlProblem, coordinates: list[Coordinate]) -> Nam
 
 
 def _unit(names: Names, h: Array, g: Array) -> str:
-    """That of what is integrated times that of time, where all of it has one."""
+    """Return the unit of an integral, that of the integrand times that of time; empty where terms have different
+    units."""
     given = [(h, names.state_units), (g, names.control_units)]
     every = {units[i] if units else "" for values, units in given for i in np.flatnonzero(values).tolist()}
     (unit,) = every if len(every) == 1 else ("",)

@@ -1,4 +1,4 @@
-"""Disturbances of a list that stay what they are for several of the pieces on which all of them are constant."""
+"""Disturbances of a list that are held over several of the pieces on which all of them are constant."""
 
 from __future__ import annotations
 
@@ -21,12 +21,15 @@ if TYPE_CHECKING:
 
     from sparserob_core.control.problem.problem import OptimalControlProblem
 
-SAME = 1e-12  # of the horizon, two breakpoints that are one but for rounding, as in a problem's records
+SAME = 1e-12  # relative to the horizon: nearer breakpoints are one up to rounding, as in a problem's records
 
 
 def on_one_grid(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple[OptimalControlProblem, Dictionary]:
-    """A problem of which every disturbance of the list has breakpoints, those of the ``dictionary`` where it had none,
-    and the dictionary of the pieces on which all of them are constant."""
+    """Return a problem in which every disturbance of the list has breakpoints, and the dictionary of the common pieces.
+
+    A disturbance without breakpoints gets those of the ``dictionary``. All disturbances are constant on the common
+    pieces.
+    """
     if not dictionary.is_complete:
         raise Unchecked("beside breakpoints the checker knows dictionaries that take any value on each piece")
     assert problem.disturbance_breakpoints is not None
@@ -42,17 +45,20 @@ def on_one_grid(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple
 @final
 @dataclass(frozen=True, eq=False)
 class Lasting:
-    """The breakpoints ``changes`` of the pieces, without the horizon, and for the components ``columns`` of every part
-    the first pieces of its own, ``firsts``: what all pieces of one of these give to a row is given to the first, since
-    it has one value on all of them."""
+    """The components of a disturbance that are held over several pieces.
+
+    ``changes`` are the breakpoints of the pieces, without the horizon. ``parts`` has for every part of the disturbance
+    its ``columns``, and ``firsts``, the first piece of each of its own intervals. A component has one value on an
+    interval, so that the coefficients of all its pieces are added to the first piece.
+    """
 
     changes: list[float]
     parts: tuple[tuple[slice, np.ndarray], ...]
 
     @staticmethod
     def of(problem: OptimalControlProblem, changes: list[float]) -> Lasting | None:
-        """Those of a problem `on_one_grid`, whose disturbance may jump at the ``changes``; ``None`` where no part of it
-        has breakpoints of its own."""
+        """Return the held components of a problem `on_one_grid`, whose disturbance may jump at the ``changes``;
+        ``None`` where no part of it has its own breakpoints."""
         if problem.disturbance_breakpoints is None:
             return None
         if not isinstance(problem.disturbance, Product):
@@ -67,8 +73,20 @@ class Lasting:
         return Lasting(changes, tuple(parts))
 
     def gathered(self, mid: Array, rad: Array) -> tuple[Array, Array]:
-        """What the first pieces ``(pieces, ..., mw, b)`` of all add per unit, with errors of the same shape, as what
-        the components add that have one value for several of them."""
+        """Return the coefficients of the pieces, added up over the intervals on which a component has one value.
+
+        Parameters
+        ----------
+        mid
+            The coefficients ``(pieces, ..., mw, b)`` of the first pieces of the disturbance.
+        rad
+            Their error bounds, of the same shape.
+
+        Returns
+        -------
+        tuple[Array, Array]
+            Both, of the same shapes: the sum of an interval is at its first piece, and its other pieces are 0.
+        """
         mid, rad = mid.copy(), rad.copy()
         for columns, firsts in self.parts:
             begun = firsts[firsts < mid.shape[0]]
@@ -80,14 +98,15 @@ class Lasting:
         return mid, rad
 
     def may_jump(self, time: float) -> np.ndarray:
-        """Which components ``(mw,)`` may have another value from a time on."""
+        """Return which components ``(mw,)`` may have another value from a time on."""
         piece = bisect_right(self.changes, time) - 1
         begins = self.changes[piece] == time
         return np.concatenate([np.full(one.stop - one.start, begins and piece in firsts) for one, firsts in self.parts])
 
 
 def summed(lasting: Lasting | None, weights: Sequence[Sequence[arb]]) -> list[list[arb]]:
-    """`Lasting.gathered` of weights ``(mw,)`` on every piece, exactly; as they are where no component lasts longer."""
+    """Return weights ``(mw,)`` on every piece, added up exactly to the first piece of the interval on which a component
+    is held."""
     found = [list(one) for one in weights]
     for columns, firsts in () if lasting is None else lasting.parts:
         first = 0

@@ -1,4 +1,4 @@
-"""Plans that begin again: every final state must be one of the initial states."""
+"""Plans that repeat: every final state must be one of the initial states."""
 
 from __future__ import annotations
 
@@ -14,14 +14,19 @@ from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.sets.sets import Box
 
 RETURN = "return"
-INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: ten times what counts as no violation, so
-# that none is handed on from period to period
+# The relative margin of final states in the set of initial states. It is ten times the violation that counts as none,
+# so that no violation is passed on from period to period.
+INSIDE = 1e-8
 
 
 def returning(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with, of a plan that repeats, one constraint more: that every final state is one of the initial
-    states, and inside their set by more than what counts as no violation; none where there is but one of each
-    coordinate. Derived from the initial states alone, whatever the problem's records say of it."""
+    """Return the problem with one more constraint for a plan that repeats: every final state is one of the initial
+    states.
+
+    Final states must be inside the set by more than the violation that counts as none. There is no such constraint
+    where there is only one initial state. It is derived from the initial states alone, whatever the problem's records
+    say.
+    """
     bound, end, alone = problem.initial_set, problem.horizon, single(problem)
     path = [entry for entry in problem.windows if not isinstance(entry, Return)]
     if not problem.repeat or bound is None or len(alone) == problem.system.states:
@@ -38,7 +43,7 @@ def returning(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 
 def single(problem: OptimalControlProblem) -> list[int]:
-    """The coordinates of the state in which all initial ones are alike."""
+    """Return the coordinates of the state in which all initial states are equal."""
     bound, d = problem.initial_set, problem.system.states
     if bound is None:
         return list(range(d))

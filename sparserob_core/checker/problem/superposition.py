@@ -1,11 +1,12 @@
-"""Parameters beside the time, as coordinates of a larger state: derived from the problem's records alone.
+"""Parameters of a system that changes with time, as coordinates of a larger state: derived from the problem's records
+alone.
 
-Where every entry of ``[A B E c]`` is a sum ``f_0(t) + sum_j f_j(t) s_j``, ``s_j`` what parameter ``j`` deviates from a
-middle one by as a share of the most that it can, the state is ``x = x_0 + sum_j s_j y_j``, if no entry of ``A`` that
-has an ``s_j`` meets a state that depends on a parameter: then ``y_j' = A_0 y_j + A_j x_0 + B_j u + E_j w + c_j``. After
-the ``d`` states of the problem come the coordinates of ``y_1`` that anything moves, then those of ``y_2``, and so on.
-Rows on ``x`` are affine in ``s``, and hold on a box where they hold at its corners, at which every ``s_j`` is -1 or 1;
-so do convex sets.
+Let every entry of ``[A B E c]`` be a sum ``f_0(t) + sum_j f_j(t) s_j``. Here ``s_j`` is the deviation of parameter
+``j`` from a middle value, as a share of its largest deviation. Let no entry of ``A`` with an ``s_j`` multiply a state
+that depends on a parameter. Then the state is ``x = x_0 + sum_j s_j y_j`` with ``y_j' = A_0 y_j + A_j x_0 + B_j u + E_j
+w + c_j``. After the ``d`` states of the problem come the coordinates of ``y_1`` that can differ from 0, then those of
+``y_2``, and so on. Rows on ``x`` are affine in ``s``. They hold on a box where they hold at its corners, at which every
+``s_j`` is -1 or 1; so do convex sets.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ NO_PLANE = "the checker knows parameters beside the time that the state depends 
 
 @final
 class Affine:
-    """A number of which it is known only that it is an affine function of some ``parameters``, by their places, at any
-    time; ``bent``: or any other function of them."""
+    """A number of which only the ``parameters`` that it depends on are known, by their places, at any time. It is an
+    affine function of them; where it is ``bent``, it may be any function of them."""
 
     __slots__ = ("bent", "parameters")
 
@@ -89,7 +90,7 @@ class ParameterExpansion:
 
     @cached_property
     def scales(self) -> list[float]:
-        """The most that every parameter deviates by, or a double above it."""
+        """The largest deviation of every parameter, or a double above it."""
         box = self.system.parameters
         if not isinstance(box, Box):
             raise Unchecked("the checker knows boxes of parameters beside the time")
@@ -100,8 +101,18 @@ class ParameterExpansion:
         ]
 
     def depends(self, entry: object) -> tuple[np.ndarray, np.ndarray]:
-        """Which entries of a matrix may be other numbers than 0, ``(rows, columns)``, and which every parameter has a
-        part in, ``(nu, rows, columns)``, at any time; raises `Unchecked` where one is no affine function of them."""
+        """Return which entries of a matrix may differ from 0, and which depend on a parameter, at any time.
+
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray]
+            Booleans ``(rows, columns)`` and ``(nu, rows, columns)``.
+
+        Raises
+        ------
+        Unchecked
+            Where an entry is no affine function of the parameters.
+        """
         movable = [frozenset([j]) if scale else frozenset[int]() for j, scale in enumerate(self.scales)]
         whole = _called(entry, [Affine(), *map(Affine, movable)])
         there, moves = np.zeros(whole.shape, dtype=bool), np.zeros((len(movable), *whole.shape), dtype=bool)
@@ -114,8 +125,10 @@ class ParameterExpansion:
         return there, moves
 
     def tables(self, entry: object, time: object) -> list[np.ndarray]:
-        """``f_0, f_1, ..., f_nu`` of a matrix at a time: what it is in the middle, and by how much more where one
-        parameter deviates by its `scales`."""
+        """Return ``f_0, f_1, ..., f_nu`` of a matrix at a time.
+
+        ``f_0`` is the matrix in the middle, and ``f_j`` its change where parameter ``j`` deviates by its `scales`.
+        """
         nothing: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
         middle, moves = [nothing + value for value in self.middle], self.depends(entry)[1]
         found = [_called(entry, [time, *middle])]
@@ -130,7 +143,7 @@ class ParameterExpansion:
 
     @cached_property
     def is_affine(self) -> bool:
-        """Whether the state is an affine function of the parameters."""
+        """True where the state is an affine function of the parameters."""
         try:
             _ = self.moved
         except Unchecked:
@@ -153,7 +166,7 @@ class ParameterExpansion:
                     own |= others
                 driven |= others.any(axis=2)
         onward = np.minimum(np.eye(d) + steady, 1.0)
-        for _ in range(d.bit_length()):  # where a state may go in 1, 2, 4, ... steps
+        for _ in range(d.bit_length()):  # the states that a state can influence in 1, 2, 4, ... steps
             onward = np.minimum(onward @ onward, 1.0)
         found = [np.flatnonzero(onward @ start > 0.0).tolist() for start in driven.astype(float)]
         if any(own[:, :, places].any() for places in found):
@@ -162,11 +175,12 @@ class ParameterExpansion:
 
     @property
     def size(self) -> int:
-        """All coordinates."""
+        """The number of all coordinates."""
         return self.system.states + sum(map(len, self.moved))
 
     def seen(self, shares: tuple[float, ...]) -> Array:
-        """``x`` as rows on all coordinates, ``(d, size)``, at deviations of the parameters."""
+        """Return the matrix ``(d, size)`` that gives ``x`` from all coordinates, at the shares ``s_j`` of the
+        parameters."""
         d = self.system.states
         found, column = np.zeros((d, self.size)), d
         found[:, :d] = np.eye(d)
@@ -177,7 +191,7 @@ class ParameterExpansion:
         return found
 
     def corners(self) -> Iterator[tuple[float, ...]]:
-        """Those of a box that holds all shares; of parameters that move nothing one suffices."""
+        """Return the corners of a box that contains all shares; a parameter without any effect has the share 0 only."""
         pairs = zip(self.scales, self.moved, strict=True)
         return product(*((-1.0, 1.0) if scale and places else (0.0,) for scale, places in pairs))
 
@@ -185,14 +199,14 @@ class ParameterExpansion:
 @final
 @dataclass(frozen=True, eq=False)
 class Larger:
-    """One of the matrices of the system of all coordinates."""
+    """A matrix of the system of all coordinates."""
 
     parts: ParameterExpansion
     name: str
     entry: object
 
     def __call__(self, p: Any) -> np.ndarray:
-        """The matrix at a time ``(1,)``."""
+        """Return the matrix at a time ``(1,)``."""
         whole, moved, d = self.parts.tables(self.entry, p[0]), self.parts.moved, self.parts.system.states
         if self.name != "A":
             return np.concatenate([whole[0], *(one[places] for one, places in zip(whole[1:], moved, strict=True))])
@@ -206,13 +220,15 @@ class Larger:
 
 
 def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with coordinates for its parameters beside the time; it itself where there are none that the state is
-    an affine function of."""
+    """Return the problem with coordinates for the parameters of a system that changes with time.
+
+    It is the problem itself where there are no such parameters, or the state is not an affine function of them.
+    """
     system = problem.system
     if not system.varies or system.parameters is None:
         return problem
     parts = ParameterExpansion(system, tuple(system.parameters.interior_point().tolist()))
-    if not parts.is_affine:  # then it is expanded, box by box by the flow
+    if not parts.is_affine:  # then the flow is expanded on boxes of parameters
         return problem
     d, more = system.states, parts.size - system.states
     corners = [parts.seen(shares) for shares in parts.corners()]
@@ -246,7 +262,7 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 
 def _called(entry: object, arguments: list[Any]) -> np.ndarray:
-    """A matrix at the time and the parameters, numbers of any kind."""
+    """Return a matrix at the time and the parameters, numbers of any kind."""
     p = np.empty(len(arguments), dtype=object)
     p[:] = arguments
     with np.errstate(all="ignore"):
@@ -254,7 +270,7 @@ def _called(entry: object, arguments: list[Any]) -> np.ndarray:
 
 
 def _above(exact: Fraction) -> float:
-    """The number itself, or the next double above it."""
+    """Return the number itself, or the next double above it."""
     found = float(exact)
     return nextafter(found, inf) if Fraction(found) < exact else found
 
@@ -266,12 +282,16 @@ def _larger(parts: ParameterExpansion, phase: Phase) -> Phase:
 
 
 def _rows(blocks: list[Array]) -> Array:
-    """All rows, every one once, in the order in which they come first."""
+    """Return every distinct row once, in the order of first occurrence."""
     return np.array(list(dict.fromkeys(tuple(row) for block in blocks for row in block.tolist())))
 
 
 def _bounds(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
-    """What a set says at all corners: one with flat sides in rows, another one in a set for every corner."""
+    """Return the sets of the larger state that hold a set at all corners.
+
+    A set with flat sides becomes one polytope with the rows of all corners, another set becomes one set for each
+    corner.
+    """
     flat = bound.halfspaces()
     if flat is not None:
         every = _rows([np.column_stack([flat[0] @ seen, flat[1]]) for seen in corners])

@@ -1,4 +1,4 @@
-"""When the control of a problem acts, and one grid of all times at which an input may jump."""
+"""The times at which the control of a problem acts, and one grid of all times at which an input may jump."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from sparserob_core.sip.convex_set import Array
 @final
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """The times of a ``problem`` whose ``control`` and ``disturbance`` have these breakpoints. Where the control is
-    ``answering``, it measures at its breakpoints."""
+    """The times of a ``problem`` whose ``control`` and ``disturbance`` have these breakpoints. A control that is
+    ``answering`` measures at its breakpoints."""
 
     problem: OptimalControlProblem
     control: Array
@@ -28,18 +28,19 @@ class Timing:
 
     @cached_property
     def acting(self) -> list[float]:
-        """When every piece of the control begins to act; from 0 on."""
+        """The times at which the pieces of the control begin to act, from 0 on."""
         later: list[float] = np.unique([0.0, *(self.control[:-1] + self.problem.system.delay)]).tolist()
         return later
 
     @property
     def until(self) -> float:
-        """The last time that anything is said of."""
+        """The last time about which anything is claimed."""
         return max(float(self.control[-1]), float(self.disturbance[-1]), self.problem.horizon)
 
     @cached_property
     def grid(self) -> list[float]:
-        """Every breakpoint of either dictionary, those of the control as late as it acts."""
+        """The breakpoints of both dictionaries, those of the control later by the delay, and the switches of the
+        system; also the breakpoints at which an answering control measures."""
         self.clock.check()
         ends, last = (self.control[-1], self.disturbance[-1]), self.until
         measured = self.control.tolist() if self.answering else []
@@ -47,11 +48,11 @@ class Timing:
         return [*every[(every < last) & ~np.isin(every, ends)].tolist(), last]
 
     def piece_at(self, time: float) -> int:
-        """The piece of the `grid` that holds a time from 0 on; the last one holds the end too."""
+        """Return the piece of the `grid` that contains a time from 0 on; the last piece contains the end too."""
         return min(bisect_right(self.grid, time) - 1, len(self.grid) - 2)
 
 
 def before(problem: OptimalControlProblem) -> list[float]:
-    """The control that acts until the first one of a delayed system does, ``(m,)``."""
+    """Return the control ``(m,)`` that acts until the first piece of a delayed system acts."""
     given = problem.initial_control
     return [0.0] * problem.system.controls if given is None else [float(u) for u in np.asarray(given)]

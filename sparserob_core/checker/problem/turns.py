@@ -1,5 +1,8 @@
-"""Systems that take turns, what acts late, and parameters, as one system whose entries depend on the time: errors of
-execution are followed in the time, not in the age of a command; so are measurable disturbances beside parameters."""
+"""Switched systems, delays and parameters as one system whose entries depend on the time.
+
+Errors of execution are propagated in the time, not in the age of a command; so are measurable disturbances of a system
+with parameters.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,11 @@ from sparserob_core.control.sets.sets import Box
 
 
 def in_turns(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem with such a system where it has errors of execution beside turns, a delay or parameters, or
-    measurable disturbances beside a box of parameters; it itself elsewhere."""
+    """Return the problem with such a system where that is needed, else the problem itself.
+
+    It is needed for errors of execution with switches, a delay or parameters, and for measurable disturbances with a
+    box of parameters.
+    """
     system = problem.system
     missed = problem.execution is not None and bool(system.switches or system.delay or system.parameter_count)
     pushed = problem.measurable is not None and isinstance(system.parameters, Box)

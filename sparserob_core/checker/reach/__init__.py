@@ -1,1 +1,1 @@
-"""What the state does, in ball arithmetic: flows, worst disturbances, tubes."""
+"""Reachable states in ball arithmetic: flows, worst-case disturbances and tubes."""

@@ -1,9 +1,9 @@
-"""A row ``c'x(t)`` of a known system that does not change, by its adjoint ``l(s) = e^{A's} c``: what it is along one
-trajectory, and how large it is at most along all of them.
+"""Rows ``c'x(t)`` of a known system that does not change with time, by their adjoints ``l(s) = e^{A's} c``: values
+along one trajectory, and upper bounds over all trajectories.
 
-The rows at the ends of equal steps are vectors of balls, each a product of few matrices; from there on they are floats
-with a radius. Within a step a row, and what an input adds, is a polynomial of the time: its terms, and what they are
-off by, are those of a segment of the verified flow. Nothing is as large as a transition at every time.
+The adjoints at the ends of equal steps are vectors of balls, each a product of a few matrices; afterwards they are
+floats with a radius. Within a step the adjoint, and its product with the inputs, is a polynomial in time. Its terms and
+its remainder are those of a segment of the verified flow. No transition matrix is made for every time.
 """
 
 from __future__ import annotations
@@ -31,32 +31,33 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-ORDER = 13  # of the polynomials
-REST = 2e-15  # of a row's largest term is left of them over a step, about: more is felt, less takes shorter steps
+ORDER = 13  # degree of the polynomials
+REST = 2e-15  # about their truncation error in parts of a row: more widens the bounds, less needs shorter steps
 LONGEST = 16.0  # size of a system over a step, at most: the terms of its series are then below 1e6, and cancel little
-BENDING = 7  # of the polynomials that bound second derivatives
+BENDING = 7  # degree of the polynomials that bound second derivatives
 MOST_STEPS = 2**17
-BLOCK = 64  # rows in one ball matrix, a power of two: fewer take more calls, more make more that are not needed
-# Steps between rows that are products of ball matrices, a power of two, where all of them would be dear; those between
-# are one product of floats more, which is off as the terms of polynomials are. With half of it the rows of many states
-# take twice as long, and with twice as much the transitions between take the time of the rows.
+BLOCK = 64  # rows in one ball matrix, a power of two: fewer need more calls, more make more rows that are not needed
+# Steps between rows that are products of ball matrices, a power of two, where making all rows so would take long. A row
+# between needs one more product of floats, whose error is like that of the terms of polynomials. With half of it the
+# rows of many states take twice as long, and with twice as much the transitions between take the time of the rows.
 APART = 16
-# Multiplications of balls for all rows, from which only every `APART`-th is made of them: some six seconds. With a
-# tenth of it bounds told to the last digit are wider than what a run wrote, of plants whose rows take no time.
+# Multiplications of balls for all rows, about six seconds; beyond, only every `APART`-th row is made of balls. With a
+# tenth of it bounds for plants whose rows take no time are wider than those that a run reports to the last digit.
 DEAR = 2**29
-MOST = 2**27  # numbers that the rows of all steps take
-AT_ONCE = 2**22  # numbers of rows that are worked on at once
-# Terms of a product of floats that are added up before these sums are: of 348 states 43 roundings meet instead of 348.
-# With half of it products take a fourth longer, and with twice as much bounds along modes that are far from normal are
-# twice as wide.
+MOST = 2**27  # entries of the rows of all steps, at most
+AT_ONCE = 2**22  # entries of rows that are computed at once
+# Terms of a product of floats in one partial sum; the partial sums are added up then. With 348 states an entry is
+# rounded 43 times instead of 348. With half of it products take a fourth longer, and with twice as much bounds along
+# modes that are far from normal are twice as wide.
 SUMMED = 32
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class AdjointFlow:
-    """What all rows of a system ``x' = A x + F u`` share: the flow on a ``segment`` of time, a ``step``, of which there
-    are ``count`` one after another. Its length is a power of two, so that places within a step are exact."""
+    """The flow that the adjoints of all rows of ``x' = A x + F u`` share: that on a ``segment`` of time of the length
+    ``step``, and the number ``count`` of such steps. The length is a power of two, so that places within a step are
+    exact."""
 
     A: arb_mat
     F: arb_mat
@@ -67,7 +68,13 @@ class AdjointFlow:
 
     @staticmethod
     def of(A: arb_mat, F: arb_mat, horizon: float, clock: Clock) -> AdjointFlow:
-        """That of rows with inputs through ``F (d, q)`` up to the ``horizon``."""
+        """Return the flow up to the ``horizon``, with inputs by ``F (d, q)``.
+
+        Raises
+        ------
+        Unchecked
+            If the system is too fast for this horizon.
+        """
         plain, speed = middles(A), np.abs(middles(F)).sum(axis=1)
         units = balanced(plain, horizon, speed)
         step = choose_step(plain * units / units[:, None], horizon)
@@ -80,21 +87,21 @@ class AdjointFlow:
 
     @property
     def states(self) -> int:
-        """How many states there are."""
+        """The number of states, ``d``."""
         return int(self.A.nrows())
 
     @property
     def apart(self) -> int:
-        """How many steps are between rows that are products of ball matrices."""
+        """The number of steps between adjoints that are products of ball matrices."""
         return APART if self.count * self.states**2 > DEAR else 1
 
     @cached_property
     def _powers(self) -> list[arb_mat]:
-        """The transition over a step, and what was squared of it."""
+        """The transitions over 1, 2, 4, ... steps that are made so far."""
         return [self.segment.end.matrix]
 
     def over(self, place: int) -> arb_mat:
-        """The transition over ``2^place`` steps."""
+        """Return the transition over ``2^place`` steps."""
         while len(self._powers) <= place:
             self.clock.check()
             self._powers.append(self._powers[-1] * self._powers[-1])
@@ -113,39 +120,43 @@ class AdjointFlow:
         return [Enclosed.all([one], shape) for one in found]
 
     def _expanded(self, order: int, columns: arb_mat | None = None) -> Enclosed:
-        """What makes of a row the terms of ``l`` on the step after it, or of ``l`` times ``columns (d, n)``, up to an
-        ``order``, ``(order + 1, d, n)``; what the others add counts as what the first is off by."""
+        """Return matrices ``(order + 1, d, n)`` that turn an adjoint at the beginning of a step into the terms of ``l``
+        on this step, or of ``l`` times ``columns (d, n)``. The remainder is in the radius of the first."""
         self.clock.check()
         terms, off = self.segment.first(order + 1)
         every = [one.matrix for one in terms]
         if columns is not None:
             every, off = [one * columns for one in every], off @ Series.known(columns).size
-        every += [every[0] * 0] * (order + 1 - len(every))  # of a system whose series ends
+        every += [every[0] * 0] * (order + 1 - len(every))  # the series of a system may end earlier
         found = Enclosed.all(every, (order + 1, *off.shape))
         found.rad[0] += off * OUTWARD
         return found
 
     @cached_property
     def rows(self) -> Enclosed:
-        """The terms of ``l``, ``(p + 1, d, d)``."""
+        """The matrices that turn an adjoint into the terms of ``l`` on a step, ``(p + 1, d, d)``."""
         return self._expanded(ORDER)
 
     @cached_property
     def inputs(self) -> Enclosed:
-        """Those of ``l'F``, ``(p + 1, d, q)``."""
+        """The matrices that turn an adjoint into the terms of ``l'F`` on a step, ``(p + 1, d, q)``."""
         return self._expanded(ORDER, self.F)
 
     @cached_property
     def bending(self) -> Enclosed:
-        """The first of ``l'[A^2, A F, A^2 F]``, ``(J, d, d + 2 q)``."""
+        """The matrices that turn an adjoint into the first terms of ``l'[A^2, A F, A^2 F]`` on a step,
+        ``(J, d, d + 2 q)``."""
         once, twice = (Series.known(self.A * one) for one in (self.F, self.A))
         return self._expanded(BENDING, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix)
 
 
 def choose_step(A: Array, horizon: float) -> float:
-    """The length of a step, a power of two, after which about `REST` of a row is beyond the terms of its polynomial;
-    ``A`` is in units in which it is small. By floats, since what is beyond is bounded wherever the step ends: powers of
-    a matrix are often far less than the power of its norm."""
+    """Return the length of a step, a power of two, such that a polynomial has about `REST` of a row as truncation
+    error.
+
+    ``A`` is in units in which it is small. Floats suffice, since the truncation error is bounded wherever the step
+    ends. The choice uses a power of ``A``, which is often far smaller than the power of its norm.
+    """
     size = float(np.abs(A).sum(axis=1).max(initial=0.0))
     if not size < 2.0**1000:
         raise Unchecked("the system is too fast for its horizon to be followed")
@@ -159,20 +170,20 @@ def choose_step(A: Array, horizon: float) -> float:
 @final
 @dataclass(frozen=True, eq=False)
 class AdjointRow:
-    """``l`` at the ends of the steps of a ``motion``, ``nodes (N + 1, d)``."""
+    """The adjoint ``l`` of a row at the ends of the steps of a ``motion``, ``nodes (N + 1, d)``."""
 
     motion: AdjointFlow
     nodes: Enclosed
-    opposite: AdjointRow | None = None  # that of ``-c``, which is as large everywhere
+    opposite: AdjointRow | None = None  # the adjoint of ``-c``, which has the same absolute values
 
     @staticmethod
     def of(motion: AdjointFlow, c: Array) -> AdjointRow:
-        """That of the row ``c (d,)``, an exact one."""
+        """Return the adjoint of a row ``c (d,)`` of exact numbers."""
         return AdjointRow.of_balls(motion, [ball(v) for v in c])
 
     @staticmethod
     def of_balls(motion: AdjointFlow, c: list[arb]) -> AdjointRow:
-        """That of a row ``(d,)`` of balls."""
+        """Return the adjoint of a row ``c (d,)`` of balls."""
         found, place, count = [c], floor(log2(motion.apart)), motion.count // motion.apart + 1
         while len(found) < BLOCK:
             found += (stacked(found) * motion.over(place)).tolist()
@@ -198,17 +209,17 @@ class AdjointRow:
         return self.motion.step
 
     def reversed(self) -> AdjointRow:
-        """That of ``-c``."""
+        """Return the adjoint of the row ``-c``."""
         return replace(self, nodes=Enclosed(-self.nodes.mid, self.nodes.rad), opposite=self)
 
     @property
     def count(self) -> int:
-        """How many steps there are."""
+        """The number of steps, ``N``."""
         return int(self.nodes.mid.shape[0]) - 1
 
     @cached_property
     def driven(self) -> Enclosed:
-        """The terms ``(N, p + 1, q)`` of ``l'F`` on every step, the rest among their radii, at the first."""
+        """The terms of ``l'F`` on every step, ``(N, p + 1, q)``; the remainder is in the radius of the first."""
         return Enclosed(*_product(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.motion.inputs))
 
     @cached_property
@@ -217,8 +228,9 @@ class AdjointRow:
 
     @cached_property
     def sums(self) -> Enclosed:
-        """``int l'F`` up to the end of every step, ``(N + 1, q)``; the radius grows from step to step by what the terms
-        of the step are off, so that what the difference of two is off is the difference of their radii."""
+        """The integrals of ``l'F`` from 0 to the end of every step, ``(N + 1, q)``. The radius grows from step to step
+        by the error bound of this step, so that the error of a difference of two is bounded by the difference of their
+        radii."""
         moved, size = (
             self.step * np.einsum("kjq,j->kq", part, self._weights)
             for part in (self.driven.mid, np.abs(self.driven.mid))
@@ -227,12 +239,12 @@ class AdjointRow:
         return Enclosed(accumulate_exactly(moved), _accumulated(rad) * OUTWARD)
 
     def placed(self, times: Array) -> tuple[np.ndarray, Array]:
-        """The step of every time, and the share of it that has passed, exactly."""
+        """Return the step that holds each time, and the share of the step that has passed, both exact."""
         steps = np.clip(np.floor(times / self.step).astype(int), 0, self.count - 1)
         return steps, (times - steps * self.step) / self.step
 
     def at(self, times: Array) -> Enclosed:
-        """``l`` at exact times ``(k,)``, ``(k, d)``."""
+        """Return ``l`` at exact ``times (k,)``, ``(k, d)``."""
         steps, shares = self.placed(times)
         mid, rad = np.empty((2, times.size, self.motion.states))
         whole = shares == 0.0
@@ -252,8 +264,14 @@ class AdjointRow:
         return Enclosed(mid, rad)
 
     def integrals(self, times: Array) -> tuple[Enclosed, Array]:
-        """``int_0^t l'F`` at exact times ``(...)``, ``(..., q)``, 0 before 0, with radii as of `sums`; and what
-        rounding makes of it here."""
+        """Return the integrals of ``l'F`` from 0 to exact times ``(...)``, and 0 for negative times.
+
+        Returns
+        -------
+        tuple
+            The integrals ``(..., q)`` with radii as in `sums`, and bounds of the rounding errors made here,
+            ``(..., q)``.
+        """
         steps, shares = self.placed(np.maximum(times, 0.0))
         powers = self.step * shares[..., None] ** np.arange(1, ORDER + 2) * self._weights
         mid = np.einsum("...jq,...j->...q", self.driven.mid[steps], powers)
@@ -264,8 +282,8 @@ class AdjointRow:
         return Enclosed(total, (self.sums.rad[steps] + rad) * OUTWARD), rounded * OUTWARD
 
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
-        """What an input of 1 from ``start`` to ``stop`` adds to the row at exact times, ``(..., q)``; where the
-        difference of two times is rounded, the radius allows for it."""
+        """Return what an input of 1 from ``start`` to ``stop`` adds to the row at exact times, ``(..., q)``. The radius
+        allows for the rounding of differences of times."""
         (since, one), (until, other) = subtract_times(times, start), subtract_times(times, stop)
         (late, first), (early, second) = self.integrals(since), self.integrals(until)
         mid = late.mid - early.mid
@@ -275,12 +293,13 @@ class AdjointRow:
 
     @cached_property
     def fastest(self) -> Array:
-        """The largest absolute value of ``l'F``, ``(q,)``."""
+        """The upper bound of ``|l'F|`` at all times, ``(q,)``."""
         return np.asarray((np.abs(self.driven.mid) + self.driven.rad).sum(axis=1).max(axis=0) * OUTWARD)
 
     @cached_property
     def bends(self) -> tuple[Array, Array, Array]:
-        """On every step bounds of ``|l''|``, ``(N, d)``, of ``|l'AF|`` and of ``|l'A^2 F|``, ``(N, q)``."""
+        """The upper bounds on every step of ``|l''|``, ``(N, d)``, of ``|l'AF|`` and of ``|l'A^2 F|``, ``(N, q)``
+        each."""
         if self.opposite is not None:
             return self.opposite.bends
         d, q, terms = self.motion.states, self.motion.F.ncols(), self.motion.bending
@@ -298,8 +317,8 @@ class AdjointRow:
 @final
 @dataclass(frozen=True, eq=False)
 class SupportIntegrals:
-    """The integrals from 0 on of the support functions of some ``sides`` at the ``columns`` of ``l'F`` of one ``row``:
-    one for every side."""
+    """The integrals, from 0 on, of the support functions of ``sides`` at some ``columns`` of ``l'F`` for one ``row``:
+    one integral for every side."""
 
     row: AdjointRow
     columns: slice
@@ -307,24 +326,25 @@ class SupportIntegrals:
 
     @cached_property
     def _polynomials(self) -> tuple[Array, Array, Array]:
-        """Those of every step in powers of ``u`` from -1 to 1 across it, ``(N, p + 1, w)``, by how much they and sums
-        of two of their values are off, and how large they are, ``(N, w)`` each."""
+        """The columns of ``l'F`` on every step in powers of ``u`` from -1 to 1, ``(N, p + 1, w)``; their error bounds,
+        which allow for rounding errors in the sum of two of their values; and bounds of their absolute values,
+        ``(N, w)`` each."""
         mid, rad = (part[:, :, self.columns] for part in (self.row.driven.mid, self.row.driven.rad))
-        size = np.abs(mid).sum(axis=1) * OUTWARD  # in other powers not more, since ``|v| <= (1 + |u|) / 2``
+        size = np.abs(mid).sum(axis=1) * OUTWARD  # no larger in powers of ``u``, since ``|v| <= (1 + |u|) / 2``
         off = rad.sum(axis=1) + (rounding(2 * ORDER) + rounding(size.shape[1] + 2 * ORDER)) * size
         return np.einsum("ij,kjw->kiw", CENTRED, mid), off * OUTWARD, size
 
     @cached_property
     def _heights(self) -> Array:
-        """How large the support functions are at most, on every step and its neighbours, ``(N, S)``."""
+        """The upper bounds of the support functions on every step and its neighbours, ``(N, S)``."""
         _, off, size = self._polynomials
         found = (size + off) @ np.array([side.far for side in self.sides]).T * OUTWARD
         around = np.pad(found, ((1, 1), (0, 0)), mode="edge")
         return np.asarray(np.maximum(found, np.maximum(around[:-2], around[2:])))
 
     def _parts(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array, Array]:
-        """The integrals over the first ``shares (k,)`` of steps ``(k,)``, and by how much more and less they may be,
-        ``(k, S)`` each."""
+        """Return the integrals over the first ``shares (k,)`` of ``steps (k,)``, and how much more and how much less
+        they may be, ``(k, S)`` each."""
         P, off, size = (part[steps] for part in self._polynomials)
         found = []
         for side in self.sides:
@@ -336,14 +356,15 @@ class SupportIntegrals:
 
     @cached_property
     def _ends(self) -> tuple[Array, Array, Array]:
-        """The same over all steps before each, ``(N + 1, S)``."""
+        """The integrals from 0 to the end of every step, and how much more and how much less they may be,
+        ``(N + 1, S)`` each."""
         value, more, less = self._parts(np.arange(self.row.count), np.ones(self.row.count))
         outward = OUTWARD * (1.0 + rounding(self.row.count))
         return accumulate_exactly(value), _accumulated(more) * outward, _accumulated(less) * outward
 
     def at(self, times: Array, rounded: Array | float = 0.0) -> tuple[Array, Array]:
-        """The integrals up to ``times (k,)``, which are off by what is ``rounded``: between ``(k, S)`` and
-        ``(k, S)``."""
+        """Return lower and upper bounds ``(k, S)`` of the integrals from 0 to ``times (k,)``, whose rounding errors are
+        at most ``rounded``."""
         steps, shares = self.row.placed(times)
         (value, more, less), inside = (part[steps] for part in self._ends), self._parts(steps, shares)
         found = value + inside[0]
@@ -354,12 +375,17 @@ class SupportIntegrals:
 @final
 @dataclass(frozen=True, eq=False)
 class Stopped:
-    """A sum of rows of which each stays what it was at a time of its own: at the earlier of ``t`` and that time. In the
-    place of an `AdjointRow`, at single times.
+    """A sum of adjoints, each of which stays constant from a time of its own on. It replaces an `AdjointRow` at single
+    times.
 
-    ``ways``: of an integral from ``a`` to ``b``, what of it measurable disturbances meet, backwards: its row for
-    ``b - a``, and for ``a`` what has become of the row then, less the row. How long each is, and by how much that is
-    rounded.
+    Attributes
+    ----------
+    parts
+        The adjoints, and the time from which each is constant.
+    ways
+        For an integral of a row from ``a`` to ``b``, the adjoints that a measurable disturbance meets, backwards in
+        time: that of the row over the length ``b - a``, then over the length ``a`` that of ``r(b - a) - r(0)``, where
+        ``r(s)`` is the adjoint of the row after ``s``. With each, its length and the rounding error of this length.
     """
 
     parts: Sequence[tuple[AdjointRow, float]]
@@ -367,7 +393,7 @@ class Stopped:
 
     @staticmethod
     def integral(parts: Sequence[tuple[AdjointRow, float]], row: Array, begin: float, end: float) -> Stopped:
-        """That of ``parts`` which are a row ``(d,)`` that is integrated from ``begin`` to ``end``."""
+        """Return the sum for the integral of a ``row (d,)`` from ``begin`` to ``end``, whose ``parts`` are given."""
         from flint import arb, arb_mat
 
         (first, _), motion = parts[0], parts[0][0].motion
@@ -378,15 +404,15 @@ class Stopped:
 
     @property
     def motion(self) -> AdjointFlow:
-        """What they share."""
+        """The adjoint flow that all parts share."""
         return self.parts[0][0].motion
 
     def at(self, times: Array) -> Enclosed:
-        """`AdjointRow.at`."""
+        """Return the sum of the adjoints at exact ``times (k,)``, ``(k, d)``."""
         return _sum([row.at(np.minimum(times, until)) for row, until in self.parts])
 
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
-        """`AdjointRow.between`."""
+        """Return what an input of 1 from ``start`` to ``stop`` adds to the sum at exact times, ``(..., q)``."""
         return _sum([row.between(np.minimum(times, until), start, stop) for row, until in self.parts])
 
 
@@ -399,7 +425,7 @@ def _sum(parts: Sequence[Enclosed]) -> Enclosed:
 
 
 def accumulate_exactly(values: Array) -> Array:
-    """The sums of the first ``0, 1, ..., N`` of ``values (N, q)``, each rounded once."""
+    """Return the sums of the first ``0, 1, ..., N`` of ``values (N, q)``, each rounded once."""
     sums = [accumulate(balls(column), initial=balls([0.0])[0]) for column in values.T]
     return np.array([[float(x) for x in column] for column in sums]).reshape(-1, len(values) + 1).T
 
@@ -409,15 +435,17 @@ def _accumulated(values: Array) -> Array:
 
 
 def subtract_times(times: Array, others: Array | float) -> tuple[Array, Array]:
-    """Differences of times, and by how much they are rounded (Knuth 1997, section 4.2.2, theorem B)."""
+    """Return the differences of times as floats, and the absolute values of their rounding errors (Knuth 1997, section
+    4.2.2, theorem B)."""
     nearest = times - np.asarray(others, dtype=float)
     part = nearest - times
     return nearest, np.abs((times - (nearest - part)) - (others + part))
 
 
 def _product(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
-    """Rows ``(k, d)`` times matrices ``(j, d, n)``, ``(k, j, n)``, with its error. What is rounded is added up as many
-    times as there are terms in one of the sums, and sums (Higham 2002, section 4.2)."""
+    """Return the products ``(k, j, n)`` of rows ``(k, d)`` with matrices ``(j, d, n)``, and their error bounds. The
+    rounding error grows with the number of terms of one partial sum plus the number of these sums (Higham 2002, section
+    4.2)."""
     j, d, n = right.mid.shape
     flat, off = (part.transpose(1, 0, 2).reshape(d, j * n) for part in (right.mid, right.rad))
     size = np.abs(left.mid)
@@ -432,9 +460,22 @@ def _product(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
 @final
 @dataclass(frozen=True, eq=False)
 class Worst:
-    """The largest ``c'x(t)`` over all initial states ``centre + begun`` and disturbances in ``pushed``, which enter by
-    the last inputs of the ``adjoint``: constant between ``changes (M + 1,)``, or, where these are ``None``, measurable;
-    the ``drives (q', L)`` between times ``grid (L + 1,)`` enter by the first."""
+    """The largest ``c'x(t)`` over all initial states and disturbances.
+
+    Attributes
+    ----------
+    adjoint
+        The adjoint of the row ``c``.
+    centre, begun
+        The centre of the initial states, ``(d,)``, and the set of deviations from it.
+    grid, drives
+        Times ``(L + 1,)``, and the known inputs between them, ``(q', L)``, which enter by the first inputs of the
+        adjoint.
+    pushed
+        The set of the disturbance, which enters by the last inputs.
+    changes
+        The times ``(M + 1,)`` between which the disturbance is constant; ``None`` where it is measurable.
+    """
 
     adjoint: AdjointRow | Stopped
     centre: Array
@@ -446,18 +487,29 @@ class Worst:
 
     @property
     def _row(self) -> AdjointRow:
-        """The one row that this is of, where it is known at all times."""
+        """The one adjoint of the row, where it is known at all times."""
         if isinstance(self.adjoint, Stopped):
             raise Unchecked("a sum of rows that stop is known at single times alone")
         return self.adjoint
 
     @property
     def _mine(self) -> slice:
+        """The inputs of the adjoint by which the disturbance enters."""
         return slice(self.drives.mid.shape[0], None)
 
     def along(self, time: float, deviation: Array, changes: Array, signal: Array | None) -> tuple[float, float]:
-        """The value at a time, between bounds, from the centre and a ``deviation (d,)``, under a ``signal (mw, M)``
-        that is constant between ``changes (M + 1,)``."""
+        """Return a lower and an upper bound of the row at a time along one trajectory.
+
+        Parameters
+        ----------
+        time
+            The time.
+        deviation
+            The initial deviation from the centre, ``(d,)``.
+        changes, signal
+            Times ``(M + 1,)``, and the disturbance between them, ``(mw, M)``; the signal is ``None`` without a
+            disturbance.
+        """
         times = np.array([time])
         row = self.adjoint.at(times)
         value, rad = self._driven(times)
@@ -475,7 +527,7 @@ class Worst:
         return float(value[0]) - lost, float(value[0]) + lost
 
     def _driven(self, times: Array) -> tuple[Array, Array]:
-        """What is known of the inputs adds, and how far that is off, ``(k,)``."""
+        """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each."""
         mid, rad, size = np.zeros(times.size), np.zeros(times.size), np.zeros(times.size)
         used = self.drives.mid.shape[0]
         for k, (start, stop) in enumerate(zip(self.grid[:-1], self.grid[1:], strict=True)):
@@ -488,8 +540,8 @@ class Worst:
         return mid, rad + rounding(used + self.grid.size) * size
 
     def most(self, times: Array) -> tuple[Array, Array]:
-        """Upper bounds ``(k,)`` of the largest value at exact times, and how far they may be above it, with flat sets
-        (of curved ones that is not told)."""
+        """Return upper bounds ``(k,)`` of the largest value at exact ``times (k,)``, and how far these bounds may be
+        above it, ``(k,)``. The second result is proven for flat sets only."""
         rows = self.adjoint.at(times)
         top, rad = self._driven(times)
         size = np.abs(rows.mid) @ np.abs(self.centre)
@@ -504,14 +556,15 @@ class Worst:
         return top + rad, 3.0 * rad
 
     def carried(self, time: float) -> list[arb]:
-        """What the initial state gives to the row at a time, ``(d,)``."""
+        """Return the weights ``(d,)`` of the initial state in the row at a time."""
         from flint import arb
 
         row = self.adjoint.at(np.array([time]))
         return [arb(m, r) for m, r in zip(row.mid[0].tolist(), row.rad[0].tolist(), strict=True)]
 
     def weights(self, time: float, starts: Array, stops: Array) -> list[list[arb]]:
-        """What inputs of 1 between ``starts (K,)`` and ``stops (K,)`` give to the row at a time, ``(q,)`` each."""
+        """Return the weights of inputs between ``starts (K,)`` and ``stops (K,)`` in the row at a time, ``(q,)`` for
+        each."""
         from flint import arb
 
         begun, columns = starts < time, self.adjoint.motion.F.ncols()
@@ -522,7 +575,7 @@ class Worst:
         return found
 
     def pushed_by(self, time: float) -> arb:
-        """What the worst disturbance adds to the row at a time."""
+        """Return what the worst disturbance adds to the row at a time."""
         from flint import arb
 
         assert self.pushed is not None
@@ -533,6 +586,8 @@ class Worst:
         return sum((known(self.pushed).support(one[self._mine]) for one in every), arb(0))
 
     def _constant(self, times: Array) -> tuple[Array, Array]:
+        """Return what the worst disturbance that is constant between ``changes`` adds to the row at ``times (k,)``, and
+        error bounds, ``(k,)`` each."""
         assert self.pushed is not None and self.changes is not None
         top, rad = np.zeros(times.size), np.zeros(times.size)
         for start, stop in zip(self.changes[:-1], self.changes[1:], strict=True):
@@ -549,11 +604,13 @@ class Worst:
 
     @cached_property
     def _swept(self) -> SupportIntegrals:
-        """What it adds, but for the middle of its set."""
+        """The integrals of the support functions of a measurable disturbance about the middle of its set."""
         assert self.pushed is not None
         return SupportIntegrals(self._row, self._mine, Side.of(self.pushed))
 
     def _measurable(self, times: Array) -> tuple[Array, Array]:
+        """Return what the worst measurable disturbance adds to the row at ``times (k,)``, and error bounds, ``(k,)``
+        each."""
         if isinstance(self.adjoint, Stopped):
             return self._over_ways(self.adjoint, times)
         low, high = (part.sum(axis=1) for part in self._swept.at(times))
@@ -565,7 +622,8 @@ class Worst:
         return top, (high - low) / 2.0 + off @ np.abs(self._about) + lost
 
     def _over_ways(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:
-        """`_measurable` of what is integrated, once for all ``times (k,)``."""
+        """Return what the worst measurable disturbance adds to an integral that has ended at all ``times (k,)``, and
+        error bounds, ``(k,)`` each."""
         assert self.pushed is not None
         if not stopped.ways or (times < stopped.parts[0][1]).any():
             raise Unchecked("of measurable disturbances one integral at a time is followed")
@@ -579,8 +637,8 @@ class Worst:
 
     @cached_property
     def _bent(self) -> Array:
-        """On every step what, times an eighth of the square of a cell's width, the row is above its chord by,
-        ``(N,)``."""
+        """The bounds ``(N,)`` of the curvature of the largest value on every step. Times an eighth of the square of the
+        width of a cell, they bound how far the largest value lies above its chord."""
         states, once, twice = self._row.bends
         far = np.abs(self.centre) + (0.0 if self.begun is None else np.array(known(self.begun).radius))
         found = states @ far
@@ -589,19 +647,23 @@ class Worst:
         inputs[:used] = (np.abs(self.drives.mid) + self.drives.rad).max(axis=1, initial=0.0)
         if self.pushed is not None:
             radius = np.array(known(self.pushed).radius)
-            if self.changes is None:  # an integral of a support function, whose argument moves by l'AE
+            if self.changes is None:  # an integral of a support function, whose argument changes at the rate l'AE
                 found = found + once[:, self._mine] @ radius
             else:
                 inputs[self._mine] = radius
-        # of inputs on pieces, l'AF at the end of each less that at its beginning: how far it moves, and the last
+        # an input on a piece has a difference of l'AF as second derivative: all together the total variation of l'AF,
+        # and one value for the piece that acts
         total = self._row.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
         return np.asarray((found + total) * OUTWARD)
 
     def over(self, start: Array, stop: Array, beside: Array | float = 0.0) -> Array:
-        """Upper bounds ``(k,)`` on ``[start, stop]``, each between two `cuts`; ``beside (2, k)``: what is added at both
-        ends, linear in between."""
+        """Return upper bounds ``(k,)`` of the largest value on cells from ``start (k,)`` to ``stop (k,)``, each between
+        two `cuts`.
+
+        The values ``beside (2, k)`` are added at both ends of every cell, and linearly in between.
+        """
         ends, which = np.unique(np.concatenate([start, stop]), return_inverse=True)
-        several = max(1, AT_ONCE // self.adjoint.motion.states)  # numbers of every state at every end are many
+        several = max(1, AT_ONCE // self.adjoint.motion.states)  # the adjoints at all ends take much memory
         parts = [self.most(ends[k : k + several])[0] for k in range(0, ends.size, several)]
         tops = np.concatenate(parts)[which]
         width, bent = (stop - start) * OUTWARD, np.zeros(start.size)
@@ -613,7 +675,7 @@ class Worst:
         return np.asarray(both.max(axis=0) + (width**2 / 8.0 * bent + lost) * OUTWARD)
 
     def cuts(self, more: Sequence[float]) -> Array:
-        """Times between which no input jumps, and ``more``; no two are farther apart than a step."""
+        """Return times, among them ``more``, between which no input jumps and which are at most a step apart."""
         parts = [np.asarray(more, dtype=float)]
         if isinstance(self.adjoint, AdjointRow):
             parts.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
@@ -623,12 +685,12 @@ class Worst:
 
 
 def _supported(bound: ConvexSet, rows: Enclosed) -> tuple[Array, Array]:
-    """The support function of a set at rows ``(k, d)``, and by how much it may be more, ``(k,)`` each."""
+    """Return the support values of a set at rows ``(k, d)``, and how much more they may be, ``(k,)`` each."""
     w, excess = known(bound).bound(rows.mid, rows.rad)
     size = (np.abs(w) * np.abs(rows.mid)).sum(axis=1)
     more = (np.abs(w) * rows.rad).sum(axis=1) + rounding(rows.mid.shape[1]) * size
     return (w * rows.mid).sum(axis=1), (more + np.abs(excess)) * OUTWARD
 
 
-# from powers of a share ``v`` of a step to those of ``u = 2 v - 1``: ``v^j = (1 + u)^j / 2^j``
+# from powers of the share ``v`` of a step to powers of ``u = 2 v - 1``: ``v^j = (1 + u)^j / 2^j``
 CENTRED = np.array([[comb(j, i) / 2.0**j for j in range(ORDER + 1)] for i in range(ORDER + 1)])

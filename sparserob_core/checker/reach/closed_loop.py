@@ -1,11 +1,10 @@
-"""What a system does whose control answers what it measures, in balls: from the gains alone.
+"""A closed loop in ball arithmetic, computed from the gains alone: the control answers what it measures.
 
-The control on piece ``k`` is ``u_k = v_k + sum_j M_kj e_j``, where ``e_j`` is what the state at the breakpoint
-``tau_j`` has beyond what the state at ``tau_{j-1}``, the control in between and the middle of the disturbance predict.
-With
-``w = m + z`` for the middle ``m``, it is ``e_j = sum_l D_jl z_l`` over the blocks ``l`` on which the disturbance is
-constant. Where the initial states are a set, ``e_0`` is what the initial state has beyond the middle of it: the last
-block.
+The control on piece ``k`` is ``u_k = v_k + sum_j M_kj e_j``. The innovation ``e_j`` is the difference between the state
+at the breakpoint ``tau_j`` and its prediction from the state at ``tau_{j-1}``, the control in between and the middle of
+the disturbance. With ``w = m + z`` for the middle ``m``, it is ``e_j = sum_l D_jl z_l`` over the blocks ``l`` on which
+the disturbance is constant. Where the initial states are a set, ``e_0`` is the initial deviation from the middle of
+that set: the last block.
 """
 
 from __future__ import annotations
@@ -37,16 +36,33 @@ if TYPE_CHECKING:
     from sparserob_core.control.policies.measurements import Measurements
     from sparserob_core.control.problem.system import System
 
-ORDER = 8  # of the states in the time on a cell; what comes after counts twice, half of it takes shorter cells
+ORDER = 8  # degree of the states in the time on a cell; the remainder counts twice, half of it needs shorter cells
 
 
 @dataclass(frozen=True, eq=False)
 class VerifiedLoop:
-    """A known system from ``initial_state`` under the ``nominal`` control, ``(m, 1)`` on each of its ``K`` pieces, and
-    ``gains (K, K, m, d)``; ``grid``: every breakpoint; ``breakpoints``: those of the control; ``changes``: where the
-    disturbance may jump; ``initial``: the set of deviations of the initial state; ``before (m,)``: what acts until a
-    delay of the control is over; ``measured``: what is seen of the state at every breakpoint, with the ``observer (K,
-    d, p)`` that makes innovations of it, of all of the state where there is none."""
+    """A known system under a control that answers innovations, with ``Q`` entries of deviations.
+
+    Attributes
+    ----------
+    initial_state
+        The initial state from which ``initial`` is counted, ``(d,)``.
+    nominal
+        The nominal control on each of ``K`` pieces, ``(m, 1)``.
+    gains
+        The answers of every piece to every innovation, ``(K, K, m, d)``; to those of the outputs, ``(K, K, m, p)``.
+    grid, breakpoints, changes
+        All breakpoints; those of the control; the times at which the disturbance may jump.
+    shape, initial
+        The set of the disturbance, and the set of deviations of the initial state; ``None`` where there is none.
+    before
+        The control that acts until the delay is over, ``(m,)``.
+    measured, observer
+        What is measured of the state at every breakpoint, and the gains of the observer ``(K, d, p)`` that makes
+        innovations of it; ``None`` where the whole state is measured.
+    law
+        The flow of the system, where it is known already.
+    """
 
     system: System
     initial_state: list[float]
@@ -64,47 +80,48 @@ class VerifiedLoop:
 
     @cached_property
     def flow(self) -> VerifiedFlow:
-        """The flow of the system, its ``law`` where that is given."""
+        """The flow of the system: its ``law`` where that is given."""
         until = self.grid[-1]
         return VerifiedFlow(Plant.of(self.system, until), until) if self.law is None else self.law
 
     @cached_property
     def acting(self) -> list[float]:
-        """When every piece of the control begins to act."""
+        """The time at which every piece of the control begins to act: its breakpoint plus the delay."""
         return [time + self.system.delay for time in self.breakpoints[:-1]]
 
     @cached_property
     def deviations(self) -> Deviations:
-        """What the control may have to answer."""
+        """The deviations that the control may have to answer."""
         noise, K = None if self.measured is None else self.measured.noise, len(self.breakpoints) - 1
         width, noises = self.system.disturbances, 0 if noise is None else K
         return HeldDeviations(self.shape, width, self.initial, len(self.changes), noise, noises)
 
     @property
     def outputs(self) -> int:
-        """How many numbers an innovation has."""
+        """The number of entries of an innovation."""
         return int(self.system.states) if self.measured is None else self.measured.outputs
 
     def _places(self, piece: int) -> tuple[int, int]:
-        """Of a piece of the grid the piece of the control that acts, -1 where the one before does, and the block of the
-        disturbance."""
+        """Return the indices of the piece of the control and of the block of the disturbance that act on a piece of the
+        grid. The piece of the control is -1 before the delay is over."""
         inside = (self.grid[piece] + self.grid[piece + 1]) / 2
         return bisect_right(self.acting, inside) - 1, bisect_right(self.changes, inside) - 1
 
     def _moved(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
-        """What a part of a piece of the grid makes of the states at its beginning, and what is added by what drives
-        them, ``(d, 1 + Q)``."""
+        """Return the transition ``(d, d)`` of a part of a piece of the grid, and what the inputs add to the nominal
+        state and to the responses, ``(d, 1 + Q)``."""
         Phi, Gamma, Delta = self.flow.over(start, stop)
         return Phi.matrix, Gamma.beside(Delta).matrix * self.drives[piece]
 
     def _passed(self, piece: int) -> tuple[arb_mat, arb_mat]:
-        """What a piece of the grid makes of a state, and of the block of the disturbance that acts, ``(d, mw)``."""
+        """Return the transition ``(d, d)`` of a piece of the grid, and the effect ``(d, mw)`` of a disturbance that is
+        constant on it."""
         Phi, _, Delta = self.flow.over(self.grid[piece], self.grid[piece + 1])
         return Phi.matrix, Delta.matrix
 
     def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
-        """Who can see a block of the disturbance along these vectors; of what may change with time from which numbers
-        are other than 0 at any time alone."""
+        """Return which states a block of the disturbance along ``vectors (q, mw)`` reaches. For a system that may
+        change with time, only the positions of entries that are not always 0 are used."""
         if not self.flow.plant.is_timed:
             return Pushed.of([(one["A"], one["E"]) for one in modes_at(self.system, ())], vectors)
         d, m = self.flow.states, self.flow.driven
@@ -113,11 +130,12 @@ class VerifiedLoop:
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
-        """``D_jl``: what every innovation is of every block, ``(p, mw)``; blocks that are not seen are left out."""
+        """The matrices ``D_jl (p, mw)`` of every innovation ``j``, by block ``l``; blocks without effect are absent."""
         return self._entering if self.measured is None else self._observed(self.measured)
 
     def _observed(self, measured: Measurements) -> list[dict[int, arb_mat]]:
-        """The innovations of the observer: its error goes on from breakpoint to breakpoint, less what it corrects."""
+        """Return ``D_jl`` of the innovations of the observer. Its error is propagated from breakpoint to breakpoint,
+        less its correction."""
         assert self.observer is not None
         C = exactly(np.asarray(measured.C))
         unit = identity(self.outputs)
@@ -139,7 +157,7 @@ class VerifiedLoop:
 
     @cached_property
     def _between(self) -> list[arb_mat]:
-        """The flows from each breakpoint of the control to the next."""
+        """The transitions from each breakpoint of the control to the next, ``(d, d)`` each."""
         found = [identity(self.system.states) for _ in self.breakpoints[:-1]]
         for piece in range(len(self.grid) - 1):
             found[self.on(piece)] = self._passed(piece)[0] * found[self.on(piece)]
@@ -147,8 +165,8 @@ class VerifiedLoop:
 
     @cached_property
     def _entering(self) -> list[dict[int, arb_mat]]:
-        """What of every block enters the state from one breakpoint to the next, ``(d, mw)``, by the next; from the
-        beginning, what it begins with."""
+        """The effect ``(d, mw)`` of every block on the state at a breakpoint of the control, as far as it entered since
+        the breakpoint before; at the first breakpoint, the initial deviation."""
         K = len(self.breakpoints) - 1
         found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
@@ -166,7 +184,7 @@ class VerifiedLoop:
 
     @cached_property
     def effects(self) -> list[list[list[arb]]]:
-        """``F_k (m, Q)``: how the control on each piece depends on the deviations."""
+        """The matrices ``F_k (m, Q)`` by which the control on each piece depends on the deviations."""
         m, zero, starts = self.gains.shape[2], ball(0), self.deviations.starts
         table = []
         for k in range(self.gains.shape[0]):
@@ -184,8 +202,8 @@ class VerifiedLoop:
 
     @cached_property
     def drives(self) -> list[arb_mat]:
-        """What acts on each piece of the grid, nominally and as answers: control, drift and disturbance, ``(m + mw, 1 +
-        Q)``."""
+        """The inputs on each piece of the grid, control, drift and disturbance, as nominal values and responses: with a
+        drift ``(m + 1 + mw, 1 + Q)``, without one ``(m + mw, 1 + Q)``."""
         found, none = [], [0.0] * self.deviations.starts[-1]
         for piece in range(len(self.grid) - 1):
             k, block = self._places(piece)
@@ -197,18 +215,19 @@ class VerifiedLoop:
         return found
 
     def _entered(self, rows: list[list[arb]], block: int) -> None:
-        """Add a block of the disturbance to what acts, row by row."""
+        """Add the response to a block of the disturbance to the rows of the disturbance, in place."""
         for i, row in enumerate(rows):
             place = 1 + block * self.system.disturbances + i
             row[place] = row[place] + 1
 
     def _ended(self, piece: int, state: arb_mat) -> arb_mat:
-        """The state and the responses when a piece of the grid is over, from what they are by then."""
+        """Return the nominal state and the responses after a piece of the grid, from those at its end: the same, unless
+        the disturbance on the piece counts there."""
         return state
 
     @cached_property
     def nodes(self) -> list[arb_mat]:
-        """The nominal state and every response at the breakpoints of the grid, ``(d, 1 + Q)``."""
+        """The nominal state and the responses to all deviations at every breakpoint of the grid, ``(d, 1 + Q)``."""
         begin, answers = [ball(v) for v in self.initial_state], identity(self.system.states).tolist()
         if self.initial is None:
             answers = [[] for _ in begin]
@@ -222,7 +241,7 @@ class VerifiedLoop:
         return found
 
     def state(self, piece: int, time: float) -> arb_mat:
-        """The nominal state and every response at a time in a piece of the grid."""
+        """Return the nominal state and the responses at a time in a piece of the grid, ``(d, 1 + Q)``."""
         if time == self.grid[piece]:
             return self.nodes[piece]
         if time == self.grid[piece + 1]:
@@ -231,37 +250,47 @@ class VerifiedLoop:
         return Phi * self.nodes[piece] + added
 
     def inputs(self, k: int) -> arb_mat:
-        """The nominal control and its answers on a piece of it, ``(m, 1 + Q)``; on piece -1 the control before."""
+        """Return the nominal control and its answers on a piece of the control, ``(m, 1 + Q)``; on piece -1 the control
+        before."""
         none = [ball(0)] * self.deviations.starts[-1]
         if k < 0:
             return stacked([[ball(v), *none] for v in self.before])
         return stacked([[v, *row] for v, row in zip(self.nominal[k].entries(), self.effects[k], strict=True)])
 
     def answers(self, k: int) -> arb_mat:
-        """The answers on a piece of the control without what is nominal, ``(m, 1 + Q)``, the first column 0."""
+        """Return the answers on a piece of the control with 0 as nominal control, ``(m, 1 + Q)``."""
         return stacked([[ball(0), *row] for row in self.effects[k]])
 
     def on(self, piece: int) -> int:
-        """The piece of the control that is commanded on a piece of the grid: the one that acts, where there is no
-        delay."""
+        """Return the index of the piece of the control that is commanded on a piece of the grid. Without a delay, this
+        piece acts there."""
         return bisect_right(self.breakpoints, (self.grid[piece] + self.grid[piece + 1]) / 2) - 1
 
     def heights(self, state: arb_mat, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
-        """``max c'x`` over all deviations for every row ``c`` of ``rows (r, d)``, at a time with this `state`, and with
-        what stands ``beside`` it, ``(r, 1 + Q)``."""
+        """Return the largest ``c'x`` over all deviations, for every row ``c``, in balls.
+
+        Parameters
+        ----------
+        state
+            The nominal state and the responses at a time, ``(d, 1 + Q)``.
+        rows
+            The rows ``c``, ``(r, d)``.
+        beside
+            A nominal value and responses that are added to each row, ``(r, 1 + Q)``.
+        """
         product = exactly(rows) * state
         along = (product if beside is None else product + beside).tolist()
         most = self.deviations.supports([row[1:] for row in along])
         return [row[0] + more for row, more in zip(along, most, strict=True)]
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
-        """`heights` at a time in a piece of the grid."""
+        """Return the `heights` of ``rows (r, d)`` at a time in a piece of the grid."""
         return self.heights(self.state(piece, time), rows, beside)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
-        """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid
-        without marks, at most, ``(r,)``: the states are a polynomial of the share ``s`` of the cell, whose term ``a
-        s^n`` is at most ``(n - 1) n^(-n / (n - 1)) |a|`` from its chord."""
+        """Return upper bounds ``(r,)`` of how far ``max c'x(t)`` lies above its chord on ``[start, stop]``, a part of a
+        piece of the grid without marks. The states are a polynomial in the share ``s`` of the cell, and a term
+        ``a s^n`` differs from its chord by at most ``(n - 1) n^(-n / (n - 1)) |a|``."""
         terms, off = self.flow.within(start, stop, start, stop, ORDER + 1)
         both = stacked([*self.state(piece, start).tolist(), *self.drives[piece].tolist()])
         line, sizes = exactly(rows), np.concatenate([[1.0], self.deviations.radii])
@@ -269,7 +298,7 @@ class VerifiedLoop:
         for n, term in enumerate(terms[2:], 2):
             found = Enclosed.of(line * (term.matrix * both))
             total += (np.abs(found.mid) + found.rad) * ((n - 1) * n ** (-n / (n - 1)) * OUTWARD)
-        # at both ends too, of which the chord takes the larger share
+        # twice, since the remainder changes both the states within the cell and the ends of the chord
         found = Enclosed.of(line * (around(off) * both))
         total += 2.0 * (np.abs(found.mid) + found.rad)
         return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)

@@ -1,4 +1,4 @@
-"""What a control that answers may have to answer: deviations from the middles of their sets, block by block."""
+"""Deviations from the middles of their sets, block by block, that a control under feedback may have to answer."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Deviations(ABC):
-    """The deviations of a disturbance with ``width`` entries in ``shape``, and last that of the initial state, in
-    ``initial``, where there are any."""
+    """The deviations of a disturbance with ``width`` entries in the set ``shape``, and the initial deviation, of a
+    state in the set ``initial``, as the last block. A set is ``None`` where there is no such deviation."""
 
     shape: ConvexSet | None
     width: int
@@ -32,45 +32,45 @@ class Deviations(ABC):
     @property
     @abstractmethod
     def blocks(self) -> int:
-        """How many blocks the disturbance has."""
+        """The number of blocks of the disturbance."""
 
     @property
     @abstractmethod
     def begun(self) -> int:
-        """The place of the block of the initial state, where there is one: the last."""
+        """The index of the block of the initial deviation, where there is one: the last block."""
 
     @property
     @abstractmethod
     def sets(self) -> list[tuple[ConvexSet, Array]]:
-        """The set and the middle of every block that is in a set of its own, that of the initial state last."""
+        """The set and its middle of every block that has a set of its own, that of the initial state last."""
 
     @property
     @abstractmethod
     def starts(self) -> list[int]:
-        """Where the entries of every block begin, and how many there are."""
+        """The index of the first entry of every block, and at the end the number of all entries, ``Q``."""
 
     @property
     @abstractmethod
     def radii(self) -> Array:
-        """How far each entry of a deviation comes from 0, ``(Q,)``, rounded up."""
+        """The upper bound of the absolute value of each entry of a deviation, ``(Q,)``, rounded up."""
 
     @abstractmethod
     def supports(self, every: Sequence[list[arb]]) -> list[arb]:
-        """``max z'a`` over all deviations, for every ``a (Q,)`` in balls."""
+        """Return the support values ``max z'a`` over all deviations ``z``, for every ``a (Q,)`` in balls."""
 
     def support(self, a: list[arb]) -> arb:
-        """`supports` of one."""
+        """Return the support value ``max z'a`` over all deviations ``z``, for one ``a (Q,)`` in balls."""
         return self.supports([a])[0]
 
     @cached_property
     def middle(self) -> Array:
-        """What deviations of the disturbance are counted from, ``(mw,)``."""
+        """The point ``(mw,)`` from which deviations of the disturbance are counted; 0 without a disturbance."""
         return np.zeros(self.width) if self.shape is None else middle(self.shape)
 
     @cached_property
     def rests(self) -> list[list[arb]]:
-        """Of each of these the deviation from its middle to a point that is in its set whatever was rounded: 0 where
-        the middle is."""
+        """The difference between a point that is proven to be in the set and the middle, for every one of `sets`: 0 but
+        for thin sets, of which rounding may have moved the middle out."""
         found: dict[int, list[arb]] = {}
         for shape, about in self.sets:
             if id(shape) not in found:
@@ -83,8 +83,8 @@ class Deviations(ABC):
 @final
 @dataclass(frozen=True, eq=False)
 class HeldDeviations(Deviations):
-    """The deviations of a disturbance that stays the same on each of ``held`` blocks, and of the ``noise`` of as many
-    measurements as there are ``noises``."""
+    """The deviations of a disturbance that is constant on each of ``held`` blocks, and of the ``noise`` of ``noises``
+    measurements."""
 
     held: int
     noise: ConvexSet | None
@@ -121,7 +121,7 @@ class HeldDeviations(Deviations):
 
 
 def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
-    """The support function of a set less a point, 0 at 0."""
+    """Return the support value at ``a`` of a set minus the point ``about``; exactly 0 at ``a = 0``."""
     total = a[0] * 0
     if any(not x.is_zero() for x in a):
         total = total + known(shape).support(a)
@@ -131,6 +131,6 @@ def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
 
 
 def rounded_radii(first: list[Array], sets: Sequence[tuple[ConvexSet, Array]]) -> Array:
-    """Radii ``(Q,)`` of some blocks, and of others from their sets, rounded up."""
+    """Return the radii ``first`` of some blocks and those of ``sets`` about their middles, ``(Q,)``, rounded up."""
     far = [np.array(known(shape).radius) + np.abs(about) for shape, about in sets]
     return np.asarray(np.nextafter(np.concatenate([np.zeros(0), *first, *far]) * OUTWARD, np.inf))

@@ -1,8 +1,9 @@
-"""Errors of execution of a known system that does not change: what is delivered of a control differs from the command.
+"""Errors of execution in a known system that does not change with time: the delivered control differs from the command.
 
-They are measurable disturbances through ``B``, as large as a share of the command. By parts the worst of them is a sum
-over the jumps of ``share_j |u_j|`` of ``F_j(t - t_k)``, ``F_j(a) = int_0^a |c'e^{A s} B_j| ds``. The rows ``c'e^{A s}``
-are followed by their adjoints, so that neither many states nor fast modes are dear.
+These errors are measurable disturbances through ``B`` whose size is a share of the command. Integration by parts
+rewrites the worst case as a sum over the jumps of ``share_j |u_j|``, each times ``F_j(t - t_k)`` with
+``F_j(a) = int_0^a |c'e^{A s} B_j| ds``. The rows ``c'e^{A s}`` are computed by their adjoints, so that neither many
+states nor fast modes are expensive.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True, eq=False)
 class FollowedExecution(BoundedInputHere):
-    """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
-    none where only rows are asked for."""
+    """The errors of execution of a control, at most the ``shares (m,)`` of its ``pieces``, ``(m, 1)`` each, between
+    ``breakpoints (K + 1,)``; ``pieces`` is empty where only bounds per unit of command are needed."""
 
     problem: OptimalControlProblem
     shares: Array
@@ -43,7 +44,7 @@ class FollowedExecution(BoundedInputHere):
 
     @cached_property
     def motion(self) -> AdjointFlow:
-        """What the rows share, with ``B`` as far as errors enter by it."""
+        """The adjoint flow that all rows share, with ``B`` set to 0 at states that no error of execution reaches."""
         (mode,) = modes_at(self.problem.system, [])
         A, B, m = mode["A"], mode["B"], self.shares.size
         B = stacked([[x * (i not in self.problem.commanded) for x in row[:m]] for i, row in enumerate(B.tolist())])
@@ -51,14 +52,15 @@ class FollowedExecution(BoundedInputHere):
 
     @remembered(key=lambda self, c: min((c + 0.0).tobytes(), (0.0 - c).tobytes()))
     def absolute(self, c: Array) -> SupportIntegrals:
-        """The integrals of ``|c'e^{A s} B_j|`` of a direction ``c (d,)``, which is exact; its opposite has the same."""
+        """Return the integrals of ``|c'e^{A s} B_j|`` for an exact direction ``c (d,)``; the direction ``-c`` has the
+        same ones."""
         ends = np.eye(self.shares.size)
         sides = [Side(np.stack([one, -one]), 0.0 * ends[:2]) for one in ends]
         return SupportIntegrals(AdjointRow.of(self.motion, c + 0.0), slice(None), sides)
 
     def integrals(self, c: Array, times: Array, points: Array) -> tuple[Array, Array]:
-        """``F_j`` at the ages ``times (k,)`` minus ``points (q,)``, exactly, between ``(k, q, m)`` and ``(k, q, m)``; 0
-        before a point."""
+        """Return lower and upper bounds ``(k, q, m)`` each of ``F_j(a)`` at the ages ``a = times (k,) - points (q,)``,
+        and 0 where the age is not positive. The bounds hold for the exact differences of these times."""
         ages, rounded = (part.ravel() for part in subtract_times(times[:, None], points))
         both = self.absolute(c).at(np.maximum(ages, 0.0), rounded)
         low, high = (np.where(ages[:, None] > 0.0, one, 0.0) for one in both)
@@ -66,14 +68,15 @@ class FollowedExecution(BoundedInputHere):
         return low.reshape(shape), high.reshape(shape)
 
     def least(self, c: Array, time: float) -> Array:
-        """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
+        """Return lower bounds ``(K, m)`` of what the worst errors add to ``c'x(t)`` for a command of size 1 on every
+        piece."""
         (low,), (high,) = self.integrals(c, np.array([time]), self.breakpoints)
         return np.asarray(np.maximum(self.shares * (low[:-1] - high[1:]) * (1.0 - 1e-15), 0.0))
 
     @cached_property
     def jumps(self) -> tuple[np.ndarray, Array, Array]:
-        """The pieces ``(q,)`` with which the size of an error changes, by how much ``(q, m)``, and how far that may be
-        off."""
+        """The indices ``(q,)`` of the pieces at which the control or the size of an error jumps, the jumps of this size
+        ``(q, m)``, and their error bounds ``(q, m)``."""
         control = Enclosed.all(self.pieces, (len(self.pieces), self.shares.size))
         size = self.shares * np.abs(control.mid)
         off = self.shares * control.rad + rounding(2) * size
@@ -83,12 +86,12 @@ class FollowedExecution(BoundedInputHere):
         return which, change[which], (off * OUTWARD)[which]
 
     def added(self, c: Array, time: float) -> tuple[float, float]:
-        """What the worst errors add to ``c'x(t)``, between two numbers."""
+        """Return a lower and an upper bound of what the worst errors add to ``c'x(t)``."""
         (low,), (high,) = self.added_at(c, np.array([time]))
         return float(low), float(high)
 
     def added_at(self, c: Array, times: Array) -> tuple[Array, Array]:
-        """`added` at ``times (k,)``, ``(k,)`` each."""
+        """Return lower and upper bounds of what the worst errors add to ``c'x`` at ``times (k,)``, ``(k,)`` each."""
         which, change, off = self.jumps
         low, high = self.integrals(c, times, self.breakpoints[which])
         up, down = np.maximum(change, 0.0), np.minimum(change, 0.0)
@@ -96,11 +99,13 @@ class FollowedExecution(BoundedInputHere):
         return (up * low + down * high).sum(axis=(1, 2)) - lost, (up * high + down * low).sum(axis=(1, 2)) + lost
 
     def bent(self, c: Array, start: float, stop: float) -> float:
-        """How far `added` may be from its chord on ``[start, stop]``, which lies within one piece."""
+        """Return an upper bound of the distance between `added` and its chord on ``[start, stop]``, which lies within
+        one piece."""
         return float(self.bent_over(c, np.array([start]), np.array([stop]))[0])
 
     def bent_over(self, c: Array, start: Array, stop: Array) -> Array:
-        """`bent` on intervals from ``start (k,)`` to ``stop (k,)``."""
+        """Return upper bounds ``(k,)`` of the distance between `added` and its chord on every interval from
+        ``start (k,)`` to ``stop (k,)``, each within one piece."""
         which, change, off = self.jumps
         steepest, step = self.absolute(c).row.bends[1], self.motion.step
         ages = np.stack([start, stop])[:, :, None] - self.breakpoints[which]
@@ -111,7 +116,7 @@ class FollowedExecution(BoundedInputHere):
 
 
 def _tallest(values: Array, first: np.ndarray, last: np.ndarray) -> Array:
-    """The largest of ``values (N, m)`` from each of ``first (...)`` up to before ``last (...)``, ``(..., m)``."""
+    """Return the largest of ``values (N, m)`` from index ``first (...)`` up to before ``last (...)``, ``(..., m)``."""
     padded = np.vstack([values, values[-1:]])
     ends = np.stack([first.ravel(), last.ravel()], axis=1).ravel()
     return np.asarray(np.maximum.reduceat(padded, ends, axis=0)[::2].reshape(*first.shape, values.shape[1]))

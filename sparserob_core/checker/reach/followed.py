@@ -1,4 +1,4 @@
-"""The rows of a problem that are followed by their adjoints, where one known system acts all along."""
+"""The rows of a problem that are computed by their adjoints: one known system acts all the time."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.sip.convex_set import Array
 
-# States from which the rows of a known system are followed: a ball matrix for every length of a cell, as the tube has
-# them, takes as long as all rows. Of few states the tube takes less; of 48 it takes minutes, and of 270 hours.
+# Number of states from which rows are computed by adjoints. A tube makes a ball matrix for every length of a cell, and
+# one such matrix takes as long as all rows. For few states a tube is faster; for 48 it takes minutes, for 270 hours.
 FOLLOWED = 16
-# Pieces up to which they are: what a piece adds is summed at every end of a cell. With a tenth of it tubes of 48 states
-# on 1600 pieces end without a verdict; with ten times as many the sums take minutes.
+# Number of pieces up to which adjoints are used: the effects of all pieces are summed at every end of a cell. With a
+# tenth of it tubes of 48 states on 1600 pieces end without a verdict; with ten times as many the sums take minutes.
 MOST_PIECES = 4000
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class FollowedRows:
-    """The rows of a ``problem``, of which ``stated`` is what it was given as, and the adjoints that were made."""
+    """The rows of a ``problem`` that are computed by their adjoints, with the adjoints made so far. ``stated`` is the
+    problem as given by the user."""
 
     problem: OptimalControlProblem
     stated: OptimalControlProblem
@@ -41,7 +42,8 @@ class FollowedRows:
 
     @cached_property
     def running(self) -> RunningIntegrals | None:
-        """What is integrated, where nothing else changes with time."""
+        """The integrals that the problem bounds, where the system changes with time only because they begin and end;
+        else ``None``."""
         system = self.problem.system
         if not system.switches:
             return None
@@ -50,7 +52,8 @@ class FollowedRows:
 
     @property
     def still(self) -> System | None:
-        """The one system that acts all along, beside what is integrated of it; ``None`` where others do."""
+        """The one system that acts all the time, in which the bounded integrals run all the time too; ``None`` where
+        the system changes with time for another reason."""
         if self.running is not None:
             return self.running.system
         system = self.problem.system
@@ -58,20 +61,20 @@ class FollowedRows:
 
     @property
     def are_possible(self) -> bool:
-        """Whether the system is known, acts all along, and is disturbed in one way."""
+        """True if the system is known, acts all the time, and its disturbances are all of one kind."""
         return self.still is not None and not self.problem.system.parameter_count and self.disturbances.alike
 
     @property
     def are_best(self) -> bool:
-        """Whether rows are followed where a tube would do too: with many states, or measurable disturbances, which
-        would be integrated along matrices on every piece."""
+        """True if adjoints are used although a tube would do as well: for many states, or for measurable disturbances,
+        which a tube integrates along matrices on every piece."""
         if self.timing.answering or not self.disturbances.alike or len(self.timing.grid) > MOST_PIECES:
             return False
         return self.are_possible and (self.problem.measurable is not None or self.problem.system.states >= FOLLOWED)
 
     @cached_property
     def flow(self) -> AdjointFlow:
-        """What the rows have in common, the inputs of the control before those of the disturbance."""
+        """The adjoint flow that all rows share, with the inputs of the control before those of the disturbance."""
         assert self.still is not None
         (parts,) = modes_at(self.still, [])
         A, B, E = (parts[name] for name in ("A", "B", "E"))
@@ -80,8 +83,10 @@ class FollowedRows:
         return AdjointFlow.of(A, B, self.timing.grid[-1], self.timing.clock)
 
     def worst(self, c: Array, scene: Scene | None) -> Worst:
-        """The worst of the row ``c (d,)``, under the control of a scene or without any; one adjoint serves a row and
-        its opposite."""
+        """Return the worst case of the row ``c'x``, ``c (d,)``, under the control of a ``scene``, or without a control.
+
+        One adjoint serves a row and its opposite.
+        """
         problem = self.problem
         inputs = problem.system.controls + problem.system.drifts
         table = Enclosed(*np.zeros((2, inputs, len(self.timing.grid) - 1)))
@@ -100,7 +105,8 @@ class FollowedRows:
         )
 
     def _adjoint(self, c: Array) -> AdjointRow | Stopped:
-        """That of a row ``c (d,)``, of what is integrated in a window as of two that stop."""
+        """Return the adjoint of a row ``c (d,)``. An integral over a window is a sum of two rows, one that stops at the
+        end of the window and an opposite one that stops at its beginning."""
         if self.running is not None:
             parts = self.running.parts(c)
             rows = [(self._kept(row), until) for row, until in parts]
@@ -112,7 +118,8 @@ class FollowedRows:
         return self._kept(c)
 
     def _kept(self, c: Array) -> AdjointRow:
-        made, c = self._made, c + 0.0  # no -0, of which the bytes of an opposite row would be others
+        """Return the adjoint of a row ``c (d,)``, which is made once for the row and its opposite."""
+        made, c = self._made, c + 0.0  # turns -0 into 0, so that equal rows have equal bytes
         if c.tobytes() not in made:
             opposite = made.get((0.0 - c).tobytes())
             made[c.tobytes()] = AdjointRow.of(self.flow, c) if opposite is None else opposite.reversed()

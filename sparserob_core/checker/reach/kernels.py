@@ -1,4 +1,5 @@
-"""What inputs at any time of an interval make of the state at its end, and how far sums of their integrals bend."""
+"""Inputs that may change at any time: their effect on the state, and how far sums of their integrals rise above a
+chord."""
 
 from __future__ import annotations
 
@@ -23,8 +24,19 @@ if TYPE_CHECKING:
 
 
 class Added(NamedTuple):
-    """Coefficients ``ends (T, M)`` over a box of parameters of what errors add at times, by how much they are ``off``
-    at most, how far ``over`` the truth in the middle of the box, and how much of it is the width of each parameter."""
+    """Bounds of what bounded inputs add to a row, over a box of parameters.
+
+    Attributes
+    ----------
+    ends
+        Coefficients ``(T, M)`` in the parameters, one row for each of ``T`` times.
+    off
+        The upper bound of how far the true value exceeds them, and the chord between two times.
+    over
+        The upper bound of how far they exceed the true value in the middle of the box.
+    wide
+        The part of ``off`` that is due to the width of each parameter, ``(nu,)``; empty where there is none.
+    """
 
     ends: Array
     off: float
@@ -33,40 +45,51 @@ class Added(NamedTuple):
 
 
 class BoundedInput(ABC):
-    """What enters at any time and is known by its size alone: errors of execution, and measurable disturbances about
-    the middle of their set."""
+    """An input that enters at any time and of which only its size is known: errors of execution, and measurable
+    disturbances about the middle of their set."""
 
     @abstractmethod
     def at(self, parameter: Sequence[float]) -> BoundedInputHere:
-        """That at one parameter, of which there may be none."""
+        """Return the input at one parameter; the parameter is empty for a known system."""
 
     @abstractmethod
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
-        """What the worst adds to ``c'x`` at one or two ``times``, between which there is no mark, ``within`` a box of
-        parameters with the monomials on it."""
+        """Return bounds of what the worst input adds to ``c'x`` at one or two times.
+
+        Parameters
+        ----------
+        c
+            The row, ``(d,)``.
+        times
+            One time, or two times without a mark between them.
+        within
+            The corners of a box of parameters, and the monomials on it; ``None`` for a known system.
+        """
 
 
 class BoundedInputHere(BoundedInput):
-    """`BoundedInput` of a known system."""
+    """A `BoundedInput` of a known system."""
 
     @abstractmethod
     def added(self, c: Array, time: float) -> tuple[float, float]:
-        """What the worst of it adds to ``c'x(t)``, between two numbers."""
+        """Return a lower and an upper bound of what the worst input adds to ``c'x(t)``, ``c (d,)``."""
 
     @abstractmethod
     def least(self, c: Array, time: float) -> Array:
-        """What a command of size 1 on every piece adds at least to ``c'x(t)``, ``(K, m)``."""
+        """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)`` for a command of size 1 on every
+        piece."""
 
     @abstractmethod
     def bent(self, c: Array, start: float, stop: float) -> float:
-        """How far `added` may be above its chord on ``[start, stop]``, which lies within one piece and one segment."""
+        """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``, which lies within one
+        piece of the command and one segment of the system."""
 
     def at(self, parameter: Sequence[float]) -> BoundedInputHere:
-        """`BoundedInput.at`."""
+        """Return the input itself, since the system is known."""
         return self
 
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
-        """`BoundedInput.over`."""
+        """Return the mean of both bounds at every time, and an error bound that includes the curvature in time."""
         ends = np.array([self.added(c, time) for time in times])
         off = float((ends[:, 1] - ends[:, 0]).max())
         bent = self.bent(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
@@ -74,8 +97,15 @@ class BoundedInputHere(BoundedInput):
 
 
 def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
-    """What some ``columns`` of ``[B E]`` make, at any time of an interval without marks, of the state at its end, times
-    its length: coefficients ``(p + 1, M, d, m)`` of powers of ``u`` from -1 to 1 across what is left of it."""
+    """Return the kernel of an interval without marks: its length times ``Phi(stop, s) [B E](s)``, in some ``columns``.
+
+    The kernel is a polynomial in ``u``, where ``(1 + u) / 2`` is the share of the interval that is left at ``s``.
+
+    Returns
+    -------
+    Enclosed
+        Coefficients ``(p + 1, M, d, m)`` of powers of ``u`` from -1 to 1; the remainder is in the radius of the first.
+    """
     from flint import arb, arb_mat
 
     terms, off = law.kernel(start, stop)
@@ -90,14 +120,23 @@ def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Encl
 def above_chord(
     law: VerifiedFlow, rows: Array | arb_mat, start: float, stop: float, begun: Array, size: Array, first: int
 ) -> Array:
-    """How far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to the time may be above their chords on ``[start,
-    stop]``, which lies between two marks, for ``rows (r, d)``: ``(r,)``, at every parameter. Of every state they are at
-    most ``begun (d,)`` at the start, and ``size (m,)`` is what drives them through the columns of ``[B E]`` from the
-    ``first`` one on.
+    """Return upper bounds ``(r,)`` of how far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to ``t`` lie above their
+    chords on ``[start, stop]``, at every parameter.
 
-    An integrand that began before is ``|c'Phi(t, start) y|``, above its chord by no more than ``c'Phi(t, start) y``
-    is from its own: its terms ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What begins within the
-    cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
+    An integrand that started before is ``|c'Phi(t, start) y|``. It lies above its chord by no more than
+    ``c'Phi(t, start) y`` differs from its own chord: a term ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What
+    starts within the cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
+
+    Parameters
+    ----------
+    rows
+        The rows ``c``, ``(r, d)``.
+    start, stop
+        The ends of a cell that lies between two marks.
+    begun
+        The upper bound of these sums at ``start`` for every state, ``(d,)``.
+    size
+        The upper bound of the inputs, ``(m,)``, which enter by the columns of ``[B E]`` from the ``first`` one on.
     """
     lines, width = exactly(rows), (stop - start) * (1.0 + rounding(2))
     large, d = Enclosed.of(lines), lines.ncols()

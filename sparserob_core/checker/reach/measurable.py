@@ -1,9 +1,10 @@
-"""A closed loop under measurable disturbances: what they make of the state by the end of every piece, and within one.
+"""A closed loop under measurable disturbances: their effect on the state at the end of every piece, and within a piece.
 
-On a piece of the grid a disturbance ``w = m + z`` pushes the state by ``e = int e^{A r} E z dr``, ``r`` the time that
-is left of the piece; the control of later pieces answers ``e``, and nothing else of the disturbance. So the worst of
-``a'e`` is the integral of the support function of ``E'e^{A'r} a``. It is enclosed: on cells the corner of the set that
-is best there stands for all, and where another one could be better, by how much is bounded.
+On a piece of the grid a disturbance ``w = m + z`` moves the state by ``e = int e^{A r} E z dr``, where ``r`` is the
+time that is left of the piece. The control of later pieces answers ``e``, and nothing else of the disturbance. So the
+largest ``a'e`` is the integral of the support function of ``E'e^{A'r} a``. This integral is enclosed. On every cell the
+corner of the set that is best there stands for all corners, and the error bound says how much better another corner
+could be.
 """
 
 from __future__ import annotations
@@ -32,25 +33,27 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-SETTLED = 2.0**-49  # of the heights: what another corner may add on a cell
+SETTLED = 2.0**-49  # of the heights: how much another corner may add on a cell that is cut no further
 ROUNDS = 60  # in which cells are cut
-CROSSING = 8  # of them always where two corners are equally good, which is beside an end where they touch there
-SECANTS = 12  # steps to where two corners are equally good
-KEPT = 4096  # ways from the beginning of a piece to a time in it, of which kernels are remembered
+# Rounds that always cut where two corners are equally good. Later every second one halves the cell: where two corners
+# touch at an end, that point lies next to this end, and such cuts gain little.
+CROSSING = 8
+SECANTS = 12  # steps of the search for the point where two corners are equally good
+KEPT = 4096  # intervals from the beginning of a piece to a time in it, whose kernels are remembered
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of the sets that add up to that of the deviations: ``corners (v, mw)``, off by at most ``rad (v, mw)``."""
+    """A summand of the set of the deviations, by its ``corners (v, mw)`` with error bounds ``rad (v, mw)``."""
 
     corners: Array
     rad: Array
 
     @staticmethod
     def of(shape: ConvexSet) -> list[Side | CurvedSide]:
-        """Those of a set, counted from its middle: of a box one for every channel, of a zonotope one for every segment,
-        a curved one as it is."""
+        """Return sets whose sum is a given set minus its middle: for a box one for every channel, for a zonotope one
+        for every segment and one for its centre, for another set with corners, and for a curved set, one."""
         from flint import arb, fmpq
 
         about, seen = [arb(float(m)) for m in middle(shape)], known(shape)
@@ -70,24 +73,38 @@ class Side:
             found = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
         else:
             curved = CurvedSide(seen, middle(shape))
-            _ = curved.far  # of a set that is not known it is `Unchecked`
+            _ = curved.far  # raises `Unchecked` for a set that the checker does not know
             return [curved]
         return [Side(one.mid, one.rad) for one in (Enclosed.of(stacked(rows)) for rows in found)]
 
     @property
     def dimension(self) -> int:
-        """How many coordinates there are."""
+        """The number of coordinates, ``mw``."""
         return int(self.corners.shape[1])
 
     @cached_property
     def far(self) -> Array:
-        """How far the set goes from 0 along every coordinate, at most, ``(mw,)``."""
+        """The upper bound of the absolute value of every coordinate on the set, ``(mw,)``."""
         return np.asarray((np.abs(self.corners) + self.rad).max(axis=0) * OUTWARD)
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """The integral over ``u`` from -1 to ``ends (n,)`` of the support function at polynomials ``plain (n, p + 1,
-        mw)``, which are off by at most ``off (n, mw)`` and whose coefficients add up to ``sizes (n, mw)``: values, by
-        how much more and less it may be, and the largest heights, ``(n,)`` each."""
+        """Return the integrals of the support function of the set along polynomials, over ``u`` from -1 to
+        ``ends (n,)``.
+
+        Parameters
+        ----------
+        plain, off, sizes
+            The coefficients of the polynomials, ``(n, p + 1, mw)``; their error bounds, ``(n, mw)``; the sums of the
+            absolute values of the coefficients, ``(n, mw)``.
+        ends
+            The upper limits of the integrals, ``(n,)``.
+
+        Returns
+        -------
+        tuple
+            Values, how much more and how much less the true integral may be, and bounds of the absolute heights without
+            their errors, ``(n,)`` each.
+        """
         P = np.einsum("npw,vw->npv", plain, self.corners)
         e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
         return *swept(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
@@ -96,22 +113,22 @@ class Side:
 @final
 @dataclass(frozen=True, eq=False)
 class Together:
-    """The sum of several ``sides``, of which there is at least one: its support function is the sum of theirs."""
+    """The sum of several ``sides``, at least one: its support function is the sum of theirs."""
 
     sides: Sequence[Side | CurvedSide]
 
     @property
     def dimension(self) -> int:
-        """How many coordinates there are."""
+        """The number of coordinates, ``mw``."""
         return self.sides[0].dimension
 
     @cached_property
     def far(self) -> Array:
-        """`Side.far`."""
+        """The upper bound of the absolute value of every coordinate on the sum, ``(mw,)``."""
         return np.asarray(np.sum([side.far for side in self.sides], axis=0) * OUTWARD)
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """`Side.swept`."""
+        """Return the sums over all sides of what `Side.swept` returns, with the rounding errors of these sums."""
         every = [side.swept(plain, off, sizes, ends) for side in self.sides]
         value, more, less, tops = (np.sum(part, axis=0) for part in zip(*every, strict=True))
         rounded = rounding(len(every)) * 2.0 * tops
@@ -121,20 +138,24 @@ class Together:
 @final
 @dataclass(frozen=True, eq=False)
 class VerifiedKernel:
-    """``Phi(end, s) E(s)`` for the time ``r`` that is left of an interval at ``s``, on parts one after another, as
-    polynomials of ``u`` from -1 to 1 across each, times its length: coefficients ``(S, p + 1, d, mw)``, all together
-    off by at most ``off (S, d, mw)``."""
+    """The kernel ``Phi(end, s) E(s)`` of an interval, by the time ``r`` that is left of the interval at ``s``.
+
+    The interval consists of ``S`` parts, from its end backwards. On each the kernel, times the length of the part, is a
+    polynomial in ``u`` from -1 to 1: ``coefficients (S, p + 1, d, mw)`` with the total error bound
+    ``off (S, d, mw)``.
+    """
 
     coefficients: Array
     off: Array
 
     @property
     def count(self) -> int:
-        """How many parts there are."""
+        """The number of parts, ``S``."""
         return int(self.coefficients.shape[0])
 
     def along(self, a: Enclosed) -> tuple[Array, Array]:
-        """``K(r)'a`` for ``a (N, d)``: polynomials ``(N, S, p + 1, mw)``, off by at most ``(N, S, mw)``."""
+        """Return ``K(r)'a`` for ``a (N, d)``: polynomials ``(N, S, p + 1, mw)`` and their error bounds
+        ``(N, S, mw)``."""
         size = np.abs(a.mid)
         plain = np.einsum("nd,spdw->nspw", a.mid, self.coefficients)
         large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
@@ -143,8 +164,8 @@ class VerifiedKernel:
         return plain, off
 
     def most(self, a: Enclosed, sides: Sequence[Side | CurvedSide]) -> Enclosed:
-        """The integral of the support function of ``K(r)'a`` for ``a (N, d)``: between bounds, as a middle and a radius
-        ``(N,)``."""
+        """Return the integral of the support function of ``K(r)'a`` over all parts, for ``a (N, d)``, as middles and
+        radii ``(N,)``. The set is the sum of ``sides``."""
         size, count = np.abs(a.mid), self.count
         large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
         plain, off = self.along(a)
@@ -157,15 +178,29 @@ class VerifiedKernel:
             value, more, less = (one.sum(axis=1) for one in bounds)
             low, high = low + value - less, high + value + more
             lost += rounding(4 * count + 8) * 2.0 * tops.sum(axis=1)
-        low, high = low / 2.0, high / 2.0  # of u from -1 to 1
+        low, high = low / 2.0, high / 2.0  # u runs from -1 to 1, an interval of length 2
         rad = (high - low) / 2.0 + (lost / 2.0 + rounding(4) * (np.abs(low) + np.abs(high)))
         return Enclosed((low + high) / 2.0, rad * OUTWARD)
 
 
 def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
-    """The integral over ``u`` from -1 to ``ends (M,)`` of the largest of polynomials ``P (M, p + 1, v)``, which are off
-    by at most ``e (M, v)``, rounding of what is added up to two values of theirs included: values, and by how much more
-    and less it may be, ``(M,)``."""
+    """Return the integral of the largest of several polynomials, over ``u`` from -1 to ``ends (M,)``.
+
+    Parameters
+    ----------
+    P
+        The coefficients of ``v`` polynomials for each of ``M`` integrals, ``(M, p + 1, v)``.
+    e
+        The error bounds of the polynomials, ``(M, v)``. They allow for the rounding errors in the sum of two of their
+        values.
+    ends
+        The upper limits of the integrals, ``(M,)``.
+
+    Returns
+    -------
+    tuple
+        Values, and how much more and how much less the true integral may be, ``(M,)`` each.
+    """
     orders = np.arange(P.shape[1])
     here, start, stop = np.arange(len(P)), -np.ones(len(P)), ends.copy()
     value, more, less = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P))
@@ -179,19 +214,20 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
         g = [one[rows, best][:, None] - one for one in (left, right)]
         below = np.maximum(0.0, -np.minimum(*g))
         bend = (np.abs(G) * (orders * (orders - 1))[:, None]).sum(axis=1)
+        # a function with |f''| <= bend that is not negative at the ends is nowhere negative where this holds
         near = (np.sqrt(np.maximum(g[0], 0.0)) + np.sqrt(np.maximum(g[1], 0.0))) ** 2
         dips = np.where(near >= bend * (width**2 / 2.0)[:, None], 0.0, bend * (width**2 / 8.0)[:, None])
         wrong = (below + dips) * (1.0 + 1e-13)
         wrong[rows, best] = 0.0
         wrong = wrong.max(axis=1)
-        # where all are within what they are off by, no cut tells them apart
+        # where the corners differ by less than their error bounds, no further cut helps
         settled = (wrong * width <= allowed[here]) | (wrong <= e[here].max(axis=1)) | (turn == ROUNDS)
         done, at = rows[settled], here[settled]
         chosen = Q[done, :, best[done]] * weights
         area = _valued(chosen, stop[done]) * stop[done] - _valued(chosen, start[done]) * start[done]
         own, others = e[at, best[done]], e[at].max(axis=1)
         np.add.at(value, at, area)
-        # of more parts than two both ends are added up as well
+        # ``e`` allows for the rounding errors of two parts; with more parts, those at both ends of each are added
         rounded = 2.0 * rounding(orders.size + 4) * np.abs(chosen).sum(axis=1) * (turn > 1)
         np.add.at(more, at, (wrong[done] + own + 2.0 * others) * width[done] + rounded)
         np.add.at(less, at, own * width[done] + rounded)
@@ -208,14 +244,15 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
 
 
 def _valued(P: Array, u: Array) -> Array:
-    """Polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
+    """Return the values of polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
     powers = u[:, None] ** np.arange(P.shape[1])
     return np.asarray(np.einsum("mp,mp...->m...", powers, P))
 
 
 def _equal(P: Array, start: Array, stop: Array) -> Array:
-    """Near a root of polynomials ``(M, p + 1)`` whose signs differ at the ends, by secants of which the older end
-    counts half (Illinois); the middle elsewhere. Wherever it is, what is claimed holds."""
+    """Return points near a root of polynomials ``(M, p + 1)`` that differ in sign at the ends, by the Illinois method:
+    secants in which the value at the older end is halved. Elsewhere return the middle. All bounds hold wherever the
+    points are."""
     a, b, fa, fb = start, stop, _valued(P, start), _valued(P, stop)
     middle_of = (a + b) / 2.0
     crossing, cut = fa * fb < 0.0, middle_of
@@ -234,8 +271,8 @@ def _equal(P: Array, start: Array, stop: Array) -> Array:
 @final
 @dataclass(frozen=True, eq=False)
 class MeasurableDeviations(Deviations):
-    """What measurable disturbances make of the state by the end of every piece of the ``grid``, ``(d,)`` each, through
-    a ``flow``; and the deviation of the initial state."""
+    """The effects of measurable disturbances on the state at the end of every piece of the ``grid``, ``(d,)`` each, by
+    a ``flow``; and the initial deviation."""
 
     flow: VerifiedFlow
     grid: list[float]
@@ -258,17 +295,18 @@ class MeasurableDeviations(Deviations):
 
     @cached_property
     def sides(self) -> list[Side | CurvedSide]:
-        """The sets of the disturbances, which add up."""
+        """The sets whose sum is the set of the disturbances about its middle."""
         assert self.shape is not None
         return Side.of(self.shape)
 
     def kernel(self, piece: int) -> VerifiedKernel:
-        """That of a piece."""
+        """Return the kernel of a piece of the grid."""
         return self.way(self.grid[piece], self.grid[piece + 1])
 
     @remembered(lambda: KEPT, lambda self, start, stop: self.flow.alike(start, stop))
     def way(self, start: float, stop: float) -> VerifiedKernel:
-        """The kernel of an interval, whose parts are those between marks, in shares of each."""
+        """Return the kernel of an interval; its parts are the intervals between marks, each with its own ``u`` from -1
+        to 1."""
         every, onward = list[Enclosed](), identity(self.flow.states)
         columns = slice(self.flow.driven, self.flow.driven + self.width)
         for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
@@ -287,7 +325,7 @@ class MeasurableDeviations(Deviations):
         d = self.flow.states
         axes = np.vstack([np.eye(d), -np.eye(d)])
         exact = Enclosed(axes, np.zeros_like(axes))
-        alike: dict[int, tuple[VerifiedKernel, Array]] = {}  # kernels are kept with their numbers
+        alike: dict[int, tuple[VerifiedKernel, Array]] = {}  # the kernels are kept, so that their ids stay unique
         found = list[Array]()
         for piece in range(self.blocks):
             kernel = self.kernel(piece)
@@ -298,12 +336,13 @@ class MeasurableDeviations(Deviations):
         return rounded_radii(found, self.sets)
 
     def supports(self, every: Sequence[list[arb]]) -> list[arb]:
+        """Return the support values at every ``a (Q,)``: sums of integrals of support functions."""
         from flint import arb
 
         d, blocks = self.flow.states, self.blocks
         table = Enclosed.of(stacked(every))
         mid, rad = (part[:, : blocks * d].reshape(len(every), blocks, d) for part in (table.mid, table.rad))
-        rad = np.where(rad > 1e-290, rad, 0.0)  # of exact zeros
+        rad = np.where(rad > 1e-290, rad, 0.0)  # the radius of an exact 0 is `TINY`
         alike: dict[int, tuple[VerifiedKernel, list[int]]] = {}
         for piece in range(blocks):
             kernel = self.kernel(piece)
@@ -325,7 +364,7 @@ class MeasurableDeviations(Deviations):
 @final
 @dataclass(frozen=True, eq=False)
 class MeasurableLoop(VerifiedLoop):
-    """`VerifiedLoop` under measurable disturbances."""
+    """A `VerifiedLoop` under measurable disturbances."""
 
     @cached_property
     def deviations(self) -> MeasurableDeviations:
@@ -333,6 +372,8 @@ class MeasurableLoop(VerifiedLoop):
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
+        """The transitions ``D_jl`` from the end of every piece ``l`` to the next breakpoint ``j`` of the control,
+        ``(d, d)``."""
         K = len(self.breakpoints) - 1
         found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
@@ -340,7 +381,7 @@ class MeasurableLoop(VerifiedLoop):
         later: tuple[int, arb_mat] = (
             K,
             identity(self.system.states),
-        )  # the piece of the control, and what is left of it
+        )  # the piece of the control, and the transition to its end
         for piece in reversed(range(self.deviations.blocks)):
             k = self.on(piece)
             left = later[1] if later[0] == k else identity(self.system.states)
@@ -350,9 +391,10 @@ class MeasurableLoop(VerifiedLoop):
         return found
 
     def _entered(self, rows: list[list[arb]], block: int) -> None:
-        """Nothing: what happens within a piece counts at its end."""
+        """Leave the rows as they are: a disturbance within a piece counts at the end of the piece."""
 
     def _ended(self, piece: int, state: arb_mat) -> arb_mat:
+        """Return the state and the responses after a piece of the grid, with the effect of the disturbance on it."""
         rows, unit = state.tolist(), identity(self.system.states)
         for i, row in enumerate(rows):
             for j in range(len(rows)):
@@ -360,13 +402,15 @@ class MeasurableLoop(VerifiedLoop):
         return stacked(rows)
 
     def state(self, piece: int, time: float) -> arb_mat:
-        """The nominal state and every response at a time in a piece of the grid, before what happens in it counts."""
+        """Return the nominal state and the responses at a time in a piece of the grid, without the effect of the
+        disturbance on this piece, ``(d, 1 + Q)``."""
         if time == self.grid[piece]:
             return self.nodes[piece]
         Phi, added = self._moved(piece, self.grid[piece], time)
         return Phi * self.nodes[piece] + added
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
+        """Return the `heights` of ``rows (r, d)`` at a time in a piece, with the disturbance up to this time."""
         from flint import arb
 
         found = super().highest(piece, time, rows, beside)
@@ -376,11 +420,13 @@ class MeasurableLoop(VerifiedLoop):
         return [one + arb(m, r) for one, m, r in zip(found, added.mid.tolist(), added.rad.tolist(), strict=True)]
 
     def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
-        """What disturbances on a piece make of ``rows (r, d)`` at most until a time in it."""
+        """Return the most that the disturbances on a piece add to ``rows (r, d)`` up to a time in this piece,
+        ``(r,)``."""
         return self.deviations.way(self.grid[piece], time).most(as_enclosed(rows), self.deviations.sides)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
-        """As of `VerifiedLoop`; what the piece itself adds is a sum of integrals of absolute values, or less."""
+        """Return upper bounds ``(r,)`` of how far ``max c'x(t)`` lies above its chord on ``[start, stop]``. The
+        disturbance on the piece itself adds a sum of integrals of absolute values, or less."""
         axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
         begun, size = (
             np.zeros(len(axes)),
@@ -395,12 +441,12 @@ class MeasurableLoop(VerifiedLoop):
 
 
 def as_enclosed(rows: Array | arb_mat) -> Enclosed:
-    """Rows of floats, or of balls."""
+    """Return rows of floats, or of balls, with their error bounds."""
     return Enclosed(rows, np.zeros_like(rows)) if isinstance(rows, np.ndarray) else Enclosed.of(rows)
 
 
 def signed(P: Array, off: Array) -> tuple[Array, Array]:
-    """Polynomials ``(n, p + 1, m)`` with their opposites, one after another, ``(n m, p + 1, 2)``, and how far both are
-    off."""
+    """Return polynomials ``(n, p + 1, m)`` one after another with their opposites, ``(n m, p + 1, 2)``, and the error
+    bounds of both, ``(n m, 2)``, from ``off (n, m)``."""
     each = np.moveaxis(P, 2, 1).reshape(-1, P.shape[1])
     return np.stack([each, -each], axis=2), np.repeat(off.reshape(-1, 1), 2, axis=1)

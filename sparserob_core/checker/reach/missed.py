@@ -1,8 +1,8 @@
-"""What enters at any time, errors of execution and measurable disturbances, through the flow of any system.
+"""Errors of execution and measurable disturbances, which enter at any time, in any system with a verified flow.
 
-The worst of them is the sum of ``share_j |u_jk| int |c'Phi(t, s) B_j(s)| ds`` over the pieces of the command, each cut
-where a segment of the system ends. What the time after a piece makes of its end is a row; ``Phi(end, s) B(s)`` on the
-piece is a polynomial with balls as coefficients.
+Their worst case is the sum of ``share_j |u_jk| int |c'Phi(t, s) B_j(s)| ds`` over the pieces of the command, where
+every piece is cut at the ends of the segments of the system. A row propagates the effect from the end of a piece to the
+time ``t``. On the piece, ``Phi(end, s) B(s)`` is a polynomial with balls as coefficients.
 """
 
 from __future__ import annotations
@@ -33,20 +33,32 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb_mat
 
-KEPT = 16  # nodes, up to which the transitions from every earlier one are remembered; cells come one after another
-PLACES_KEPT = 128  # parameters at which what errors do is remembered
-TIMES_KEPT = 4096  # times at which what errors make of the states is remembered
-MEANS = 1.0 / np.arange(1.0, 257.0)  # of |u|^p from -1 to 1
+KEPT = 16  # marks whose transitions from all earlier marks are remembered; cells come one after another
+PLACES_KEPT = 128  # parameters whose inputs are remembered
+TIMES_KEPT = 4096  # times at which sums are remembered, and intervals whose kernels are
+MEANS = 1.0 / np.arange(1.0, 257.0)  # the means of |u|^p from -1 to 1, p = 0, 1, ...
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class SizedInput:
-    """The ``shares (m,)`` of a control that is ``pieces``, ``(m, 1)`` each, between ``breakpoints (K + 1,)``; there are
-    none where only rows are asked for. It enters through the columns of ``[B E]`` from the ``first`` one on; the
-    errors are known but for ``off (m,)``, and do not reach the ``numb`` states, which add up what is commanded.
-    ``side``: what enters by all columns at once, in the place of channels of their own; there is one share of 1 then,
-    and integrals are those of its support function."""
+    """An input that is at most a share of a command. There are no pieces where only bounds per unit of command are
+    needed.
+
+    Attributes
+    ----------
+    shares, off
+        The shares, ``(m,)``, and their error bounds, ``(m,)``.
+    breakpoints, pieces
+        The breakpoints ``(K + 1,)`` of the command, and its pieces, ``(m, 1)`` each.
+    first
+        The first of the columns of ``[B E]`` by which the input enters.
+    numb
+        States that no error reaches: integrals of the command.
+    side
+        The set of what enters by all columns together, instead of one channel for each column. Then there is one share,
+        which is 1, and the support function of the set takes the place of the absolute value.
+    """
 
     shares: Array
     breakpoints: Array
@@ -58,7 +70,7 @@ class SizedInput:
 
     @cached_property
     def sizes(self) -> Enclosed:
-        """How large errors may be on every piece of the command, ``(K, m)``."""
+        """The size of the input on every piece of the command, ``(K, m)``, with error bounds."""
         control = Enclosed.all(self.pieces, (len(self.pieces), self.shares.size))
         size, off = self.shares * np.abs(control.mid), np.zeros(self.shares.size) if self.off is None else self.off
         lost = off * (np.abs(control.mid) + control.rad)
@@ -66,62 +78,63 @@ class SizedInput:
 
     @property
     def columns(self) -> slice:
-        """The columns of ``[B E]`` it enters through."""
+        """The columns of ``[B E]`` by which the input enters."""
         return slice(self.first, self.first + (self.shares.size if self.side is None else self.side.dimension))
 
     @cached_property
     def far(self) -> Array:
-        """How far from 0 at most what enters by each column is, ``(m,)``, as a multiple of its size."""
+        """The upper bound of what enters by each column, ``(m,)``, as a multiple of its size."""
         if self.side is None:
             return np.ones(self.shares.size)
         return self.side.far
 
     def piece_at(self, time: float) -> int:
-        """The piece of the command from a time on."""
+        """Return the index of the piece of the command from a time on."""
         place = int(np.searchsorted(self.breakpoints, time, side="right")) - 1
         return min(max(0, place), len(self.pieces) - 1)
 
     def largest(self, piece: int) -> Array:
-        """How large what enters by each column may be on a piece, ``(m,)``, at most."""
+        """Return upper bounds ``(m,)`` of what enters by each column on a piece."""
         return np.asarray((self.sizes.mid[piece] + self.sizes.rad[piece]) * self.far)
 
     def reaching(self, rows: Array) -> Array:
-        """Rows ``(n, d)`` without the states that nothing of it reaches."""
+        """Return ``rows (n, d)`` with 0 for the states that the input does not reach."""
         return np.where(np.isin(np.arange(rows.shape[1]), list(self.numb)), 0.0, rows)
 
 
 @final
 @dataclass(eq=False)
 class BoundedInputAt(BoundedInputHere):
-    """An ``input`` of a known system, which follows a ``law``."""
+    """An ``input`` of a known system with the flow ``law``."""
 
     law: VerifiedFlow
     input: SizedInput
 
     @cached_property
     def marks(self) -> list[float]:
-        """Where a piece of the command begins or ends, or a segment of the system."""
+        """The times at which a piece of the command or a segment of the system begins or ends."""
         return self.law.marks(self.input.breakpoints.tolist())
 
     @cached_property
     def owner(self) -> np.ndarray:
-        """The piece of the command that each piece between marks is in."""
+        """The index of the piece of the command that holds each interval between marks."""
         return np.searchsorted(self.input.breakpoints, np.array(self.marks[:-1]), side="right") - 1
 
     def least(self, c: Array, time: float) -> Array:
-        """`BoundedInputHere.least`."""
+        """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)`` for a command of size 1 on every
+        piece."""
         found = np.zeros((self.input.breakpoints.size - 1, self.input.shares.size))
         low, _, which = self._integrals(c[None], time, np.arange(len(self.marks) - 1))
         np.add.at(found, self.owner[which], np.maximum(low[:, 0], 0.0))
         return found * self.input.shares * (1.0 - rounding(which.size))
 
     def added(self, c: Array, time: float) -> tuple[float, float]:
-        """`BoundedInputHere.added`."""
+        """Return a lower and an upper bound of what the worst input adds to ``c'x(t)``."""
         low, high = self._summed(c[None], time)
         return float(low[0]), float(high[0])
 
     def bent(self, c: Array, start: float, stop: float) -> float:
-        """`BoundedInputHere.bent`."""
+        """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``."""
         d = c.size
         begun = self._summed(np.eye(d), start)[1]
         if self.input.side is not None:
@@ -131,12 +144,13 @@ class BoundedInputAt(BoundedInputHere):
 
     @remembered(lambda: TIMES_KEPT, lambda self, rows, time: (time, rows.tobytes()))
     def _summed(self, rows: Array, time: float) -> tuple[Array, Array]:
-        """What errors add along ``rows (n, d)`` at a time, at least and at most, ``(n,)``."""
+        """Return lower and upper bounds ``(n,)`` of what the worst input adds to ``rows (n, d)`` at a time."""
         used = np.flatnonzero((self.input.sizes.mid + self.input.sizes.rad).any(axis=1))
         low, high, which = self._integrals(rows, time, np.flatnonzero(np.isin(self.owner, used)))
         owner = self.owner[which]
         mid, rad = self.input.sizes.mid[owner, None], self.input.sizes.rad[owner, None]
-        if self.input.side is None:  # an absolute value is not negative; the middle of a thin set may be beside it
+        # absolute values are not negative; a support function may be, where the middle of a thin set is not in it
+        if self.input.side is None:
             low = np.maximum(low, 0.0)
         at_least = np.where(low > 0.0, low * np.maximum(mid - rad, 0.0), low * (mid + rad)).sum(axis=(0, 2))
         at_most = (high * (mid + rad)).sum(axis=(0, 2))
@@ -144,8 +158,15 @@ class BoundedInputAt(BoundedInputHere):
         return at_least - lost * OUTWARD, at_most + lost * OUTWARD
 
     def _integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
-        """``int |c'Phi(t, s) B_j(s)| ds`` for ``rows (n, d)`` over those of the ``pieces`` between marks that begin
-        before the time: between ``(q, n, m)`` and ``(q, n, m)``; and which pieces these are, ``(q,)``."""
+        """Return bounds of ``int |c'Phi(t, s) B_j(s)| ds`` for ``rows (n, d)``, over the intervals between marks among
+        ``pieces`` that begin before ``time``.
+
+        Returns
+        -------
+        tuple
+            Lower bounds ``(q, n, m)``, upper bounds ``(q, n, m)``, and the indices ``(q,)`` of these intervals. With a
+            `side` the integrals are those of its support function, and ``m`` is 1.
+        """
         begins, rows = np.array(self.marks[:-1]), self.input.reaching(rows)
         which = pieces[begins[pieces] < time]
         if not which.size:
@@ -173,7 +194,7 @@ class BoundedInputAt(BoundedInputHere):
         sizes = np.abs(K.mid).sum(axis=1)
         off = np.einsum("qnd,qdm->qnm", np.abs(a), rounding(a.shape[2] + 1) * sizes + K.rad.sum(axis=1))
         off = (off + np.einsum("qnd,qdm->qnm", rad, sizes + K.rad.sum(axis=1))) * OUTWARD
-        off = off + rounding(4 * order + 32) * np.abs(plain).sum(axis=2)  # as they are summed
+        off = off + rounding(4 * order + 32) * np.abs(plain).sum(axis=2)  # rounding of the sums that follow
         if self.input.side is not None:
             return *self._together(self.input.side, plain, off), which
         flat = signed(plain.reshape(-1, *plain.shape[2:]), off.reshape(-1, off.shape[2]))
@@ -183,8 +204,8 @@ class BoundedInputAt(BoundedInputHere):
 
     @staticmethod
     def _together(side: Side | CurvedSide | Together, plain: Array, off: Array) -> tuple[Array, Array]:
-        """Bounds ``(q, n, 1)`` of the integrals of the support function of a set at polynomials ``(q, n, p + 1, m)``
-        that are off by ``off (q, n, m)``."""
+        """Return lower and upper bounds ``(q, n, 1)`` of the integrals of the support function of a set along
+        polynomials ``(q, n, p + 1, m)`` with error bounds ``off (q, n, m)``."""
         q, n, order, m = plain.shape
         sizes = np.abs(plain).sum(axis=2).reshape(q * n, m)
         lost = off.reshape(q * n, m) + rounding(4 * order + 32 + m) * sizes
@@ -195,13 +216,13 @@ class BoundedInputAt(BoundedInputHere):
 
     @remembered(lambda: TIMES_KEPT)
     def _kernel(self, start: float, stop: float) -> Enclosed:
-        """That of an interval, in powers of ``u`` from -1 to 1 across it, ``(p + 1, d, m)``."""
+        """Return the kernel of an interval in powers of ``u`` from -1 to 1, ``(p + 1, d, m)``."""
         found = pushes(self.law, start, stop, self.input.columns)
         return Enclosed(found.mid[:, 0], found.rad[:, 0])
 
     @remembered(lambda: KEPT)
     def _onward_to(self, node: int) -> Enclosed:
-        """The transitions to a mark from the end of every piece before it, ``(node, d, d)``."""
+        """Return the transitions to a mark from the end of every interval before it, ``(node, d, d)``."""
         whole = enclosed(products(self._steps[:node])[1:])
         return Enclosed(whole.mid[:, 0], whole.rad[:, 0])
 
@@ -213,15 +234,14 @@ class BoundedInputAt(BoundedInputHere):
 @final
 @dataclass(eq=False)
 class BoundedInputOver(BoundedInput):
-    """`BoundedInputAt` of a control, or of disturbances, in a system with parameters that its state is no affine
-    function of.
+    """An ``input`` of a system of which the state is not an affine function of the parameters.
 
-    At one parameter it is that of the known system there. Over a box: of one parameter alone a function ``f`` is
-    nowhere further from its chord than half the largest ``f''`` in shares of half the interval, and the absolute value
-    of a chord is not above the chord of the absolute values. So the integrals of ``|f|`` are, one parameter after
-    another, at most what is linear in each between those at the corners, and half of those of the second derivatives
-    more; what is beyond the degree of the expansion that these are bounded by counts twice. So it is with the
-    support function of a ``side`` in the place of the absolute value: of a sum it is not above the sum of both.
+    At one parameter it is the `BoundedInputAt` of the known system there. Over a box, take one parameter after another,
+    in shares of half its interval. A function ``f`` differs from its chord by at most half of the largest ``|f''|``,
+    and the absolute value of a chord is not above the chord of the absolute values. So the integrals of ``|f|`` are at
+    most the interpolation of their values at the corners, linear in each parameter, plus half of the integrals of
+    ``|f''|``. The second derivatives are bounded by an expansion, whose remainder counts twice. The support function of
+    a ``side`` takes the place of the absolute value, since for a sum it is not above the sum of both values.
     """
 
     flows: VerifiedFlows
@@ -229,11 +249,12 @@ class BoundedInputOver(BoundedInput):
 
     @remembered(lambda: PLACES_KEPT, lambda self, parameter: tuple(map(float, parameter)))
     def at(self, parameter: Sequence[float]) -> BoundedInputAt:
-        """That at one parameter."""
+        """Return the input at one parameter."""
         return BoundedInputAt(self.flows.at(parameter), self.input)
 
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
-        """`BoundedInput.over`."""
+        """Return bounds of what the worst input adds to ``c'x`` at one or two ``times`` over the box ``within``: the
+        interpolation of the values at its corners, and how far the true value may lie above it."""
         assert within is not None
         box, flow = within
         low, high, centre, radius = map(np.array, (*box, flow.centre, flow.radius))
@@ -246,9 +267,9 @@ class BoundedInputOver(BoundedInput):
             part = signs[:, np.flatnonzero(chosen)].prod(axis=1) @ middle / len(signs)
             if chosen in numbers:
                 ends[:, numbers[chosen]] = part
-            else:  # of more parameters than there are degrees
+            else:  # a monomial that the expansion does not have
                 rest += float(np.abs(part).max())
-        # the corners of a box are where its shares are 1 or -1, but for what the middle and the radius round
+        # rounding of the middle and the radius moves the corners of the box away from shares of exactly 1 and -1
         inside = np.minimum(high - centre, centre - low) * (1.0 - rounding(2))
         skew = float(((radius - inside) / np.where(radius > 0.0, radius, 1.0)).sum())
         rest += 2.0 * skew * float(np.ptp(middle, axis=0).max()) + rounding(4 * len(signs) + 8) * float(found.max())
@@ -259,8 +280,17 @@ class BoundedInputOver(BoundedInput):
         return Added(ends, (off + rest + total + 2.0 * lost + bent) * OUTWARD, over * OUTWARD, wide)
 
     def _curved(self, c: Array, times: Sequence[float], box: ParameterBox) -> tuple[Array, float, float]:
-        """How far integrals may be above what is linear between the corners of a box, by each parameter, but for what
-        is beyond the degree; how much that is; and in the time above a chord between ``times``."""
+        """Return bounds of what the curvature adds on a box of parameters.
+
+        Returns
+        -------
+        wide
+            How far the integrals may lie above the interpolation between corners, due to each parameter, ``(nu,)``.
+        lost
+            The remainder of the expansion.
+        bent
+            How far the integrals may lie above their chord between the ``times``; 0 at a single time.
+        """
         flow = self.flows.holding(box)
         halves = np.array(flow.box.halves)
         shares = np.array(box.halves) / np.where(halves > 0.0, halves, 1.0) * (1.0 + rounding(4))
@@ -280,8 +310,8 @@ class BoundedInputOver(BoundedInput):
         return wide * OUTWARD, lost * OUTWARD, bent * OUTWARD
 
     def _summed(self, flow: VerifiedFlow, rows: Array, time: float) -> tuple[Array, Array]:
-        """What errors add along ``rows (n, d)`` by a time, at most, and in absolute values: every coefficient in the
-        parameters ``(n, M)``, and what is beyond these ``(n,)``."""
+        """Return upper bounds of what the input adds to ``rows (n, d)`` by a time, in absolute values: for every
+        coefficient in the parameters, ``(n, M)``, and for the remainder, ``(n,)``."""
         onward, kernels, owner = self._reaching(flow, time)
         size, off = np.zeros((len(rows), flow.monomials.size)), np.zeros(len(rows))
         lost = onward.rad + rounding(rows.shape[1]) * np.abs(onward.mid)
@@ -296,13 +326,14 @@ class BoundedInputOver(BoundedInput):
 
     @remembered(lambda: TIMES_KEPT)
     def _kernel(self, flow: VerifiedFlow, start: float, stop: float) -> Enclosed:
-        """The kernel of an interval between marks."""
+        """Return the kernel of an interval between marks, ``(p + 1, M, d, m)``."""
         return pushes(flow, start, stop, self.input.columns)
 
     @remembered(lambda: KEPT)
     def _reaching(self, flow: VerifiedFlow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
-        """The transitions from the end of every interval between marks to a time, ``(q, M, d, d)``; the kernels of
-        these intervals, ``(q, p + 1, M, d, m)``; and the piece of the command that each is in."""
+        """Return the transitions to a time from the end of every interval between marks before it, ``(q, M, d, d)``;
+        the kernels of these intervals, ``(q, p + 1, M, d, m)``; and the indices ``(q,)`` of the pieces of the command
+        that hold them."""
         ends = [t for t in self.input.breakpoints.tolist() if t < time]
         marks = flow.marks([*ends, time]) if ends else [time]
         steps = [flow.over(*pair)[0] for pair in pairwise(marks)]
@@ -318,7 +349,7 @@ class BoundedInputOver(BoundedInput):
 
 
 def _carried(rows: Enclosed, steps: Enclosed) -> Enclosed:
-    """``rows (n, d)`` times every one of ``steps (q, d, d)``: ``(q, n, d)``."""
+    """Return ``rows (n, d)`` times every one of ``steps (q, d, d)``, ``(q, n, d)``."""
     size, there = np.abs(rows.mid), np.abs(steps.mid)
     rad = np.einsum("nd,qde->qne", size, steps.rad + rounding(size.shape[1]) * there)
     rad = (rad + np.einsum("nd,qde->qne", rows.rad, there + steps.rad)) * OUTWARD

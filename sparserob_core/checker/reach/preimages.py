@@ -1,10 +1,12 @@
-"""Deviations that are seen as given: inverses of what innovations see of the blocks of the disturbance.
+"""Deviations that explain given innovations: generalised inverses of the matrix from the disturbance to the
+innovations.
 
-Innovations are ``D z`` for deviations ``z``. Of ``p = D z`` one wants some ``q`` with ``D q = p``. Where breakpoints of
-control and disturbance differ, rows of ``D`` depend on others (all that lie within one block see the same few numbers),
-and so do columns (a state sees no more numbers than it has entries). Balls cannot tell that a number is 0; so the rank
-is bounded from above by who can see what, without rounding, and from below by rows that balls show to be independent.
-Where these agree, the other rows are combinations of them, and ``q`` from them alone is right for all.
+Innovations are ``D z`` for deviations ``z``. Given ``p = D z``, some ``q`` with ``D q = p`` is wanted. Where
+breakpoints of control and disturbance differ, rows of ``D`` depend on each other: all innovations within one block
+measure the same few numbers. Columns depend on each other too, since a state holds no more numbers than it has entries.
+Balls cannot show that a number is 0. Therefore the rank is bounded from above without rounding, by which states each
+deviation reaches, and from below by rows that balls show to be independent. Where both bounds agree, the other rows are
+combinations of these, and a ``q`` that fits these rows fits all.
 """
 
 from __future__ import annotations
@@ -27,10 +29,11 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat, fmpq_mat
 
-EVENED = 20  # steps in which rows and columns become of one size; the first few do most, twice as many change nothing
+EVENED = 20  # steps of scaling rows and columns to one size; the first few do most, twice as many change nothing
 
-# Bits that a row may have lost to what cancels in it. An observer's numbers have 53, so that of what it leaves of what
-# was seen before so many are lost; other rows lose a few. Where those do not suffice, of which six digits are known do.
+# Bits that a row may have lost by cancellation, and bits that it must have at least. The gains of an observer have 53
+# bits, so that what they leave of earlier deviations loses about 40; other rows lose a few. Where rows that lost less
+# do not suffice, rows with six known digits are used too.
 OBSERVED, FEWEST = 40, 20
 
 Pattern = npt.NDArray[np.bool_]
@@ -39,9 +42,18 @@ Pattern = npt.NDArray[np.bool_]
 @final
 @dataclass(frozen=True, eq=False)
 class Pushed:
-    """Who of the states can see which entry of a disturbance in ``x' = A x + E w``, whatever the times, and whichever
-    of several systems act: ``pattern (d, mw)``; of all of these at most ``states`` are independent of each other, and
-    at most ``entries``."""
+    """The states that each entry of a disturbance reaches in ``x' = A x + E w``, whatever the times, and whichever of
+    several systems act.
+
+    Attributes
+    ----------
+    pattern
+        The entries of the effect on the states that may differ from 0, ``(d, q)``.
+    states
+        The dimension of the reached subspace, or an upper bound of it.
+    entries
+        An upper bound of the number of independent columns of ``E`` along the vectors.
+    """
 
     pattern: Pattern
     states: int
@@ -49,11 +61,23 @@ class Pushed:
 
     @staticmethod
     def of(modes: Sequence[tuple[arb_mat, arb_mat]], vectors: Sequence[Sequence[Fraction]]) -> Pushed:
-        """Without rounding, for a disturbance along the ``vectors (q, mw)``, of systems ``A (d, d)``, ``E (d, mw)``;
-        raises `Unchecked` where their numbers are not exact.
+        """Return the reached states for a disturbance along ``vectors (q, mw)``, without rounding.
 
-        Where columns of ``E`` are brought to by any of the systems, one after another, is the least subspace that holds
-        them and that no ``A`` leaves; it is reached within ``d`` steps."""
+        The reached subspace is the smallest one that holds the columns of every ``E`` along the vectors and that no
+        ``A`` leaves. It is found within ``d`` steps.
+
+        Parameters
+        ----------
+        modes
+            The matrices ``A (d, d)`` and ``E (d, mw)`` of every system.
+        vectors
+            The vectors along which the disturbance deviates, ``(q, mw)``.
+
+        Raises
+        ------
+        Unchecked
+            If the numbers of a system are not exact.
+        """
         from flint import fmpq, fmpq_mat
 
         if not all(x.is_exact() for mode in modes for part in mode for x in part.entries()):
@@ -72,7 +96,8 @@ class Pushed:
 
     @staticmethod
     def linked(A: Pattern, E: Pattern, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
-        """From which entries of the matrices are other than 0 alone."""
+        """Return the reached states from the positions of entries that may differ from 0, of ``A (d, d)`` and
+        ``E (d, mw)``, for a disturbance along ``vectors (q, mw)``."""
         pattern: Pattern = E.astype(int) @ np.array([[bool(v) for v in vector] for vector in vectors]).T > 0
         for _ in range(len(A) - 1):
             pattern = pattern | (A.astype(int) @ pattern.astype(int) > 0)
@@ -88,9 +113,19 @@ def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
 @final
 @dataclass(frozen=True, eq=False)
 class SeenDeviations:
-    """What some innovations see of some blocks: ``matrix``, and which of its entries may be other than 0, ``pattern``.
-    ``rows``: of every group of rows, one for each innovation, where it ends and how many of it are independent at most;
-    ``columns``: the same for each block. ``reach``: how far every column deviates, all alike unless given."""
+    """The effect of some blocks of deviations on some innovations.
+
+    Attributes
+    ----------
+    matrix, pattern
+        The matrix ``D (r, c)``, and which of its entries may differ from 0, ``(r, c)``.
+    rows
+        For each innovation: the end of its group of rows, and an upper bound of how many of them are independent.
+    columns
+        For each block: the end of its group of columns, and an upper bound of how many of them are independent.
+    reach
+        The largest deviation of every column, ``(c,)``; ``None`` where all are alike.
+    """
 
     matrix: arb_mat
     pattern: Pattern
@@ -100,8 +135,9 @@ class SeenDeviations:
 
     @cached_property
     def most(self) -> int:
-        """No more rows than this are independent: a cut between rows and columns, groups of either counted once, leaves
-        nothing but zeros. Any cut is a bound; the least one is that of the largest flow (Ford and Fulkerson 1956)."""
+        """An upper bound of the rank: the capacity of a cut between rows and columns, of which a group counts at most
+        its number of independent members. Any cut is such a bound. The smallest one is found by the largest flow (Ford
+        and Fulkerson 1956)."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -123,9 +159,17 @@ class SeenDeviations:
         return int(room[inside[starts] & ~inside[ends]].sum())
 
     def inverse(self) -> arb_mat:
-        """A matrix that takes what is seen of any deviations to deviations that are seen alike, of all such the least
-        beside how far they reach; raises `Unchecked` where balls do not show as many independent rows as there can
-        be."""
+        """Return a matrix ``(c, r)`` that gives, for the innovations of any deviations, deviations with the same
+        innovations.
+
+        Of all such deviations they are the shortest, in units of powers of two that are near ``reach`` where it is
+        given.
+
+        Raises
+        ------
+        Unchecked
+            If balls do not show as many independent rows as there can be.
+        """
         from flint import ctx
         from scipy.linalg import qr
 
@@ -152,12 +196,12 @@ class SeenDeviations:
 
 
 def _groups(groups: Sequence[tuple[int, int]], count: int) -> list[int]:
-    """The group of each of so many members."""
+    """Return the index of the group of each of ``count`` members."""
     return [int(g) for g in np.searchsorted([end for end, _ in groups], np.arange(count), side="right")]
 
 
 def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
-    """The columns of a matrix at these places of ``count``, 0 at the others."""
+    """Return a matrix with its columns at these ``places`` of ``count``, and columns of 0 at the others."""
     zero, found = ball(0), []
     for row in matrix.tolist():
         given = dict(zip(places, row, strict=True))
@@ -166,14 +210,15 @@ def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
 
 
 def _is_told(row: Sequence[arb], bits: int) -> bool:
-    """Whether so many bits of a row are known. Beside rows of one size, one of which little is known would make a
-    matrix that no balls invert, or an inverse of which little is known."""
+    """Return whether so many bits of a row are known. With rows of one size, a row of which few bits are known makes a
+    matrix that balls cannot invert, or an inverse of which few bits are known."""
     return max(float(abs(x.mid())) for x in row) > 2.0**bits * max(float(x.rad()) for x in row)
 
 
 def _reaching(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
-    """A matrix with its columns multiplied by powers of two near how far they reach, so that short deviations are those
-    that use little of it, and its rows so that the largest entry of each is about 1; and these powers."""
+    """Return a scaled matrix, and the powers of two that multiply its rows and its columns. Columns are multiplied by
+    about their reach, so that short solutions are those that use little of it. Rows are multiplied so that their
+    largest entry is about 1."""
     columns = np.exp2(np.round(np.log2(reach)))
     most = (np.abs(middles(D)) * columns).max(axis=1)
     rows = np.exp2(-np.round(np.log2(np.where(most > 0.0, most, 1.0))))
@@ -181,8 +226,8 @@ def _reaching(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
 
 
 def _evened(D: arb_mat) -> tuple[arb_mat, Array, Array]:
-    """A matrix with its rows and columns multiplied by powers of two, so that the largest entry of each is about 1
-    (Ruiz 2001), and these powers: what is inverted is then of no unit."""
+    """Return a scaled matrix, and the powers of two that multiply its rows and its columns, so that the largest entry
+    of each is about 1 (Ruiz 2001). The scaled matrix does not depend on units."""
     sizes = np.abs(middles(D))
     rows, columns = np.ones(sizes.shape[0]), np.ones(sizes.shape[1])
     for _ in range(EVENED):

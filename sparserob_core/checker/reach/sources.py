@@ -1,4 +1,5 @@
-"""What enters a problem at any time and is known by its size alone: measurable disturbances, errors of execution."""
+"""Inputs of a problem that enter at any time and of which only the size is known: measurable disturbances and errors of
+execution."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """The bounded inputs of a ``problem``. ``pieces``: what makes the control, of which there may be none;
-    ``is_still``: one system acts all along."""
+    """The bounded inputs of a ``problem``. ``pieces`` makes the pieces of the control, of which there may be none;
+    ``is_still`` says that one known system acts all the time."""
 
     problem: OptimalControlProblem
     timing: Timing
@@ -40,9 +41,9 @@ class Sources:
 
     @cached_property
     def strayed(self) -> BoundedInput | None:
-        """What measurable disturbances do beside the middle of their box, where nothing answers them: a command
-        of 1 through the columns of ``E`` that is missed by half the widths; of a polytope all of it at once, counted
-        from its middle. ``None`` where there are none."""
+        """The measurable disturbances, counted from the middle of their set, where the control does not answer them;
+        else ``None``. In a box, they are the errors of a command of size 1 through the columns of ``E``, with half the
+        widths as shares. In another set all components enter together."""
         bound = self.problem.measurable
         if bound is None or self.timing.answering:
             return None
@@ -60,19 +61,19 @@ class Sources:
         return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off)
 
     def _missing(self, *errors: Any, **more: Any) -> BoundedInput:
-        """What is missed at every parameter of the system."""
+        """Return a bounded input of this size at every parameter of the system."""
         entering = SizedInput(*errors, **more)
         if self.flows.box.middle:
             return BoundedInputOver(self.flows, entering)
         return BoundedInputAt(self.flows.at(()), entering)
 
     def strayed_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
-        """`strayed` at one parameter."""
+        """Return `strayed` at one parameter."""
         return None if self.strayed is None else self.strayed.at(parameter)
 
     @cached_property
     def execution(self) -> BoundedInput | None:
-        """How exactly the control is delivered, ``None`` where that is as it is commanded; of no control where the
+        """The errors of execution; ``None`` where the command is delivered exactly. They belong to no control where the
         certificate has none."""
         shares, system = self.problem.execution, self.problem.system
         if shares is None:
@@ -82,24 +83,31 @@ class Sources:
         shares, acts, pieces = np.asarray(shares, dtype=float), self.timing.control, self.pieces()
         if self.is_still:
             return FollowedExecution(self.problem, shares, acts, pieces, self.timing.clock)
-        if system.delay > 0.0:  # what was commanded before is the first piece, and the last ones act too late
+        if system.delay > 0.0:  # the control before 0 is the first piece; the last pieces act after the horizon
             begins = acts[:-1] + system.delay
             acts = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][: acts.size - 1 if pieces else 0]
         return self._missing(shares, acts, pieces, numb=self.problem.commanded)
 
     def delivered_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
-        """`execution` at one parameter."""
+        """Return `execution` at one parameter."""
         return None if self.execution is None else self.execution.at(parameter)
 
     def entering(self, parameter: Sequence[float] | None) -> list[BoundedInput]:
-        """All of them, at one parameter where it is given."""
+        """Return all bounded inputs, at one parameter where it is given."""
         both = (self.execution, self.strayed)
         return [one if parameter is None else one.at(parameter) for one in both if one is not None]
 
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
-        """What errors of execution add to ``c'x(t)`` at least, at a parameter: of a command of size 1 on every piece,
-        ``(K, m)``, ``None`` where there are none; and of what was commanded before."""
+        """Return lower bounds of what errors of execution add to ``c'x(t)`` at a parameter.
+
+        Returns
+        -------
+        sizes
+            The bounds for a command of size 1 on every piece, ``(K, m)``; ``None`` where there are no such errors.
+        given
+            The bound for the control that acts until the delay is over; 0 without a delay.
+        """
         delivered = self.delivered_at(parameter)
         found, none = None if delivered is None else delivered.least(c, time), ball(0)
         if found is None or not self.problem.system.delay > 0.0:

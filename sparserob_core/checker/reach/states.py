@@ -1,4 +1,5 @@
-"""The states that a scene reaches, at every parameter of a box: at marks of the time and between them."""
+"""The states that a system reaches under a given control, over a box of parameters, at marks of time and between
+them."""
 
 from __future__ import annotations
 
@@ -27,17 +28,29 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 if TYPE_CHECKING:
     from flint import arb_mat
 
-PATHS_KEPT = 256  # intervals of which the states are remembered
-BOXES_KEPT = 8  # of parameters, over which states are remembered
-EFFECTS_KEPT = 16  # marks, at which the effect of every piece before is remembered; cells come one after another
+PATHS_KEPT = 256  # intervals whose states are remembered
+BOXES_KEPT = 8  # boxes of parameters whose states are remembered
+EFFECTS_KEPT = 16  # marks at which the effect of all intervals before is remembered; cells come one after another
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of ``x(0)`` and the set
-    of deviations from it, and the disturbance: its set and the breakpoints between which it is constant, of which some
-    components may be ``lasting`` longer."""
+    """The inputs and initial states of a system.
+
+    Attributes
+    ----------
+    grid
+        All breakpoints.
+    control
+        The control on each piece of the grid, ``(m, 1)``.
+    initial_state, initial_set
+        The centre of the initial states, ``(d,)``, and the set of deviations from it.
+    disturbance, changes
+        The set of the disturbance, and the breakpoints between which it is constant.
+    lasting
+        The components of the disturbance that are held over several of these intervals.
+    """
 
     grid: list[float]
     control: list[arb_mat]
@@ -51,7 +64,7 @@ class Scene:
 @final
 @dataclass(eq=False)
 class States:
-    """What a ``flow`` makes of a ``scene``."""
+    """The states that a ``flow`` makes of a ``scene``, as polynomials in the parameters."""
 
     flow: VerifiedFlow
     scene: Scene
@@ -66,16 +79,16 @@ class States:
 
     @cached_property
     def marks(self) -> list[float]:
-        """The times from each of which to the next the flow is a polynomial and inputs stay the same."""
+        """The times between which the flow is a polynomial in time and the inputs are constant."""
         return self.flow.marks(self.scene.grid)
 
     @cached_property
     def pieces(self) -> list[int]:
-        """The piece of the scene that every interval between marks is in."""
+        """The index of the piece of the grid that holds each interval between marks."""
         return [bisect_right(self.scene.grid, t) - 1 for t in self.marks[:-1]]
 
     def place(self, piece: int, time: float) -> int:
-        """The interval between marks that holds a time in a piece of the scene."""
+        """Return the index of the interval between marks that holds a time in a piece of the grid."""
         last = bisect_right(self.pieces, piece) - 1
         return min(bisect_right(self.marks, time) - 1, last)
 
@@ -89,7 +102,7 @@ class States:
         return self.node(len(self.marks) - 1)
 
     def node(self, mark: int) -> Series:
-        """The undisturbed state at a mark, ``(d, 1)``: block by block, as `effect`."""
+        """Return the undisturbed state at a mark, ``(d, 1)``, from blocks of intervals as in `effect`."""
         if mark not in self._nodes:
             x = Series.constant(self.flow.monomials, stacked([[v] for v in balls(self.scene.initial_state)]))
             for level, number in _blocks(mark):
@@ -98,7 +111,7 @@ class States:
         return self._nodes[mark]
 
     def _controlled(self, level: int, number: int) -> Series:
-        """What the control does on ``2^level`` intervals in a row, ``(d, 1)``."""
+        """Return what the control adds to the state over ``2^level`` consecutive intervals, ``(d, 1)``."""
         if (level, number) not in self._driven:
             block, last = self._block(level, number), 2 * number + 1
             if level:
@@ -107,7 +120,7 @@ class States:
             else:
                 u = self.scene.control[self.pieces[number]]
                 key = block, id(u)
-            if key not in self._made:  # most of a sparse control is one and the same
+            if key not in self._made:  # most pieces of a sparse control are the same
                 self._made[key] = (
                     self._tables[self._block(level - 1, last)][0] * parts[0] + parts[1]
                     if level
@@ -118,8 +131,9 @@ class States:
 
     @remembered(lambda: EFFECTS_KEPT)
     def effect(self, mark: int) -> tuple[Enclosed, Enclosed]:
-        """What the state at 0, ``(M, d, d)``, and the disturbance on every interval before a mark, ``(M, d, mark mw)``,
-        made of the state there: by blocks of 1, 2, 4, ... intervals, each carried on by those that follow it."""
+        """Return how the state at a mark depends on the initial state, ``(M, d, d)``, and on the disturbance on every
+        interval before the mark, ``(M, d, mark mw)``. Both are made of blocks of 1, 2, 4, ... intervals, each
+        propagated by the blocks after it."""
         d, blocks = self.flow.states, [self._block(*one) for one in _blocks(mark)]
         monomials = self.flow.monomials
         after, found = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
@@ -130,8 +144,9 @@ class States:
         return single(after), Enclosed(mid, rad)
 
     def _block(self, level: int, number: int) -> int:
-        """The number of what ``2^level`` intervals in a row make of the state before them, and of the disturbances on
-        them, side by side; those that are alike share one."""
+        """Return the number of the block of ``2^level`` consecutive intervals. Blocks with the same flow share one
+        number. The transition of the block and the effects of the disturbances on its intervals are kept under this
+        number."""
         if (level, number) in self._places:
             return self._places[level, number]
         if not level:
@@ -159,9 +174,27 @@ class States:
     def seen(
         self, basis: Array, place: int, start: float, stop: float, order: int
     ) -> tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]:
-        """Rows ``basis (b, d)`` on ``[start, stop]`` between two marks, as so many terms in the share of it: on the
-        undisturbed state, ``(J, M, b)``; and the sets of what is uncertain, with what each of their members adds per
-        unit, ``(blocks, J, M, w, b)``."""
+        """Return the states projected onto rows, on a part of an interval between marks, as polynomials.
+
+        Parameters
+        ----------
+        basis
+            The rows, ``(b, d)``.
+        place
+            The index of the interval between marks.
+        start, stop
+            The ends of the part; both may be the same.
+        order
+            The number of terms, ``J``, in the share of the part that has passed.
+
+        Returns
+        -------
+        Enclosed
+            The undisturbed state, ``(J, M, b)``.
+        list
+            For the disturbance and for the initial deviation, as far as there are any: the set, and the effect per unit
+            of every entry on every block, ``(blocks, J, M, w, b)``.
+        """
         flow, scene, d, m = self.flow, self.scene, self.flow.states, self.flow.driven
         begin, end, order = self.marks[place], self.marks[place + 1], 1 if start == stop else order
         segment, share = flow.segment(begin, end)
@@ -194,21 +227,23 @@ class States:
 
     @remembered(lambda: PATHS_KEPT)
     def _path(self, place: int) -> Powers:
-        """The undisturbed state from one mark to the next, ``(d, 1)``."""
+        """Return the undisturbed state from one mark to the next, ``(d, 1)``, as a polynomial in the share of the
+        interval."""
         segment, _ = self.flow.segment(self.marks[place], self.marks[place + 1])
         control = self.scene.control[min(self.pieces[place], len(self.scene.control) - 1)]
         return segment.applied(self.node(place).above(control))
 
     @remembered(lambda: PATHS_KEPT, lambda self, segment, basis: (segment, basis.tobytes()))
     def _lines(self, segment: VerifiedSegment, basis: Array) -> Lines:
-        """Rows of a segment."""
+        """Return the rows ``basis (b, d)`` of the flow on a segment."""
         return Lines.of(segment, basis)
 
     def blur(self, place: int) -> Array:
-        """About how much of the state at a mark, ``(d,)``, is due to the size of the box of parameters and unknown."""
+        """Return about how much of the error of the state at a mark, ``(d,)``, is due to the size of the box of
+        parameters. No claim rests on it."""
         if not self.flow.monomials.degree:
             return np.zeros(self.flow.states)
-        mark = max(place, 1)  # at the first nothing is unknown yet
+        mark = max(place, 1)  # at the first mark nothing is uncertain yet
         found = np.array([float(x.rad()) for x in self.node(mark).parts[0].entries()])
         for convex, number in ((self.scene.initial_set, 0), (self.scene.disturbance, 1)):
             if convex is not None:
@@ -220,13 +255,13 @@ class States:
 @final
 @dataclass(frozen=True, eq=False)
 class StatesOverBoxes:
-    """The states that a ``scene`` reaches over boxes of parameters; those over the latest ones are remembered."""
+    """The states of a ``scene`` over boxes of parameters; those over the latest boxes are remembered."""
 
     flows: VerifiedFlows
     scene: Scene
 
     def over(self, box: ParameterBox) -> States:
-        """The states over a box, or over a larger one."""
+        """Return the states over a box, or over a larger one that holds it."""
         return self._of(self.flows.holding(box))
 
     @remembered(lambda: BOXES_KEPT)
@@ -237,8 +272,8 @@ class StatesOverBoxes:
 @final
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Rows of the terms of a segment, ``(N, M, b, d + w)``, and by how much they are ``off`` at any share of it, ``(b,
-    d + w)``; ``sizes (N, b, d + w)``: how large the terms are at every parameter."""
+    """Rows of the flow on a segment of time: ``terms (N, M, b, d + w)`` in the share of the segment, their error bound
+    ``off (b, d + w)`` at any share, and bounds ``sizes (N, b, d + w)`` of the terms at every parameter."""
 
     terms: Enclosed
     off: Array
@@ -246,13 +281,14 @@ class Lines:
 
     @staticmethod
     def of(segment: VerifiedSegment, basis: Array) -> Lines:
-        """Those of a ``basis (b, d)``."""
+        """Return the rows ``basis (b, d)`` of the flow on a segment."""
         rows = exactly(basis)
         terms = enclosed([one.along(rows) for one in segment.terms])
         return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.powers.sizes * OUTWARD)
 
     def shifted(self, first: float, width: float, order: int) -> Enclosed:
-        """So many terms in the share of a part of the segment, ``(J, M, b, d + w)``."""
+        """Return the rows on a part of the segment, from the share ``first`` on and of this ``width``: ``order`` terms
+        in the share of the part, ``(J, M, b, d + w)``, with the remainder in the radius of the first."""
         count = len(self.terms.mid)
         table = shifted(first, width, count)
         kept, size = table[:order], np.abs(self.terms.mid)
@@ -263,7 +299,8 @@ class Lines:
 
 
 def _blocks(mark: int) -> list[tuple[int, int]]:
-    """The intervals before a mark in blocks of ``2^level``, the longest first: level and number of each."""
+    """Return the level and the number of the blocks of ``2^level`` intervals that fill those before a mark, longest
+    first."""
     found, begin = [], 0
     for level in range(mark.bit_length() - 1, -1, -1):
         if mark >> level & 1:
@@ -273,27 +310,27 @@ def _blocks(mark: int) -> list[tuple[int, int]]:
 
 
 def enclosed(series: Sequence[Series]) -> Enclosed:
-    """The entries of series of one shape, ``(J, M, rows, columns)``."""
+    """Return the coefficients of series of one shape as floats with radii, ``(J, M, rows, columns)``."""
     first = series[0]
     shape = len(series), len(first.parts), *first.shape
     return Enclosed.all([part for one in series for part in one.parts], shape)
 
 
 def single(series: Series) -> Enclosed:
-    """The entries of one series, ``(M, rows, columns)``."""
+    """Return the coefficients of one series as floats with radii, ``(M, rows, columns)``."""
     found = enclosed([series])
     return Enclosed(found.mid[0], found.rad[0])
 
 
 def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
-    """Products of polynomials in the parameters ``(..., M, a, d)`` with others ``(M, d, n)``, what is beyond the degree
-    in the radii of the constants."""
+    """Return the products of polynomials in the parameters, ``left (..., M, a, d)`` times ``right (M, d, n)``,
+    truncated at the degree. The radii of the constants hold the truncation error."""
     size, there = np.abs(left.mid), np.abs(right.mid)
     wide = right.rad + rounding(left.mid.shape[-1] * monomials.size) * there
     mid = _multiplied(monomials, left.mid, right.mid)
     with np.errstate(invalid="ignore"):
         rad = _multiplied(monomials, size, wide) + _multiplied(monomials, left.rad, there + right.rad)
-    rad = np.where(np.isnan(rad), np.inf, rad)  # 0 times no bound
+    rad = np.where(np.isnan(rad), np.inf, rad)  # 0 times infinity: no bound
     if monomials.degree:
         degrees = np.array(monomials.degrees)
         sums = [
@@ -306,8 +343,8 @@ def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
 
 
 def _multiplied(monomials: Monomials, left: Array, right: Array) -> Array:
-    """The coefficients of products up to the degree, as one product of matrices: what is a matrix ``(M d, M n)`` of
-    those of ``right (M, d, n)``, of monomials of the left factor and of the product."""
+    """Return the coefficients of the products up to the degree by one matrix product: ``right (M, d, n)`` becomes a
+    matrix ``(M d, M n)``, whose blocks belong to a monomial of the left factor and a monomial of the product."""
     (M, d, n), place = right.shape, monomials.quotients
     table = np.concatenate([right, np.zeros((1, d, n))])[place]  # (M, M, d, n)
     rows = np.swapaxes(left, -3, -2)

@@ -1,5 +1,5 @@
-"""The worst case of ``c'x(t)`` over all deviations, on cells of time, as polynomials with an error: over one box of
-parameters; of a loop that answers close; and of what has places in place of times."""
+"""The largest ``c'x(t)`` over all deviations on cells of time, as polynomials with error bounds: over one box of
+parameters, for a closed loop, and for quantities with numbered places instead of times."""
 
 from __future__ import annotations
 
@@ -27,18 +27,34 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-ORDER = 6  # of polynomials in the time on a cell: half of it takes shorter cells, twice it takes longer for each
-CELLS_KEPT = 20_000  # of which rows are remembered: those of a box are asked for again in its parts
+ORDER = 6  # terms of polynomials in the time on a cell: half of it needs shorter cells, twice it more time for each
+CELLS_KEPT = 20_000  # cells whose rows are remembered: the parts of a box need the rows of the box again
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Polynomial:
-    """``coefficients (J + 1, M)`` in powers of the time within the cell (from 0 to 1) and monomials of the parameters;
-    the truth exceeds it by at most ``error``, of which ``expansion`` is due to the size of the box of parameters, or of
-    the cell of time where it is a chord; both together exceed the truth by at most twice the ``error`` and ``kinks``,
-    which is due to disturbances about to switch, about ``turning`` of it because the box of parameters is so large.
-    ``bent``: what of the error each parameter makes beside those, ``None`` where none does.
+    """A polynomial with an error bound, near the largest ``c'x`` on a cell of time and a box of parameters.
+
+    The true value exceeds the polynomial by at most ``error``. The polynomial plus ``error`` exceeds the true value by
+    at most twice the ``error`` plus ``kinks``; for a chord this holds at its ends.
+
+    Attributes
+    ----------
+    coefficients
+        The coefficients ``(J + 1, M)`` of powers of the time within the cell, from 0 to 1, and monomials of the
+        parameters.
+    error
+        The error bound.
+    expansion
+        About the part of ``error`` that is due to the size of the box of parameters; for a chord, to the length of the
+        cell.
+    kinks
+        How much the bound may be above the true value because the worst disturbance switches within the cell.
+    turning
+        About the part of ``kinks`` that is due to the size of the box of parameters.
+    bent
+        A further part of the error, due to each parameter, ``(nu,)``; ``None`` where there is none.
     """
 
     coefficients: Array
@@ -50,8 +66,8 @@ class Polynomial:
 
 
 class Around(NamedTuple):
-    """The ``monomials`` of parameters about the ``centre (nu,)`` of a box, in units of its ``radius (nu,)``; there may
-    be none that anything depends on. ``sizes (M,)``: how much each has to do with the system."""
+    """The ``monomials`` of parameters about the ``centre (nu,)`` of a box, in units of its ``radius (nu,)``. There may
+    be no parameter. ``sizes (M,)`` says about how much each monomial contributes to the system."""
 
     monomials: Monomials = NONE
     centre: tuple[float, ...] = ()
@@ -62,7 +78,7 @@ class Around(NamedTuple):
 @final
 @dataclass(eq=False)
 class ProjectedStates:
-    """The ``states`` along the rows of a ``basis (b, d)``."""
+    """The ``states`` projected onto the rows of a ``basis (b, d)``."""
 
     states: States
     basis: Array
@@ -71,7 +87,7 @@ class ProjectedStates:
     )
 
     def on(self, place: int, start: float, stop: float) -> tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]:
-        """`States.seen` of the basis."""
+        """Return `States.seen` for the basis on ``[start, stop]``, a part of an interval between marks."""
         key = place, start, stop
         if key not in self._seen:
             if len(self._seen) >= CELLS_KEPT or not self.states.flow.monomials.degree:
@@ -83,8 +99,8 @@ class ProjectedStates:
 @final
 @dataclass(eq=False)
 class VerifiedTube:
-    """The reachable states over a ``box`` of parameters, seen along combinations of ``rows``, which are known over that
-    box or one that holds it."""
+    """The reachable states over a ``box`` of parameters, projected onto combinations of ``rows``, which are known over
+    this box or a larger one."""
 
     rows: ProjectedStates
     box: ParameterBox = ParameterBox()  # noqa: RUF009  immutable
@@ -97,8 +113,8 @@ class VerifiedTube:
 
     @cached_property
     def _recentred(self) -> Enclosed | None:
-        """What makes of coefficients about the middle of the larger box those on this one, ``(M, M)``; ``None`` where
-        these are the same."""
+        """The matrix ``(M, M)`` from coefficients on the larger box to those on this one; ``None`` where both boxes are
+        the same."""
         whole = self.rows.states.flow.box
         if whole == self.box:
             return None
@@ -108,7 +124,7 @@ class VerifiedTube:
         ):
             unit = ball(width) if width else ball(1)
             moves.append(((ball(middle) - ball(centre)) / unit, ball(half) / unit))
-        for e in self.flow.monomials.exponents:  # of this box
+        for e in self.flow.monomials.exponents:  # on this box; below, ``f`` on the larger one
             row = []
             for f in self.flow.monomials.exponents:
                 entry = ball(1)
@@ -119,8 +135,24 @@ class VerifiedTube:
         return Enclosed.of(stacked(table))
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
-        """For every ``c = z_i'basis``, ``z (k, b)``, the polynomial above ``c'x`` on ``[start, stop]``, a part
-        of piece ``piece`` of the grid; ``sharp``: with less for disturbances about to switch, where that can be."""
+        """Return polynomials above ``c'x`` for every direction ``c = z_i'basis``, over all deviations.
+
+        Parameters
+        ----------
+        piece
+            The index of a piece of the grid.
+        start, stop
+            The ends of the cell, a part of this piece without marks.
+        z
+            The combinations of the basis, ``(k, b)``.
+        sharp
+            Whether to reduce the error due to disturbances that switch, where the set is round; this takes longer.
+
+        Returns
+        -------
+        list of Polynomial
+            One polynomial for every direction.
+        """
         states = self.rows.states
         place = states.place(piece, start)
         state, parts = self.rows.on(place, start, stop)
@@ -142,7 +174,7 @@ class VerifiedTube:
         ]
 
     def _moved(self, rows: Enclosed, axis: int) -> Enclosed:
-        """Coefficients on this box, from those about the middle of the larger one along an ``axis``."""
+        """Return coefficients on this box from those on the larger one; they stand along an ``axis``."""
         moves = self._recentred
         if moves is None:
             return rows
@@ -154,17 +186,33 @@ class VerifiedTube:
 def bound_supports(
     shape: Shape, monomials: Monomials, every: Array, errors: Array, z: Array, sharp: bool
 ) -> tuple[Array, Array, Array, Array]:
-    """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at
-    most ``errors``, for combinations ``z (k, b)`` of them: coefficients ``(k, J + 1, M)``, their error ``(k,)``, how
-    much of that, or of the coefficients, is due to switching, and about how much of that would go in smaller boxes of
-    parameters. ``sharp``: less of it where the set is round, which takes longer."""
+    """Return upper bounds of the sum over pieces of a set's support function.
+
+    Parameters
+    ----------
+    shape, monomials
+        The set, and the monomials of the parameters.
+    every, errors
+        The arguments of the support function, ``(pieces, J + 1, M, mw, b)``, and their error bounds.
+    z
+        The combinations of the arguments, ``(k, b)``.
+    sharp
+        Whether to take a smaller bound where the set is round, which takes longer.
+
+    Returns
+    -------
+    tuple
+        The coefficients ``(k, J + 1, M)``; their errors ``(k,)``; how much the bounds may be above the true value
+        because the worst point of the set switches, ``(k,)``; and about how much of that is due to the size of the box
+        of parameters.
+    """
     pieces = every.shape[0]
     mid, w, lost, error, kinks, share = _linear(shape, every, errors, z, pieces)
     k, mw = mid.shape[0], mid.shape[-1]
     if not sharp or shape.round is None:
         moved = np.einsum("ilw,iljkw->ijk", w, mid)
         return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
-    # of every piece the better of this linear bound and of a polynomial above the length of L'f
+    # for every piece, the better one of this linear bound and a polynomial above the length of L'f
     m, L = shape.round
     parts = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
     above, off, over = (part.reshape(k, pieces, *part.shape[1:]) for part in lengths(monomials, parts))
@@ -181,10 +229,16 @@ def bound_supports(
 def _linear(
     shape: Shape, every: Array, errors: Array, z: Array, count: int
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """The weights ``(k, pieces, J + 1, M, mw)`` for combinations ``z (k, b)``, the points ``(k, pieces, mw)`` of the
-    set that are best at them or nearly, what is lost of the weights, ``(k, pieces, mw)``, where up to ``count``
-    pieces are added up, and by how much the points' products may be too small, ``(k, pieces)``; with what of that is
-    due to switching, and about what share of this to the size of the box of parameters."""
+    """Return linear bounds of the support function of each piece, by a point of the set that is best or nearly so.
+
+    Returns
+    -------
+    tuple
+        The arguments ``(k, pieces, J + 1, M, mw)`` for the combinations ``z (k, b)``; the points ``(k, pieces, mw)``;
+        the error bounds of the arguments, ``(k, pieces, mw)``, where up to ``count`` pieces are added up; the errors of
+        the bounds, ``(k, pieces)``; their parts due to switching; and about which share of these is due to the box of
+        parameters.
+    """
     mid = np.einsum("ljkwb,ib->iljkw", every, z)
     rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
     k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
@@ -199,8 +253,8 @@ def _linear(
 
 
 def _ranges(mid: Array, rad: Array) -> tuple[Array, Array, Array]:
-    """The ranges that weights ``(k, pieces, J + 1, M, mw)`` stay in on the cell: middles and half-widths, ``(k, pieces,
-    mw)``, and what parameters have to do with these."""
+    """Return the ranges of arguments ``(k, pieces, J + 1, M, mw)`` on the cell: their middles, their half-widths, and
+    the part of the half-widths due to the parameters, ``(k, pieces, mw)`` each."""
     k, pieces, orders, _, mw = mid.shape
     ends = bernstein(np.moveaxis(mid[:, :, :, 0], 2, 3).reshape(-1, orders), [False]).reshape(k, pieces, mw, -1)
     highest, lowest = ends.max(axis=3), ends.min(axis=3)
@@ -212,8 +266,8 @@ def _ranges(mid: Array, rad: Array) -> tuple[Array, Array, Array]:
 @final
 @dataclass(eq=False)
 class LoopTube:
-    """The reachable states of a closed ``loop``, seen along combinations of the rows of ``basis (b, d)``, and of
-    ``gains (b, m)`` on the answers of the control beside them, its nominal part left out."""
+    """The reachable states of a closed ``loop``, projected onto combinations of the rows of ``basis (b, d)``. With
+    ``gains (b, m)``, these rows also hold the answers of the control, without its nominal part."""
 
     loop: VerifiedLoop
     basis: Array
@@ -221,8 +275,9 @@ class LoopTube:
     flow: Around = Around()  # noqa: RUF009  immutable
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
-        """As `VerifiedTube.cells`, with the chord as polynomial; of its error `expansion` is due to the length of the
-        cell. The truth may be far below it between the ends."""
+        """Return chords with error bounds for every direction ``c = z_i'basis``, with the parameters of
+        `VerifiedTube.cells`. The part ``expansion`` of the error is due to the length of the cell. The true value may
+        be far below a chord between its ends."""
         begin, end = self._height(piece, start, z), self._height(piece, stop, z)
         bent = np.zeros(z.shape[0])
         if start < stop:
@@ -236,7 +291,7 @@ class LoopTube:
 
     @remembered(key=lambda self, piece, time, z: (piece, time, z.tobytes()))
     def _height(self, piece: int, time: float, z: Array) -> Enclosed:
-        """The largest ``c'x`` at a time in a piece of the grid, ``(k,)``."""
+        """Return the largest ``c'x`` at a time in a piece of the grid, ``(k,)``."""
         beside = None
         if self.gains.shape[1]:
             beside = exactly(_combined(z, self.gains)) * self.loop.answers(self.loop.on(piece))
@@ -246,15 +301,16 @@ class LoopTube:
 @final
 @dataclass(frozen=True, eq=False)
 class Still:
-    """Of what has places in place of times: ``heights`` of a place, by number, along rows ``(r, d)``, which are
-    combinations of those of ``basis (b, d)``."""
+    """The largest values of quantities with numbered places instead of times. ``heights`` gives them at a place for
+    rows ``(r, d)``, which are combinations of the rows of ``basis (b, d)``."""
 
     heights: Callable[[int, arb_mat], list[arb]]
     basis: Array
     flow: Around = Around()  # noqa: RUF009  immutable
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
-        """As `VerifiedTube.cells`, at one place."""
+        """Return constants with error bounds at the place number ``piece``, with the parameters of
+        `VerifiedTube.cells`."""
         found = _of_column(self.heights(piece, exactly(_combined(z, self.basis))))
         return [
             Polynomial(np.array([[height]]), float(error), 0.0, 0.0)
@@ -263,12 +319,12 @@ class Still:
 
 
 def _combined(z: Array, basis: Array) -> Array | arb_mat:
-    """``z'basis (k, d)``: floats where nothing is added up, balls elsewhere."""
+    """Return ``z'basis (k, d)``: as floats where this needs no rounding, as balls elsewhere."""
     alone = (np.count_nonzero(z, axis=1) <= 1).all() and np.isin(z, (-1.0, 0.0, 1.0)).all()
     return np.asarray(z @ basis) if alone else exactly(z) * exactly(basis)
 
 
 def _of_column(heights: Sequence[arb]) -> Enclosed:
-    """Balls as numbers with their radii, ``(k,)`` each."""
+    """Return balls as floats with radii, ``(k,)`` each."""
     found = Enclosed.of(stacked([[height] for height in heights]))
     return Enclosed(found.mid[:, 0], found.rad[:, 0])

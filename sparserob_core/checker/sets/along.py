@@ -1,10 +1,10 @@
 """Integrals of the support function of a curved set along polynomials, between bounds.
 
-On a cell, in ``s`` from -1 to 1, the argument is ``a_0 + a_1 s + ...``. In the disc ``|s| <= R`` it is within ``sum_n
-|a_n| R^n`` of ``a_0``, entry by entry. Where the support function is analytic there, and at most ``M``, coefficients of
-its series are at most ``M R^-n`` (Cauchy): Gauss' rule with ``q`` nodes, which is exact up to the degree ``2 q - 1``,
-is off by no more than ``4 M R^-2q / (1 - 1 / R)``. Other cells are halved; what is left of one that holds a kink is the
-support function of what its argument moves by.
+On a cell, with ``s`` from -1 to 1, the argument is ``a_0 + a_1 s + ...``. In the disc ``|s| <= R`` it is within ``sum_n
+|a_n| R^n`` of ``a_0``, entry by entry. Let the support function be analytic there, and at most ``M``. Then coefficients
+of its series are at most ``M R^-n`` (Cauchy). Gauss' rule with ``q`` nodes is exact up to the degree ``2 q - 1``, so
+that its error is at most ``4 M R^-2q / (1 - 1 / R)``. Other cells are halved. On a small cell with a kink the error is
+at most the support function of the change of the argument.
 """
 
 from __future__ import annotations
@@ -25,38 +25,56 @@ from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, rou
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.sip.convex_set import Array
 
-DISC = 3.0  # radius: with 2 the rule is off by 1e-9, with 4 cells are halved once more
-NODES = 16  # of Gauss' rule: they leave 3e-15
+DISC = 3.0  # radius: with 2 the error of the rule is 1e-9, with 4 cells are halved once more
+NODES = 16  # of Gauss' rule: its relative error is then 3e-15
 LEFT = 4.0 * DISC ** (-2.0 * NODES) / (1.0 - 1.0 / DISC) * OUTWARD
-ROUNDS = 60  # in which cells are halved
-SETTLED = 2.0**-49  # of the heights: what a cell may be off by before it is halved no more
-ROOM = 0.999  # of a sum of squares or powers, by which it may move: it is away from 0 whatever rounding does
-STEEP = 1e9  # a power of a number that is rounded is off by some 1e-6 of itself, where there is room for 1e-3
-AT_ONCE = 20_000  # cells that are looked at together: some 50 MB
+ROUNDS = 60  # rounds in which cells are halved
+SETTLED = 2.0**-49  # relative to the support values: a cell with a smaller error is halved no more
+ROOM = 0.999  # the largest relative change of a sum of squares or powers: it stays away from 0 despite rounding
+STEEP = 1e9  # the largest exponent: rounding changes such a power by some 1e-6 of itself, and `ROOM` leaves 1e-3
+AT_ONCE = 20_000  # cells that are evaluated together: some 50 MB
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class CurvedSide:
-    """A set counted from a point ``about (mw,)``, by what its support function is along polynomials."""
+    """A set relative to a point ``about (mw,)``, with integrals of its support function along polynomials."""
 
     shape: Shape
     about: Array
 
     @property
     def dimension(self) -> int:
-        """How many coordinates there are."""
+        """The number of coordinates."""
         return self.shape.dimension
 
     @cached_property
     def far(self) -> Array:
-        """How far the set goes from the point along every coordinate, at most, ``(mw,)``."""
+        """The upper bounds ``(mw,)`` of the distance from the point to the set's ends along every coordinate."""
         axes = np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
         heights, off = _heights(self.shape, self.about, axes)
         return np.asarray((heights + off).reshape(2, -1).max(axis=0) * OUTWARD)
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """`Side.swept`."""
+        """Return the integral over ``u`` from -1 to ``ends (n,)`` of the support function at polynomials of ``u``.
+
+        Parameters
+        ----------
+        plain
+            Coefficients ``(n, p + 1, mw)`` of the polynomials.
+        off
+            Upper bounds ``(n, mw)`` of the errors of the polynomials.
+        sizes
+            The sums ``(n, mw)`` of the absolute values of the coefficients; not used here.
+        ends
+            The ends ``(n,)`` of the integrals.
+
+        Returns
+        -------
+        tuple[Array, Array, Array, Array]
+            Values, upper bounds of how much more and how much less the integral may be, and the largest support values,
+            ``(n,)`` each.
+        """
         found = [np.zeros(0)] * 3
         for first in range(0, len(plain), AT_ONCE):
             part = slice(first, first + AT_ONCE)
@@ -71,7 +89,7 @@ class CurvedSide:
         here, far = np.arange(len(plain)), self.far
         value, wrong, length = np.zeros(len(plain)), np.zeros(len(plain)), (ends + 1.0) / 2.0
         tops = np.abs(plain).sum(axis=1) @ far
-        # of a cell from -1 to the end, in a place from -1 to 1 across it: -1 + length (1 + s) = (length - 1) + length s
+        # on the cell from -1 to the end, with s from -1 to 1: u = -1 + length (1 + s) = (length - 1) + length s
         a, each = _stretched(plain, length), rounding(2 * count) * tops
         lost = each.copy()
         nodes, weights = rule()
@@ -105,7 +123,8 @@ class CurvedSide:
 
 @cache
 def rule() -> tuple[Array, Array]:
-    """The nodes and weights of Gauss' rule, rounded once: those of NumPy are off by several units."""
+    """Return the nodes and weights of Gauss' rule, rounded once: those of NumPy have errors of several units in the
+    last place."""
     from flint import arb, ctx
 
     with ctx.workprec(128):
@@ -116,7 +135,8 @@ def rule() -> tuple[Array, Array]:
 
 @cache
 def _halves(count: int) -> tuple[Array, Array]:
-    """From the coefficients of powers of ``x`` to those of ``s``, ``x = -1/2 + s/2`` and ``x = 1/2 + s/2``."""
+    """Return the matrices from coefficients of powers of ``x`` to those of ``s``, for ``x = -1/2 + s/2`` and ``x = 1/2
+    + s/2``."""
     found = [
         np.array(
             [[comb(n, k) * side ** (n - k) * 0.5**k if n >= k else 0.0 for n in range(count)] for k in range(count)]
@@ -127,7 +147,7 @@ def _halves(count: int) -> tuple[Array, Array]:
 
 
 def _stretched(plain: Array, length: Array) -> Array:
-    """Polynomials ``(M, p + 1, mw)`` at ``(length - 1) + length s``, by Horner's rule."""
+    """Return polynomials ``(M, p + 1, mw)`` at ``(length - 1) + length s``, by Horner's rule."""
     found = np.zeros_like(plain)
     shift, stretch = (length - 1.0)[:, None, None], length[:, None, None]
     for n in reversed(range(plain.shape[1])):
@@ -139,7 +159,8 @@ def _stretched(plain: Array, length: Array) -> Array:
 
 
 def _parts(shape: Shape, about: Array, *arrays: Array) -> list[tuple[Shape, list[Array]]]:
-    """The sets whose product a shape is, each with its columns."""
+    """Return the factors of a product of sets, each with its columns of the arrays; another set is its own only
+    factor."""
     if not isinstance(shape, Joint):
         return [(shape, [about, *arrays])]
     every = zip(shape.parts, shape.places, strict=True)
@@ -147,7 +168,8 @@ def _parts(shape: Shape, about: Array, *arrays: Array) -> list[tuple[Shape, list
 
 
 def _heights(shape: Shape, about: Array, values: Array) -> tuple[Array, Array]:
-    """The support function of the set less the point at exact directions ``(k, mw)``, and how far that may be off."""
+    """Return the support function of the set minus the point at exact directions ``(k, mw)``, and error bounds,
+    ``(k,)`` each."""
     total, off = np.zeros(len(values)), np.zeros(len(values))
     for part, (own, c) in _parts(shape, about, values):
         height, wrong = _height(part, own, c)
@@ -180,8 +202,12 @@ def _height(part: Shape, about: Array, c: Array) -> tuple[Array, Array]:
 
 
 def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
-    """How large the same is at complex directions within ``spread (k, mw)`` of ``c (k, mw)`` where it is analytic at
-    all of them, ``inf`` elsewhere."""
+    """Return bounds ``(k,)`` of the absolute value of the support function of the set minus the point at complex
+    directions.
+
+    The directions are those within ``spread (k, mw)`` of ``c (k, mw)``. A bound is ``inf`` where the function is not
+    shown to be analytic at all of them.
+    """
     total = np.zeros(len(c))
     for part, (own, value, apart) in _parts(shape, about, c, spread):
         reach = np.abs(value) + apart
@@ -213,7 +239,7 @@ def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
                 about_0, moved = np.linalg.norm(y, axis=1), np.linalg.norm(b, axis=1)
                 least, moved = about_0**2, 2.0 * about_0 * moved + moved**2
                 analytic = moved < ROOM * least
-            else:  # the slope of z^q is at most q (y + b)^(q - 1) on the way
+            else:  # the slope of z^q is at most q (y + b)^(q - 1) between
                 least, moved = (y**q).sum(axis=1), (q * b * (y + b) ** (q - 1.0)).sum(axis=1)
                 analytic = (moved < ROOM * least) & (q < STEEP)
             found = np.where(analytic, (least + moved) ** (1.0 / q), np.inf)
@@ -227,9 +253,12 @@ def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
 
 
 def _led(y: Array, b: Array, q: float) -> Array:
-    """How large the ``q``-norm is within ``b (k, d)`` of ``y (k, d)``, both at least 0, where one entry leads: of
-    quotients with that, the powers of all others add up to less than 1, so that 1 and they are away from 0. For a large
-    ``q`` that is nearly everywhere, while a power changes by its own size where its base does by ``1 / q``."""
+    """Return bounds of the ``q``-norm within ``b (k, d)`` of ``y (k, d)``, both nonnegative, where one entry dominates.
+
+    The entries are divided by the dominating one. Where the powers of all others add up to less than 1, the sum of all
+    is away from 0; elsewhere the bound is ``inf``. For a large ``q`` one entry dominates nearly everywhere, while a
+    power changes by its own size where its base changes by a share ``1 / q``.
+    """
     lead = y.argmax(axis=1)[:, None]
     low, high = (np.take_along_axis(end, lead, axis=1) for end in (y - b, y + b))
     quotients = np.where(low > 0.0, (y + b) / np.where(low > 0.0, low, 1.0), 1.0)
@@ -240,14 +269,14 @@ def _led(y: Array, b: Array, q: float) -> Array:
 
 
 def _norm(y: Array, q: float) -> Array:
-    """The q-norms of rows, of which no entry over- or underflows."""
+    """Return the q-norms of rows; no entry overflows or underflows."""
     size = np.abs(y).max(axis=1, keepdims=True)
     safe = np.where(size > 0.0, size, 1.0)
     return np.asarray(size[:, 0] * np.linalg.norm(y / safe, ord=q, axis=1))
 
 
 def _root(part: Shape) -> tuple[Array, float, float]:
-    """``L (d, d)`` and ``q`` with ``h(c) = c'm + |L'c|_q``, but for a share of the root."""
+    """Return ``L (d, d)``, the relative error of ``L``, and ``q`` with ``h(c) = c'm + |L'c|_q``."""
     if isinstance(part, Ball):
         p = part.source.p
         return part.source.radius * np.eye(part.dimension), HALF_ULP, p / (p - 1.0)
@@ -260,7 +289,8 @@ def _root(part: Shape) -> tuple[Array, float, float]:
 
 
 def _sides(part: Boxed, about: Array) -> tuple[Array, Array, Array]:
-    """The middle of a box less a point, half its widths, and how far both are off together, ``(d,)``."""
+    """Return the middle of a box minus a point, half its widths, and the error bound of both together, ``(d,)``
+    each."""
     ends = part.exact
     middle = [float((low + high) / 2 - Fraction(float(m))) for (low, high), m in zip(ends, about, strict=True)]
     half = [float((high - low) / 2) for low, high in ends]
@@ -268,7 +298,7 @@ def _sides(part: Boxed, about: Array) -> tuple[Array, Array, Array]:
 
 
 def _corners(part: Cornered, about: Array) -> tuple[Array, Array]:
-    """The corners of a set less a point, and how far they are off, ``(v, d)``."""
+    """Return the corners of a set minus a point, and their error bounds, ``(v, d)`` each."""
     exact: Sequence[Sequence[Fraction]] = part.corners
     found = [[float(x - Fraction(float(m))) for x, m in zip(corner, about, strict=True)] for corner in exact]
     return np.array(found), HALF_ULP * np.abs(found)

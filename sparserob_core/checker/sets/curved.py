@@ -20,9 +20,9 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-DIGITS = 4  # times the working precision, in which an ellipsoid is compared with its factor
-LEAST = 2.0**-1000  # of an error: smaller ones have lost digits to underflow
-MOST_ENDS = 8  # dimension up to which a ball of a p-norm is looked at in all corners of a range
+DIGITS = 4  # times the working precision, for the comparison of an ellipsoid with its factor
+LEAST = 2.0**-1000  # an error bound below this is rounded up: underflow has cost it digits
+MOST_ENDS = 8  # the largest dimension in which a ball of a p-norm is evaluated at all corners of a range
 
 
 @final
@@ -68,16 +68,16 @@ class Ellipsoidal(Shape):
 
     @cached_property
     def missed(self) -> float:
-        """Cholesky's factor is rounded: what the matrix differs from ``L L'`` by, as a share of it, measured in
-        balls."""
+        """The difference between the matrix and ``L L'``, relative to ``L L'``, where ``L`` is the rounded Cholesky
+        factor: an upper bound, measured in balls."""
         from flint import arb_mat, ctx
 
         L = self.source.factor
-        with ctx.workprec(DIGITS * ctx.prec):  # of a long one most of them cancel
+        with ctx.workprec(DIGITS * ctx.prec):  # in a long ellipsoid most digits cancel
             inverse = arb_mat(L.tolist()).inv()
             shares = (inverse * arb_mat(self.source.shape.tolist()) * inverse.transpose()).tolist()
             rest = [x - int(i == j) for i, row in enumerate(shares) for j, x in enumerate(row)]
-            # a square as a product: a power of a ball that holds 0 is none
+            # a square as a product: Arb gives no power of a ball that contains 0
             found = above(total(x * x for x in rest).nonnegative_part().sqrt())
         if not found < 1.0:
             raise Unchecked("the ellipsoid is too long for its axes to be told in floats")
@@ -126,7 +126,8 @@ class Ball(Shape):
         return (summed if summed.is_zero() else _power(summed, 1 / p)) / ball(self.source.radius)
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
-        """``h(f) - w'f`` is convex: on a range it is largest at one of the corners."""
+        """Return linear upper bounds of the support function: ``h(f) - w'f`` is convex, hence largest at a corner of a
+        range."""
         d, p = self.dimension, self.source.p
         if p == 2.0:
             size, power = math.frexp(self.source.radius)
@@ -143,7 +144,7 @@ class Ball(Shape):
         return w, (np.maximum(over, 0.0) + lost) * OUTWARD
 
     def _norm(self, vectors: Array) -> Array:
-        """The support function about the centre, to rounding; no component over- or underflows."""
+        """Return the support values about the centre, up to rounding; no component overflows or underflows."""
         size = np.abs(vectors).max(axis=-1, keepdims=True)
         scaled = vectors / np.where(size > 0.0, size, 1.0)
         answer: Array = self.source.radius * size[..., 0] * np.linalg.norm(scaled, ord=self.source.dual, axis=-1)
@@ -156,7 +157,7 @@ class Ball(Shape):
 
 @final
 class Cylindrical(Shape):
-    """A cylinder: the first coordinates, or their sums with others, are in the set ``base``; what else there is is
+    """A cylinder: the first coordinates, or their sums with others, are in the set ``base``; everything else is
     free."""
 
     source: Cylinder
@@ -179,7 +180,8 @@ class Cylindrical(Shape):
         return np.concatenate([self.base.centre, np.zeros(self.dimension - self.spanned)])
 
     def lifted(self, directions: Array) -> Array:
-        """Directions of the base ``(k, b)`` as directions of the set; exact, for one number makes each entry."""
+        """Return directions ``(k, b)`` of the base as directions of the set; exact, since each entry comes from one
+        number."""
         return np.hstack([directions, directions @ self.slopes])
 
     def support(self, direction: Sequence[arb]) -> arb:
@@ -187,13 +189,13 @@ class Cylindrical(Shape):
         for place, c in enumerate(direction[self.spanned :]):
             (which,) = np.nonzero(self.slopes[:, place])
             off = c - total(float(self.slopes[i, place]) * own[i] for i in which.tolist()) if which.size else c
-            # a ball that holds 0 is what rounding leaves of a direction that `lifted` made exactly
+            # where `lifted` made the direction exactly, rounding leaves a ball that contains 0
             if not (off.is_zero() if not which.size else off.contains(0)):
                 raise Broken("a direction points where its set is unbounded")
         return self.base.support(own)
 
     def _seen(self, point: Sequence[arb]) -> list[arb]:
-        """What of a point is looked at in the base."""
+        """Return a point projected onto the coordinates of the base."""
         found = list(point[: self.spanned])
         for i, place in np.argwhere(self.slopes).tolist():
             found[i] = found[i] + float(self.slopes[i, place]) * point[self.spanned + place]
@@ -214,7 +216,8 @@ class Cylindrical(Shape):
 
 @final
 class Joint(Shape):
-    """A product: some coordinates are in one set, the next ones in another; as the set of a disturbance alone."""
+    """A product of sets: some coordinates are in one set, the next ones in another. It serves as the set of a
+    disturbance only."""
 
     source: Product
 
@@ -243,7 +246,7 @@ class Joint(Shape):
 
 
 def _power(value: arb, exponent: arb) -> arb:
-    """``|value|^exponent``, ``exponent > 0``, also of a ball that holds 0, for which Arb gives none."""
+    """Return ``|value|^exponent`` with ``exponent > 0``, also for a ball that contains 0, where Arb gives none."""
     from flint import arb
 
     size = abs(value)
@@ -251,23 +254,26 @@ def _power(value: arb, exponent: arb) -> arb:
 
 
 def _round_bound(centre: Array, S: Array, value: Array, spread: Array, power: int = 0) -> tuple[Array, Array]:
-    """What is lost is of second order in ``spread``: in the norm of the set,
-    ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``. The set is ``2^power`` times as large as ``S`` says.
+    """Return linear upper bounds of the support function of an ellipsoid: a point, and an excess, as `Shape.bound`
+    does.
 
-    In units, powers of two, in which the largest entry reaches from 1/2 to 1 on the set: the squares of what is smaller
-    than 1e-162 would be 0, and the set a point.
+    The ellipsoid has the matrix ``S``, enlarged by the factor ``2^power``. The excess is of second order in ``spread``:
+    in the norm of the set, ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``.
+
+    Directions are scaled by powers of two, such that the largest support value of an entry is from 1/2 to 1. Otherwise
+    squares of numbers below 1e-162 would be 0, and the set a point.
     """
     largest = (np.maximum(np.abs(value), spread) * np.sqrt(np.diag(S))).max(axis=1)
     shift = np.frexp(np.where(np.isfinite(largest), largest, 1.0))[1][:, None]
     value, spread = np.ldexp(value, -shift), np.ldexp(spread, -shift)
     middle = np.ldexp(centre, -power)
     square = np.maximum(np.einsum("ki,ij,kj->k", value, S, value), 0.0)
-    lost = ROUNDING * np.einsum("ki,ij,kj->k", np.abs(value), np.abs(S), np.abs(value))  # by cancellation
+    lost = ROUNDING * np.einsum("ki,ij,kj->k", np.abs(value), np.abs(S), np.abs(value))  # error by cancellation
     size = np.sqrt(square)
     safe = np.where(size > 0, size, 1.0)
     w = centre + np.ldexp(np.where(size[:, None] > 0, value @ S / safe[:, None], 0.0), power)
     off = spread @ np.sqrt(np.diag(S)) * OUTWARD
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what overflows is lost altogether
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # an overflow makes the bound infinite
         excess = np.where(off < 0.5 * size, off**2 / (2.0 * (size - off)), 2.0 * off + np.where(size > 0, 0.0, off))
     short = np.sqrt(square + lost) - size + lost / safe
     lost = (excess + short) * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(middle))

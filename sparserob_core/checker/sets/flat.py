@@ -22,15 +22,15 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, fmpq
 
-MOST_CORNERS = 20_000  # intersections of facets looked at when a polytope's corners are listed
+MOST_CORNERS = 20_000  # intersections of facets that may be computed to list the corners of a polytope
 
 
 class Flat(Shape):
-    """A set that its facets describe."""
+    """A set that is given by its facets."""
 
     @property
     def sides(self) -> list[Facet]:
-        """The facets, which there are."""
+        """The facets, for a set whose facets are listed."""
         assert self.facets is not None
         return self.facets
 
@@ -39,12 +39,15 @@ class Flat(Shape):
 
     @property
     def holding(self) -> list[Facet]:
-        """Half-spaces that hold the set."""
+        """The half-spaces that contain the set."""
         return self.sides
 
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
-        """Where the coordinate planes cut the set (or one that holds it, larger by rounding), what is asked for is
-        linear on every part: its least value is attained at a corner of one of them."""
+        """Return a lower bound of ``min sum_i ups_i max(u_i, 0) + downs_i max(-u_i, 0) + slope_i u_i`` over the set.
+
+        The coordinate planes cut the set, or one that is larger by rounding, into parts on which the function is
+        linear. Its minimum is attained at a corner of a part.
+        """
         rows = tuple((*map(float, c), float(b) if b == float(b) else above(b)) for c, b in self.holding)
         return _least(
             [
@@ -62,7 +65,7 @@ class Flat(Shape):
 
 @final
 class Boxed(Flat):
-    """A box, or what is one: a ball of the maximum norm, of any norm in one dimension."""
+    """A box, or a set that is one: a ball of the maximum norm, or of any norm in one dimension."""
 
     def __init__(self, source: Box | NormBall) -> None:
         super().__init__(source)
@@ -75,7 +78,7 @@ class Boxed(Flat):
 
     @cached_property
     def exact(self) -> list[tuple[Fraction, Fraction]]:
-        """The ends of every side of a bounded one, as fractions."""
+        """The two ends of every side of a bounded box, as fractions."""
         if isinstance(self.source, Box):
             ends = zip(self.source.lower.tolist(), self.source.upper.tolist(), strict=True)
             return [(Fraction(low), Fraction(high)) for low, high in ends]
@@ -114,7 +117,7 @@ class Boxed(Flat):
         return total(self.shares_of_least(ups, downs, slope))
 
     def shares_of_least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> list[arb]:
-        """What every component has of the `least`."""
+        """Return the contribution of every component to `least`."""
         ends = zip(self._low, self._high, strict=True)
         points = [[low, high] + ([0 * low] if low <= 0 and high >= 0 else []) for low, high in ends]
         return [
@@ -127,7 +130,7 @@ class Boxed(Flat):
 
 
 class Cornered(Flat):
-    """A flat set with corners that are known."""
+    """A flat set with known corners."""
 
     @property
     @abstractmethod
@@ -140,7 +143,8 @@ class Cornered(Flat):
 
     @cached_property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
-        """From one corner to others, which are in the set with what is between."""
+        """The vectors from the first corner to others, each with the number 1; ``None`` for a set that is not thin. The
+        lines between corners lie in the set."""
         chosen = _apart(self._offsets)
         if len(chosen) == self.dimension or (len(chosen) > 1 and len(_independent(self._offsets)) > len(chosen)):
             return None
@@ -148,12 +152,12 @@ class Cornered(Flat):
 
     @cached_property
     def _offsets(self) -> list[list[Fraction]]:
-        """What takes the first corner to the others, the longest first."""
+        """The vectors from the first corner to the others, the longest first."""
         first, *others = self.corners
         return _longest_first([[a - b for a, b in zip(x, first, strict=True)] for x in others])
 
     def nearest(self, point: Array) -> list[arb]:
-        """A mean of corners."""
+        """Return a weighted mean of corners close to a point."""
         from scipy.optimize import nnls
 
         single = self.segments is not None and len(self.segments) == 1
@@ -171,7 +175,8 @@ class Cornered(Flat):
         return [rational(x + sum(w * v for w, v in zip(shares, column, strict=True))) for x, column in columns]
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
-        """The corner that is best at ``value``: nothing is lost where it stays the best."""
+        """Return the corner that is best at ``value``, and an excess that is only rounding error where it remains the
+        best."""
         points = np.array([[float(x) for x in corner] for corner in self.corners])
         heights = value @ points.T
         best = heights.argmax(axis=1)
@@ -180,7 +185,7 @@ class Cornered(Flat):
         ahead = heights - heights.max(axis=1, keepdims=True) + apart
         ahead += 3.0 * rounding(self.dimension) * (reach @ np.abs(points).max(axis=0))[:, None]
         ahead[np.arange(best.size), best] = 0.0
-        corner = 2.0 * HALF_ULP * (reach @ np.abs(points).T).max(axis=1)  # corners are rounded to floats
+        corner = 2.0 * HALF_ULP * (reach @ np.abs(points).T).max(axis=1)  # error of corners that are rounded to floats
         return w, (np.maximum(ahead.max(axis=1), 0.0) + corner) * OUTWARD
 
 
@@ -200,7 +205,7 @@ class Polyhedral(Cornered):
         return list(_meets(tuple((*map(float, row), float(b)) for row, b in zip(H, h, strict=True)), ()))
 
     def limit(self, direction: Array) -> arb:
-        """Simply what the facet says whose normal the direction is."""
+        """Return the right-hand side of the facet whose normal the direction is, times the factor between the two."""
         number, factor = facet(self.sides, direction)
         return self.sides[number][1] * rational(factor)
 
@@ -236,17 +241,22 @@ class Octahedral(Cornered):
 
 @final
 class Segments(Flat):
-    """A zonotope: ``h(c) = c'm + sum_j |c'g_j|``. Where its segments do not span the space it has opposite facets
-    across every direction in which it does not reach."""
+    """A zonotope: ``h(c) = c'm + sum_j |c'g_j|``.
+
+    Where its segments do not span the space, it has opposite facets across every direction in which its width is 0.
+    """
 
     source: Zonotope
 
     @cached_property
     def facets(self) -> list[Facet] | None:
-        """Every facet is spanned by as many segments as their span has dimensions, less one. Its normal is one of
-        floats, of length 1, near the exact one: its limit is drawn inwards by as much as a point within it, up to
-        twice as large as the set, could be outside of the exact one."""
-        if self.source.halfspaces() is None:  # too many: what a run sees as curved
+        """The facets, with normals in floats and limits drawn inwards; ``None`` where there are too many.
+
+        A facet is spanned by one segment fewer than the dimension of the span of all segments. Its normal is a float
+        vector of length 1 near the exact normal. Its limit is drawn inwards, such that a point within it, up to twice
+        as large as the set, cannot be outside the exact facet.
+        """
+        if self.source.halfspaces() is None:  # too many facets: a run treats the set as curved
             return None
         far, found = 2 * total(balls(self.radius)), []
         for exact in self._normals:
@@ -263,8 +273,8 @@ class Segments(Flat):
 
     @property
     def _normals(self) -> list[tuple[Fraction, ...]]:
-        """One normal of every pair of facets, exactly: those within the span of the segments, and some that span what
-        is across it."""
+        """The exact normals, one for each pair of facets: the normals within the span of the segments, and some that
+        span its orthogonal complement."""
         from flint import fmpq, fmpq_mat
 
         d, found = self.dimension, dict[tuple[str, ...], list[fmpq]]()
@@ -285,12 +295,12 @@ class Segments(Flat):
         return [tuple(Fraction(int(v.p), int(v.q)) for v in normal) for normal in found.values()]
 
     def contains(self, point: Sequence[float] | Array) -> bool:
-        """Of its middle that is no question."""
+        """Return True where an exact point is proven to be in the set; the middle needs no proof."""
         return np.array_equal(point, self.source.centre) or super().contains(point)
 
     @cached_property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
-        """Those of the segments that it is a sum of, the longest first, as many as are apart."""
+        """The longest of the segments whose sum the set is, as many as have distinct directions."""
         chosen = _apart(self._sums)
         if len(chosen) == self.dimension or len(_independent(self._sums)) > len(chosen):
             return None
@@ -298,8 +308,8 @@ class Segments(Flat):
 
     @cached_property
     def _sums(self) -> list[list[Fraction]]:
-        """The segments that are long, the longest first; those along one another as one, and all of them in the set
-        together."""
+        """The long segments, the longest first. Parallel segments are added into one, so that the zonotope of the
+        results lies in the set."""
         found = list[list[Fraction]]()
         rows = _longest_first([[Fraction(v) for v in g] for g in self.source.generators.tolist() if any(g)])
         widths = _widths(rows)
@@ -317,11 +327,11 @@ class Segments(Flat):
 
     @property
     def generators(self) -> list[list[Fraction]]:
-        """The segments that it is a sum of ``(q, d)``, exactly."""
+        """The segments ``(q, d)`` whose sum the set is, exactly."""
         return [[Fraction(float(v)) for v in row] for row in self.source.generators if row.any()]
 
     def nearest(self, point: Array) -> list[arb]:
-        """So much of every segment, none of them more than whole."""
+        """Return a point close to another one: the middle plus each segment times a number in ``[-1, 1]``."""
         from scipy.optimize import lsq_linear
 
         offset, middle = point - self.source.centre, self.source.centre
@@ -347,10 +357,11 @@ class Segments(Flat):
         return along(self.source.centre, direction) + heights
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
-        """For every segment ``|a + b| <= sign(a) (a + b) + 2 max(|b| - |a|, 0)``."""
+        """Return linear upper bounds of the support function, by ``|a + b| <= sign(a) (a + b) + 2 max(|b| - |a|, 0)``
+        for every segment."""
         G = self.source.generators
         heights, moved = value @ G.T, spread @ np.abs(G).T
-        moved = moved + rounding(self.dimension) * (np.abs(value) @ np.abs(G).T)  # of the heights, too
+        moved = moved + rounding(self.dimension) * (np.abs(value) @ np.abs(G).T)  # rounding of the heights
         signs = np.where(heights >= 0, 1.0, -1.0)
         w = self.source.centre + signs @ G
         size = np.abs(self.source.centre) + np.abs(G).sum(axis=0)
@@ -368,24 +379,27 @@ def _size(row: Sequence[Fraction]) -> float:
 
 
 def _widths(rows: Sequence[list[Fraction]]) -> list[Fraction]:
-    """The largest entry of every column, 1 where there is none: the units of what the coordinates of a set mean differ,
-    and what is short beside another coordinate is not thin."""
+    """Return the largest absolute value of every column, 1 where all are 0.
+
+    The columns are coordinates in different units. A vector that is short relative to another coordinate is not thin.
+    """
     return [max(map(abs, column)) or Fraction(1) for column in zip(*rows, strict=True)]
 
 
 def _share(row: Sequence[Fraction], widths: Sequence[Fraction]) -> float:
-    """How long a row is in such units."""
+    """Return the length of a row in units of the ``widths``."""
     return _size([v / width for v, width in zip(row, widths, strict=True)])
 
 
 def _longest_first(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
-    """The rows by how long they are in units of their `_widths`."""
+    """Return the rows sorted by their length in units of their `_widths`, the longest first."""
     widths = _widths(rows)
     return sorted(rows, key=lambda row: _share(row, widths), reverse=True)
 
 
 def _apart(rows: Sequence[list[Fraction]], widths: Sequence[Fraction] | None = None) -> list[list[Fraction]]:
-    """The rows that are further than `NEAR`, in units of the ``widths`` of all, from what those before them span."""
+    """Return the rows whose distance from the span of the rows chosen before is more than `NEAR`, in units of the
+    ``widths``."""
     chosen, basis = list[list[Fraction]](), list[Array]()
     units = _widths(rows) if widths is None else widths
     for row in rows:
@@ -402,7 +416,7 @@ def _apart(rows: Sequence[list[Fraction]], widths: Sequence[Fraction] | None = N
 
 
 def _independent(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
-    """The rows of which none is a combination of those before it."""
+    """Return the rows that are not a linear combination of the rows before them."""
     chosen, reduced = list[list[Fraction]](), list[tuple[int, list[Fraction]]]()
     for row in rows:
         rest = row
@@ -417,7 +431,7 @@ def _independent(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
 
 
 def _null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
-    """Vectors ``(d,)`` that span what is orthogonal to all of the rows."""
+    """Return vectors ``(d,)`` that span the orthogonal complement of the rows."""
     from flint import fmpq
 
     basis = spanning(rows)
@@ -443,8 +457,15 @@ def _least(values: Sequence[arb]) -> arb:
 
 @lru_cache(maxsize=64)
 def _meets(rows: tuple[tuple[float, ...], ...], planes: tuple[int, ...]) -> tuple[tuple[Fraction, ...], ...]:
-    """The points of ``{x : H x <= h}`` (rows ``(*H_i, h_i)``) where ``d`` of its facets and of the coordinate
-    ``planes`` meet, in rational arithmetic; raises `Unchecked` when these are too many to list."""
+    """Return the points of ``{x : H x <= h}`` where ``d`` of its facets and of the coordinate ``planes`` meet.
+
+    The rows are ``(*H_i, h_i)``, and the arithmetic is rational.
+
+    Raises
+    ------
+    Unchecked
+        Where the intersections are too many to be listed, or the polytope has no corners.
+    """
     from flint import fmpq, fmpq_mat
 
     d = len(rows[0]) - 1

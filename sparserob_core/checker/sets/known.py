@@ -1,4 +1,4 @@
-"""Which kinds of sets the checker knows, and how it sees each of them."""
+"""The kinds of sets that the checker knows, each with its `Shape`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Product, Zonotope
 from sparserob_core.sip.convex_set import Array
 
-MOST_SIGNS = 10  # dimension up to which a 1-norm ball is listed by its facets
+MOST_SIGNS = 10  # the largest dimension in which the facets of a 1-norm ball are listed
 
 
 def _ball(source: NormBall) -> Shape:
@@ -39,8 +39,15 @@ KINDS: Mapping[type[ConvexSet], Callable[[Any], Shape]] = MappingProxyType(
 
 
 def known(source: ConvexSet) -> Shape:
-    """How the checker sees a set, at the working precision. Raises `Unchecked` for a kind whose data it cannot read:
-    nothing that such a set says of itself is believed, nor what a subclass of a known kind does."""
+    """Return the `Shape` of a set at the working precision.
+
+    No claim rests on what the set's own class computes, nor on a subclass of a known kind.
+
+    Raises
+    ------
+    Unchecked
+        For a kind of set whose data the checker cannot read.
+    """
     from flint import ctx
 
     if type(source) not in KINDS:
@@ -54,8 +61,8 @@ def _seen(source: ConvexSet, precision: int) -> Shape:
 
 
 def middle(shape: ConvexSet) -> Array:
-    """The middle ``(d,)`` of a bounded set; of one without an interior floats next to it."""
-    found = shape.middle()  # any point of the set would be right: what is claimed is claimed of deviations from it
+    """Return the middle ``(d,)`` of a bounded set; for a set without an interior, floats close to it."""
+    found = shape.middle()  # any point of the set would be right: claims are about deviations from it
     if known(shape).member(found) is None:
         raise Unchecked(f"the middle of the {shape.kind} is not shown to be in it")
     return found

@@ -1,4 +1,4 @@
-"""The set of parameters on a box of the subdivision: whether they meet, and half-spaces of the set that help a bound
+"""The set of parameters on a box of the subdivision: whether both intersect, and half-spaces that sharpen a bound
 there."""
 
 from __future__ import annotations
@@ -16,35 +16,49 @@ if TYPE_CHECKING:
     from flint import arb
 
 Corners: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
-"""Lower and upper corners of a box of parameters."""
+"""The lower and the upper corner of a box of parameters."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """The set that the parameters are known to be in; ``None`` for a known system."""
+    """The set that contains the parameters; its ``shape`` is ``None`` for a known system."""
 
     shape: Shape | None
 
     @property
     def is_box(self) -> bool:
-        """Whether boxes of the subdivision hold parameters only."""
+        """True where boxes of the subdivision contain points of the set only."""
         return self.shape is None or self.shape.is_box
 
     def holds(self, point: Array) -> bool:
-        """Whether a point is proven to be in the set."""
+        """Return True where a point is proven to be in the set."""
         return self.shape is None or self.shape.contains(point)
 
     def meets(self, box: Corners) -> bool:
-        """Whether a box may hold parameters; ``False`` only where a half-space of the set provably excludes it."""
+        """Return True where a box may intersect the set; False only where a half-space of the set provably excludes the
+        box."""
         if self.shape is None or self.is_box:
             return True
         low, high = np.array(box[0]), np.array(box[1])
         return all(not _least(normal, low, high) > limit for normal, limit in halfspaces(self.shape, (low + high) / 2))
 
     def bounds(self, box: Corners, slope: Array) -> list[tuple[Array, Array, float]]:
-        """Ways to use the set: normals ``a (k, nu)``, limits ``s (k,)`` with ``a p <= s`` on the set, and weights
-        ``(k,) >= 0``, such that the weighted normals take up as much as they can of ``slope (nu,)``."""
+        """Return combinations of half-spaces of the set that compensate a slope as far as they can.
+
+        Parameters
+        ----------
+        box
+            A box of the subdivision.
+        slope
+            The slope ``(nu,)`` of a bound in the parameters.
+
+        Returns
+        -------
+        list[tuple[Array, Array, Array]]
+            Normals ``a (k, nu)``, limits ``s (k,)`` with ``a p <= s`` on the set, and weights ``(k,) >= 0``. The
+            weighted normals add up to ``slope`` as nearly as they can.
+        """
         if self.is_box or self.shape is None or not slope.any():
             return []
         found = [(slope[None], np.array([above(self.shape.support(balls(slope)))]), np.ones(1))]
@@ -59,7 +73,7 @@ class Parameters:
 
 
 def halfspaces(shape: Shape, point: Array) -> list[Facet]:
-    """Half-spaces that hold a set: its facets, or that of a curved one that looks towards a point."""
+    """Return half-spaces that contain a set: its facets, or for a curved set the one in the direction of a point."""
     if shape.facets is not None:
         return shape.facets
     normal = shape.towards(point - shape.centre)
@@ -67,6 +81,6 @@ def halfspaces(shape: Shape, point: Array) -> list[Facet]:
 
 
 def _least(normal: Array, low: Array, high: Array) -> arb:
-    """The least ``a'p`` on a box."""
+    """Return the least ``a'p`` on a box."""
     ends = zip(normal, balls(normal), balls(low), balls(high), strict=True)
     return sum((c * (a if weight > 0 else b) for weight, c, a, b in ends), balls([0.0])[0])

@@ -1,4 +1,4 @@
-"""From ball matrices to arrays with an error bound; polynomials of such arrays, and the length of vectors of them."""
+"""Arrays with error bounds, made from ball matrices; polynomials of such arrays, and the lengths of vectors of them."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ if TYPE_CHECKING:
     from flint import arb_mat
 
 HALF_ULP = 1.2e-16
-OUTWARD = 1.0 + 1e-12  # factor on computed error bounds, which are sums of a few thousand rounded numbers at most
+OUTWARD = 1.0 + 1e-12  # factor on computed error bounds, which are sums of at most a few thousand rounded numbers
 TINY = 1e-300
-NEAR = 0.5  # how far a squared length may be from its middle, as a share of it, for a polynomial above the length
-ROUNDING = 1e-13  # of a sum of floats, relative to the sum of absolute values (up to a few hundred terms)
+NEAR = 0.5  # the relative deviation of a squared length from its middle, below which a polynomial bounds the length
+ROUNDING = 1e-13  # rounding error of a sum of up to a few hundred floats, relative to the sum of absolute values
 
 
 def rounding(terms: int) -> float:
-    """What rounding may do to a sum of that many products, relative to the sum of their absolute values (Higham 2002,
-    section 3.1)."""
+    """Return a bound of the rounding error of a sum of that many products, relative to the sum of their absolute values
+    (Higham 2002, section 3.1)."""
     return (terms + 4) * HALF_ULP
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Enclosed:
-    """Numbers ``mid`` that are off by at most ``rad``, arrays of one shape."""
+    """An array ``mid`` with an error bound ``rad`` of the same shape."""
 
     mid: Array
     rad: Array
 
     @staticmethod
     def of(matrix: arb_mat) -> Enclosed:
-        """The entries of a ball matrix, ``(rows, columns)``."""
+        """Return the entries of a ball matrix, ``(rows, columns)``."""
         return Enclosed.all([matrix], (matrix.nrows(), matrix.ncols()))
 
     @staticmethod
     def all(matrices: Sequence[arb_mat], shape: tuple[int, ...]) -> Enclosed:
-        """The entries of ball matrices, one matrix after another, row by row, in an array of that shape."""
+        """Return the entries of ball matrices in an array of that shape, one matrix after another, row by row."""
         entries = [x for matrix in matrices for x in matrix.entries()]
         mid = np.array([*map(float, entries)]).reshape(shape)
         rad = np.array([float(x.rad()) for x in entries]).reshape(shape)
@@ -54,7 +54,7 @@ class Enclosed:
 
 
 def product(left: Enclosed, right: Enclosed) -> Enclosed:
-    """Matrices ``(..., a, d)`` times matrices ``(..., d, n)``."""
+    """Return matrices ``(..., a, d)`` times matrices ``(..., d, n)``, with error bounds."""
     size, there = np.abs(left.mid), np.abs(right.mid)
     rad = size @ (right.rad + rounding(size.shape[-1]) * there) + left.rad @ (there + right.rad)
     return Enclosed(left.mid @ right.mid, rad * OUTWARD)
@@ -63,8 +63,11 @@ def product(left: Enclosed, right: Enclosed) -> Enclosed:
 @final
 @dataclass(frozen=True, eq=False)
 class Truncated:
-    """Polynomials on ``[0, 1]`` in time and ``[-1, 1]`` in the parameters, ``coefficients (n, J + 1, M)``, each off by
-    at most ``lost (n,)``: products drop what is beyond the degrees, and bound it."""
+    """Polynomials in the time on ``[0, 1]`` and in the parameters on ``[-1, 1]``, with bounded truncation errors.
+
+    The ``coefficients`` are ``(n, J + 1, M)``. The error of each polynomial is at most ``lost (n,)``: products drop the
+    terms beyond the degrees, and bound them.
+    """
 
     monomials: Monomials
     coefficients: Array
@@ -92,27 +95,33 @@ class Truncated:
         return Truncated(self.monomials, found, (self.lost + other.lost + rounding(1) * size) * OUTWARD)
 
     def scaled(self, factors: Array) -> Truncated:
-        """Each times a number."""
+        """Return each polynomial times a number."""
         found, sizes = self.coefficients * factors[:, None, None], np.abs(factors)
         return Truncated(self.monomials, found, sizes * (self.lost + rounding(1) * self.size) * OUTWARD)
 
     def plus(self, number: float) -> Truncated:
-        """Each plus a number."""
+        """Return each polynomial plus a number."""
         found = self.coefficients.copy()
         found[:, 0, 0] += number
         return Truncated(self.monomials, found, self.lost + rounding(1) * (self.size + abs(number)))
 
     @cached_property
     def size(self) -> Array:
-        """A bound ``(n,)`` of the polynomials without what was lost."""
+        """The upper bounds ``(n,)`` of the absolute values of the polynomials without their errors."""
         answer: Array = np.abs(self.coefficients).sum(axis=(1, 2))
         return answer
 
 
 @lru_cache(maxsize=16)
 def _pairs(monomials: Monomials) -> tuple[Array, Array, Array, Array]:
-    """Pairs of monomials whose product is kept: the first and the second of each, the matrix from pairs to products;
-    and that from monomials to degrees."""
+    """Return the pairs of monomials whose product is kept.
+
+    Returns
+    -------
+    tuple[Array, Array, Array, Array]
+        The first and the second monomial of each pair, the matrix from pairs to products, and the matrix from monomials
+        to degrees.
+    """
     products = np.array(monomials.products)
     gather, degrees = np.zeros((len(products), monomials.size)), np.zeros((monomials.size, monomials.degree + 1))
     gather[np.arange(len(products)), products[:, 2]] = 1.0
@@ -121,11 +130,16 @@ def _pairs(monomials: Monomials) -> tuple[Array, Array, Array, Array]:
 
 
 def lengths(monomials: Monomials, parts: Array) -> tuple[Array, Array, Array]:
-    """Upper bounds of ``|g|`` for vectors of polynomials ``g (n, J + 1, M, r)``: coefficients ``(n, J + 1, M)``, their
-    errors ``(n,)``, and how far above the truth they may be besides; infinite where a vector may come near 0.
+    """Return polynomials that bound the lengths ``|g|`` of vectors of polynomials ``g (n, J + 1, M, r)`` from above.
 
-    With ``|g|^2 = s^2 (1 + e)`` it is ``s sqrt(1 + e) <= s (1 + e/2 - e^2/8 + e^3/16)``, since the next derivative of
-    the root is negative everywhere; what is lost is of fourth order in ``e``.
+    With ``|g|^2 = s^2 (1 + e)`` the length is ``s sqrt(1 + e) <= s (1 + e/2 - e^2/8 + e^3/16)``, since the fourth
+    derivative of the root is negative. The bound exceeds the length by a term of fourth order in ``e``.
+
+    Returns
+    -------
+    tuple[Array, Array, Array]
+        Coefficients ``(n, J + 1, M)``, their errors ``(n,)``, and how far the bound may be above the length in
+        addition, ``(n,)``; infinite where a vector may come near 0.
     """
     none = np.zeros(len(parts))
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""What a set of a problem is in ball arithmetic: the one interface by which the checker sees sets."""
+"""The interface of a set in ball arithmetic: the checker uses sets through it alone."""
 
 from __future__ import annotations
 
@@ -18,43 +18,50 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 if TYPE_CHECKING:
     from flint import arb
 
-# Of a set's size: what is no further off counts as no direction of its own, and a point as one of the set. Nothing
-# false is believed with more of it: points are replaced by some of the set. A run's own number is a tenth of it.
+# Relative to the size of a set: a thinner direction counts as none, and a nearer point counts as one of the set. A
+# larger value makes no false claim hold, since such a point is replaced by one of the set. A run uses a tenth of it.
 NEAR = 1e-8
 WRITTEN = (
-    1e-13  # of a point's size, what rounding of its numbers may have moved it; a tenth is what products of norms round
+    1e-13  # relative rounding error of the coordinates of a written point; products of norms round by a tenth of it
 )
-PARALLEL = 1e-12  # of unit vectors: rows that differ by less are opposite ones
-SPARE = 20  # bits of the working precision by which a point that is to be in a set is drawn inwards
+PARALLEL = 1e-12  # unit normals whose sum is smaller are opposite ones
+SPARE = 20  # a point that must be in a set is drawn inwards by at least this number of the last bits
 
 Facet: TypeAlias = "tuple[Array, arb]"
-"""``c'x <= b`` as ``c (d,)``, exact numbers, and ``b``."""
+"""A half-space ``c'x <= b``: the normal ``c (d,)`` in exact numbers, and the limit ``b``."""
 
 
 class Shape(ABC):
-    """A kind of set, from the data of ``source`` alone: nothing that the set's own class computes is part of a claim.
+    """A set in ball arithmetic, from the data of its ``source`` alone: no claim rests on what the set's own class
+    computes.
 
-    A flat set has `facets`; a curved one a `centre` and a `gauge` about it. A kind that has no answer to a question
-    raises `Unchecked`.
+    A flat set has `facets`; a curved one has a `centre` and a `gauge` about it. A method that a kind of set cannot
+    answer raises `Unchecked`.
     """
 
     is_box = False
-    """Whether the boxes of a subdivision hold points of the set only."""
+    """True where the boxes of a subdivision contain points of the set only."""
 
     def __init__(self, source: ConvexSet) -> None:
         self.source, self.dimension = source, source.dimension
 
     @abstractmethod
     def support(self, direction: Sequence[arb]) -> arb:
-        """``h(c)``, ``c`` a vector of balls ``(d,)``; raises `Broken` where the set is unbounded."""
+        """Return the support value ``h(c)`` of a direction ``c (d,)`` of balls; raise `Broken` where the set is
+        unbounded."""
 
     @abstractmethod
     def holds(self, point: Sequence[arb]) -> bool:
-        """Whether a point is proven to be in the set, ``(d,)`` balls."""
+        """Return True where a point, ``(d,)`` balls, is proven to be in the set."""
 
     def contains(self, point: Sequence[float] | Array) -> bool:
-        """Whether an exact point is proven to be in the set; raises `Unchecked` for one that rounding may have taken
-        out of it."""
+        """Return True where an exact point is proven to be in the set.
+
+        Raises
+        ------
+        Unchecked
+            Where the rounding of its coordinates may have moved the point out of the set.
+        """
         if self.holds(balls(point)):
             return True
         if self.member(point, WRITTEN) is not None:
@@ -62,9 +69,18 @@ class Shape(ABC):
         return False
 
     def member(self, point: Sequence[float] | Array, near: float = NEAR) -> list[arb] | None:
-        """The point of the set that an exact one stands for: itself, or one of the set next to it, since floats are
-        seldom in a thin one; of a set without an interior one along its `segments`. ``None`` where there is none as
-        ``near``, in parts of the size of both."""
+        """Return the point of the set that an exact point stands for; ``None`` where none is near.
+
+        It is the point itself, or a nearby one of the set, since floats are seldom in a thin set. In a set without an
+        interior it lies in the span of the `segments`.
+
+        Parameters
+        ----------
+        point
+            The exact point ``(d,)``.
+        near
+            The largest distance, relative to the size of the set or of the point, whichever is larger.
+        """
         if self.segments is None and self.holds(balls(point)):
             return balls(point)
         found = self.nearest(np.asarray(point, dtype=float))
@@ -75,35 +91,51 @@ class Shape(ABC):
         return found if far <= near * size else None
 
     def nearest(self, point: Array) -> list[arb] | None:
-        """A point of the set next to another one, in what its `segments` span where it has some; ``None`` of a kind
-        that has no answer."""
+        """Return a point of the set close to another one, in the span of the `segments` where there are some; ``None``
+        for a kind of set without an answer."""
         return None
 
     @property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
-        """Of a set without an interior, or none beside its length, vectors ``v (d,)`` along which its points differ,
-        and numbers ``c`` such that its width along any ``a`` is at least ``c |a'v|``; ``None`` of others. They span
-        what a part of the set is in, next to all of it."""
+        """The vectors ``v (d,)`` along which the points of a thin set differ, each with a number ``c``; ``None`` for
+        other sets.
+
+        A thin set has no interior, or one that is negligible relative to its length. Its width along any ``a`` is at
+        least ``c |a'v|``. The vectors span a part of the set, and the whole set is close to that part.
+        """
         return None
 
     @abstractmethod
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
-        """``w (k, d)`` and ``excess (k,)`` with ``h(f) <= w'f + excess`` for every ``f`` within ``spread (k, d)`` of
-        ``value (k, d)``; sharp where ``spread`` is 0."""
+        """Return linear upper bounds of the support function on ranges of directions.
+
+        Parameters
+        ----------
+        value
+            Middles ``(k, d)`` of the ranges.
+        spread
+            Half the widths ``(k, d)`` of the ranges.
+
+        Returns
+        -------
+        tuple[Array, Array]
+            Points ``w (k, d)`` and ``excess (k,)`` with ``h(f) <= w'f + excess`` for every ``f`` within ``spread`` of
+            ``value``. The bound is sharp where ``spread`` is 0.
+        """
 
     @property
     def round(self) -> tuple[Array, Array] | None:
-        """``m (d,)`` and ``L (d, r)`` with ``h(c) <= c'm + |L'c|``, nearly equal, where the set is round; the numbers
-        are off by no more than rounding makes them."""
+        """The ``m (d,)`` and ``L (d, r)`` of a round set with ``h(c) <= c'm + |L'c|``, where both sides differ by
+        rounding only; ``None`` for other sets."""
         return None
 
     @property
     def spanned(self) -> int:
-        """How many of the first coordinates the set bounds, alone or in sums with others."""
+        """The number of first coordinates that the set bounds, alone or in sums with others."""
         return self.dimension
 
     def lifted(self, directions: Array) -> Array:
-        """Directions of the `spanned` coordinates ``(k, b)`` as those of the set, ``(k, d)``."""
+        """Return directions ``(k, b)`` of the `spanned` coordinates as directions ``(k, d)`` of the set."""
         return directions
 
     # Flat sets
@@ -115,8 +147,8 @@ class Shape(ABC):
 
     @cached_property
     def basis(self) -> tuple[Array, Array] | None:
-        """``basis (b, d)`` and ``z (k, b)`` with ``z_i'basis`` the normal of the ``i``-th facet, exactly; opposite
-        normals share a row of the basis. ``None`` for a curved set."""
+        """The ``basis (b, d)`` and ``z (k, b)`` where ``z_i'basis`` is exactly the normal of facet ``i``; ``None`` for
+        a curved set. Opposite normals share a row of the basis."""
         if self.facets is None:
             return None
         places: dict[bytes, int] = {}
@@ -130,13 +162,17 @@ class Shape(ABC):
         return np.array(kept).reshape(len(kept), self.dimension), z[:, : len(kept)]
 
     def shares(self, direction: Array) -> Array:
-        """Numbers ``y (k,) >= 0`` with ``c`` the sum of the facets' normals times ``y``, to rounding."""
+        """Return numbers ``y (k,) >= 0`` such that the facets' normals times ``y`` add up to the direction, up to
+        rounding."""
         raise Unchecked(f"the checker does not know the facets of a {self.source.kind}")
 
     @cached_property
     def units(self) -> list[float]:
-        """The own unit of every facet of a flat set: the smallest that is not zero of how far it reaches over the set,
-        the width between it and the opposite facet, and what else the kind of set names."""
+        """The own unit of every facet of a flat set: the smallest nonzero one of several sizes.
+
+        The sizes are the largest absolute value of ``c'x`` over the set, the width to the opposite facet, and others
+        that the kind of set names.
+        """
         assert self.facets is not None
         return [
             smallest([width, max(_reach(self, c), _reach(self, -c)), *self._sizes(b)])
@@ -150,20 +186,23 @@ class Shape(ABC):
 
     @property
     def centre(self) -> Array:
-        """The centre ``(d,)`` of a curved set: what its gauge is about."""
+        """The centre ``(d,)`` of a curved set, about which its gauge is defined."""
         raise Unchecked(f"the checker does not know where the middle of a {self.source.kind} is")
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
-        """How many times as large the set must be to reach ``centre + offsets``."""
+        """Return the factor by which the set must be enlarged about its centre to contain ``centre + offsets``."""
         raise Unchecked(f"the checker cannot tell who is in a {self.source.kind}")
 
     def far(self, direction: Sequence[arb]) -> list[arb]:
-        """What takes the centre to the point farthest out in a direction, nearly."""
+        """Return the approximate offset from the centre to the point of the set farthest out in a direction."""
         raise Unchecked(f"the checker does not know how far a {self.source.kind} reaches")
 
     def point(self, direction: Array) -> list[arb]:
-        """A point of the set far out in a direction, exact numbers, proven to be in it; the middle when nothing better
-        is. Floats would not do: in a thin set that is turned, a rounded point is far outside."""
+        """Return a point of the set far out in a direction, in exact numbers and proven to be in the set.
+
+        The point is the centre where none better is proven. Floats would not suffice: a rounded point is far outside a
+        thin set that is oblique to the axes.
+        """
         from flint import arb, ctx
 
         middle, far, spare = balls(self.centre), self.far(balls(direction)), arb(2) ** (SPARE - ctx.prec)
@@ -177,12 +216,15 @@ class Shape(ABC):
     # All of them
 
     def limit(self, direction: Array) -> arb:
-        """The largest ``c'x`` over the set, or a bound of it."""
+        """Return the largest ``c'x`` over the set, or an upper bound of it."""
         return self.support(balls(direction))
 
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
-        """At most ``min sum_i ups_i max(u_i, 0) + downs_i max(-u_i, 0) + slope_i u_i`` over the set; ``ups`` and
-        ``downs`` are not negative, and any slope between ``-down`` and ``up`` is below their part."""
+        """Return a lower bound of ``min sum_i ups_i max(u_i, 0) + downs_i max(-u_i, 0) + slope_i u_i`` over the set.
+
+        ``ups`` and ``downs`` are not negative. A linear function with any slope between ``-down`` and ``up`` is a lower
+        bound of the first two terms of a component.
+        """
         tilt = [
             s + balls([float(np.clip(-float(s), -float(down.lower()), float(up.lower())))])[0]
             for up, down, s in zip(ups, downs, slope, strict=True)
@@ -190,19 +232,28 @@ class Shape(ABC):
         return -self.support([-t for t in tilt])
 
     def towards(self, offset: Array) -> Array:
-        """A normal that tells the set from a point outside."""
+        """Return a normal that separates the set from a point outside, at this ``offset (d,)`` from the centre."""
         return offset
 
     @cached_property
     def radius(self) -> list[float]:
-        """Bounds of ``|w_i|`` over the set, rounded up, one per coordinate."""
+        """The upper bounds of ``|w_i|`` over the set, one per coordinate, rounded up."""
         axes = np.eye(self.dimension)
         return [above(self.support(balls(axis)).max(self.support(balls(-axis)))) for axis in axes]
 
     def excess(self, point: Sequence[arb], beyond: Callable[[Array], arb] | None = None) -> tuple[float, str]:
-        """An upper bound of how far a point may lie outside, and where: relative to the own unit of each facet (at
-        least what double precision resolves), or along the gauge of a curved set; 0 when proven inside. Of a flat set
-        with what may lie ``beyond`` the point along a normal."""
+        """Return an upper bound of the distance by which a point may lie outside the set, and where.
+
+        The distance is relative to the own unit of each facet, which is at least what double precision resolves. For a
+        curved set it is along the gauge. It is 0 where the point is proven inside.
+
+        Parameters
+        ----------
+        point
+            The point, ``(d,)`` balls.
+        beyond
+            For a flat set, a function of a normal: what is added to the value of the point along it.
+        """
         if self.facets is None:
             assert beyond is None
             gauge = self.gauge([x - m for x, m in zip(point, balls(self.centre), strict=True)])
@@ -223,7 +274,7 @@ class Shape(ABC):
 def _reach(shape: Shape, direction: Array) -> float:
     try:
         return abs(float(shape.support(balls(direction)).mid()))
-    except (Broken, Unchecked):  # unbounded there, or nowhere cornered
+    except (Broken, Unchecked):  # unbounded in this direction, or without corners
         return math.inf
 
 
@@ -232,7 +283,8 @@ def _named(normal: Array, number: int) -> str:
 
 
 def widths(flat: Sequence[Facet]) -> list[float]:
-    """For every facet how far it is from the opposite one, in its own measure; infinite where there is none."""
+    """Return the distance of every facet to the opposite one, in the measure of its own normal; infinite where there is
+    none."""
     normals = np.array([c for c, _ in flat]).reshape(len(flat), -1)
     sizes = np.linalg.norm(normals, axis=1)
     heights = np.array([float(b) for _, b in flat])
@@ -246,8 +298,15 @@ def widths(flat: Sequence[Facet]) -> list[float]:
 
 
 def facet(flat: Sequence[Facet], direction: Array) -> tuple[int, Fraction]:
-    """Which facet a direction is the normal of, the nearest of parallel ones, and its length in terms of that normal;
-    exact, and `Broken` if none."""
+    """Return the number of the facet whose normal a direction is, and the factor between the two.
+
+    The factor is exact. Of several parallel facets it is the tightest one.
+
+    Raises
+    ------
+    Broken
+        Where the direction is the normal of no facet.
+    """
     place, best = int(np.abs(direction).argmax()), None
     for number, (c, b) in enumerate(flat):
         if c[place] * direction[place] <= 0.0:
@@ -262,20 +321,20 @@ def facet(flat: Sequence[Facet], direction: Array) -> tuple[int, Fraction]:
 
 
 def smallest(sizes: Sequence[float]) -> float:
-    """The smallest of these that is not zero; 0 when none is."""
+    """Return the smallest of the sizes that is not zero; 0 where none is."""
     return min((size for size in sizes if 0.0 < size < math.inf), default=0.0)
 
 
 def dot(left: Sequence[float] | Array, right: Sequence[float] | Array) -> arb:
-    """The scalar product of exact numbers."""
+    """Return the scalar product of exact numbers."""
     return total(a * b for a, b in zip(balls(left), balls(right), strict=True) if not (a.is_zero() or b.is_zero()))
 
 
 def total(terms: Iterable[arb]) -> arb:
-    """The sum of balls, 0 of none."""
+    """Return the sum of balls, 0 where there are none."""
     return sum(terms, ball(0))
 
 
 def along(point: Sequence[float] | Array, direction: Sequence[arb]) -> arb:
-    """The scalar product of exact numbers with balls."""
+    """Return the scalar product of exact numbers with balls."""
     return total(balls([a])[0] * c for a, c in zip(point, direction, strict=True) if a)

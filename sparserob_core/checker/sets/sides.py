@@ -1,4 +1,4 @@
-"""What is to be bounded on a cell: the facets of a flat set, or the directions of a cell of a curved one."""
+"""The rows to be bounded on a cell: the facets of a flat set, or the directions of a cell of a curved one."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True, eq=False)
 class Bounded:
-    """``(z'basis) x <= limit``, ``z (b,)``. An excess of at most `TOLERANCE` of the row's own ``unit`` counts as
-    none."""
+    """A constraint ``(z'basis) x <= limit``, ``z (b,)``. An excess of at most `TOLERANCE` times the row's own ``unit``
+    counts as none."""
 
     z: Array
     limit: float
@@ -30,35 +30,41 @@ class Bounded:
 
     @property
     def slack(self) -> float:
-        """What counts as none."""
+        """The largest excess that counts as none."""
         return TOLERANCE * self.unit
 
     @property
     def allowed(self) -> float:
-        """What is not to be exceeded, rounded down."""
+        """The limit with the slack, rounded down."""
         return float(np.nextafter(self.limit + self.slack, -np.inf))
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Curved:
-    """A curved set with the coordinates of its directions: ``c = z'normals``, ``normals (b, d)``; ``least``: the
-    least unit of a direction ``c (d,)``, along which the set reaches so far from its centre."""
+    """A curved set with the coordinates of its directions ``c = z'normals``, ``normals (b, d)``.
+
+    ``least`` returns the least unit of a direction ``c (d,)``, from the distance between the centre and the end of the
+    set along it.
+    """
 
     shape: Shape
     normals: Array
     least: Callable[[Array, float], float]
 
     def bounded(self, z: Array, inside: Sequence[arb]) -> Bounded:
-        """The constraint in one direction with a point ``inside`` the set as its limit. Its unit is the width of the
-        set from its centre to there, so that an excess is judged along the gauge."""
+        """Return the constraint in one direction, with a point ``inside`` the set as its limit.
+
+        Its unit is the distance along the direction from the centre of the set to the point, so that an excess is
+        judged along the gauge.
+        """
         c = self.balls(z)
         height, middle = total(a * x for a, x in zip(c, inside, strict=True)), along(self.shape.centre, c)
         unit = max(0.0, below(height - middle))
         return self._row(z, below(height), unit)
 
     def true(self, z: Array) -> Bounded:
-        """The constraint in one direction, with its true limit."""
+        """Return the constraint in one direction, with its true limit."""
         c = self.balls(z)
         height = self.shape.support(c)
         return self._row(z, below(height), max(0.0, below(height - along(self.shape.centre, c))))
@@ -67,20 +73,21 @@ class Curved:
         return Bounded(z, limit, max(unit, self.least(self.floats(z), unit)) or 1.0)
 
     def floats(self, z: Array) -> Array:
-        """``c (d,)`` rounded."""
+        """Return the direction ``c (d,)``, rounded."""
         return np.asarray(z @ self.normals, dtype=float)
 
     def balls(self, z: Array) -> list[arb]:
-        """``c (d,)``."""
+        """Return the direction ``c (d,)`` in balls."""
         return [dot(z, column) for column in self.normals.T]
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """The rows of one cell. A curved set has a cell of directions between ``low`` and ``high``, on the cube's surface:
-    ``c'x`` is convex in the direction and ``h(c) >= w'c`` for any point ``w`` of the set, so the corners of the cell,
-    with limit ``w'c``, stand for all of it.
+    """The rows of one cell; for a curved set the directions between ``low`` and ``high`` on the surface of a cube.
+
+    ``c'x`` is convex in the direction ``c``, and ``h(c) >= w'c`` for any point ``w`` of the set. Hence it suffices to
+    bound the corners of the cell, with the limit ``w'c``.
     """
 
     rows: Sequence[Bounded]
@@ -90,7 +97,7 @@ class Sides:
 
     @staticmethod
     def cell(curved: Curved, low: Array, high: Array) -> Sides:
-        """The cell of directions ``[low, high]`` of a curved set."""
+        """Return the rows of a curved set on the cell of directions ``[low, high]``."""
         w = curved.shape.point(curved.floats((low + high) / 2))
         free = np.flatnonzero(high > low)
         rows = []
@@ -102,19 +109,22 @@ class Sides:
 
     @property
     def centre(self) -> Bounded | None:
-        """The constraint in the middle of the cell of directions, with its true limit; ``None`` of a flat set."""
+        """The constraint in the middle of the cell of directions, with its true limit; ``None`` for a flat set."""
         if self.curved is None or self.low is None or self.high is None:
             return None
         return self.curved.true((self.low + self.high) / 2)
 
     @property
     def is_wide(self) -> bool:
-        """Whether it is a cell of more than one direction; on a line a curved set has two directions and no more."""
+        """True for a cell of more than one direction; on a line a curved set has two directions and no more."""
         return self.low is not None and self.high is not None and bool((self.high > self.low).any())
 
     def slopes(self, tops: Sequence[float]) -> Array:
-        """By how much bounds ``tops`` of the rows differ from end to end of every coordinate of the directions, in the
-        mean, ``(b,)``: what the cell loses, for in the middle the limit is the true one."""
+        """Return the mean difference of bounds ``tops`` between the two ends of every coordinate of the directions,
+        ``(b,)``.
+
+        It is what the bound on the cell loses, since the limit in the middle is the true one.
+        """
         assert self.low is not None and self.high is not None
         free, found = np.flatnonzero(self.high > self.low), np.zeros(self.low.size)
         corners = np.asarray(tops, dtype=float).reshape((2,) * free.size)
@@ -123,7 +133,7 @@ class Sides:
         return found
 
     def halves(self, slopes: Array) -> list[Sides]:
-        """Both halves of the cell of directions, across the coordinate of the largest of the ``slopes (b,)``."""
+        """Return both halves of the cell of directions, across the coordinate of the largest of the ``slopes (b,)``."""
         assert self.curved is not None and self.low is not None and self.high is not None
         axis = int(np.where(self.high > self.low, slopes, -np.inf).argmax())
         middle = (self.low[axis] + self.high[axis]) / 2

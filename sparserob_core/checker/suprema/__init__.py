@@ -1,1 +1,1 @@
-"""The worst cases that ``sparserob bound`` writes down, derived anew."""
+"""The verification of the worst cases that ``sparserob bound`` writes."""

@@ -1,5 +1,5 @@
-"""The two sides of every worst case, derived anew: one along its witness, the other over the continuum, on cells of the
-checker's own."""
+"""The two sides of every worst case, derived anew: one along its witness, the other over the continuum, on the
+checker's own cells."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-SHARE = 1e-3  # of a bound, the unit of a row: what is forgiven of it is a thousandth of what bounds are apart at best
-OUTPUT, STATE = "output", "state"  # what rows are called that no constraint asks for
+SHARE = 1e-3  # the unit of a row relative to its bound: the excused excess is a thousandth of the smallest gap
+OUTPUT, STATE = "output", "state"  # names of rows that belong to no constraint
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class SupremumRow:
-    """A row of the problem: ``direction'(x - r, u) <= wall`` in a window."""
+    """A row of the problem: ``direction'(x - r, u) <= wall`` in a window; the ``wall`` is ``None`` without a
+    constraint."""
 
     window: ConstraintWindow
     direction: Array
@@ -45,7 +46,7 @@ class SupremumRow:
 
 
 def check_suprema(case: Case) -> list[Finding]:
-    """One verdict per worst case that the certificate writes down, and one on whether these are the problem's."""
+    """Return one verdict per worst case in the certificate, and one on whether these are the rows of the problem."""
     from flint import ctx
 
     with ctx.workprec(precision_of(case)):
@@ -70,7 +71,7 @@ def _sense(asked: SupremumRow) -> str:
 
 
 def _asked(case: Case) -> list[SupremumRow]:
-    """The rows of the problem."""
+    """Return the rows of the problem: those of its constraints, or else of its outputs or states."""
     found = [
         SupremumRow(window, direction, b)
         for window in case.windows
@@ -87,7 +88,8 @@ def _asked(case: Case) -> list[SupremumRow]:
 
 
 def _matched(case: Case) -> list[tuple[SupremumRow, Mapping[str, Any]]]:
-    """The rows that are written, each with the one of the problem that it is about."""
+    """Return the rows of the certificate, each with the row of the problem that it is about; raise `Broken` unless both
+    agree."""
     left, found = _asked(case), []
     for entry in listed(case.certificate, "rows"):
         if not isinstance(entry, Mapping):
@@ -108,7 +110,7 @@ def _matched(case: Case) -> list[tuple[SupremumRow, Mapping[str, Any]]]:
 
 
 def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
-    """Both sides of one row; a sentence with the figures."""
+    """Return a sentence with both sides of one row; raise `Broken` or `Unchecked` where they are not shown."""
     sense = _sense(asked)
     if entry.get("sense") != sense:
         raise Broken(f"it is called {entry.get('sense')!r}, its direction is that of {sense}")
@@ -138,7 +140,8 @@ def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
 
 
 def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
-    """The wall must be the problem's, and what is left to it follow."""
+    """Raise `Broken` unless the wall is the problem's, and the margin is the difference between the wall and the
+    bound."""
     wall, margin = entry.get("wall"), entry.get("margin")
     if asked.wall is None:
         if wall is not None or margin is not None:
@@ -156,7 +159,7 @@ def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: flo
 
 
 def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: FollowedRow) -> tuple[float, float]:
-    """The value of the row along its witness, which must be one of the problem's, between bounds."""
+    """Return a lower and an upper bound of the value of the row along its witness, which must be admissible."""
     problem, window, time = case.problem, asked.window, number(entry, "time")
     parameter = numbers(entry.get("parameter"), "parameter")
     deviation = shaped(entry, "deviation", (problem.system.states,))
@@ -168,7 +171,7 @@ def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: Fo
     changes, signal = _signal(case, entry)
     low, high = row.beside(time, time)
     delivered = case.sources.delivered_at(parameter.tolist())
-    if delivered is not None:  # the worst errors are enclosed, whatever they are
+    if delivered is not None:  # an enclosure of the worst errors
         errors = delivered.added(window.split(asked.direction)[0], time)
         slack = 2.0 * HALF_ULP * (abs(low) + abs(high) + abs(errors[1]))
         low, high = low + errors[0] - slack, high + errors[1] + slack
@@ -183,7 +186,7 @@ def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: Fo
 
 
 def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
-    """The disturbance of a witness, which must be admissible, and when it changes."""
+    """Return the times at which the disturbance of a witness changes, and the disturbance, which must be admissible."""
     problem = case.problem
     changes = numbers(entry.get("changes"), "changes")
     if changes.ndim != 1 or changes.size < 2 or not (np.diff(changes) > 0.0).all():
@@ -209,8 +212,10 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
 
 
 def _following(case: Case, changes: Array, signal: Array | None) -> tuple[Case, object]:
-    """The case whose grid has the ``changes`` of a signal, and the signal on the pieces of that grid: a measurable one
-    that is constant between them is one of a dictionary with these pieces."""
+    """Return the case whose grid has the ``changes`` of a signal, and the signal on the pieces of that grid.
+
+    A measurable signal that is constant between the changes is one of a dictionary with these pieces.
+    """
     if signal is None:
         return case, None
     if case.measurable:
@@ -221,13 +226,14 @@ def _following(case: Case, changes: Array, signal: Array | None) -> tuple[Case, 
 
 
 def _proven_in_cells(case: Case, asked: SupremumRow, limit: float) -> int:
-    """As `_proven`, over the parameters and pieces of the system, in cells of times and parameters."""
+    """Show that a row is at most the ``limit`` over the parameters and phases of the system; return the number of
+    cells."""
     window = asked.window
     alone = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))
     found = alone.seen.basis
     assert found is not None
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
-    unit = SHARE * abs(limit) or 1.0  # what counts as no violation is then taken off the limit, and is rounding of it
+    unit = SHARE * abs(limit) or 1.0  # the excused excess is subtracted from the limit, of which it is a rounding error
     bounded = Bounded(z[0], float(np.nextafter(limit - TOLERANCE * unit * OUTWARD, -np.inf)), unit)
     bound = case.problem.system.parameters
     box = None if bound is None else bound.bounding_box()
