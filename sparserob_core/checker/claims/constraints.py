@@ -331,12 +331,14 @@ def of_fixed(case: Case) -> str:
 def _reached(case: Case, state: int) -> bool:
     """Return whether an uncertain entry, a disturbance or the choice of an initial state may reach a state.
 
-    States are linked by the entries of ``A`` that are other than 0 at some time and parameter."""
+    States are linked by the entries of ``A`` that are other than 0 at some time and parameter. Columns of ``E`` count
+    as entries where the middle of the disturbance is other than 0."""
     reaching = _linked(case, state)
     rows = sorted(reaching)
     there, changed = case.flows.links
     d, m = case.problem.system.states, case.flows.plant.driven
-    uncertain = bool(changed[rows, : d + m].any())
+    acting = [*range(d + m), *(d + m + int(w) for w in np.flatnonzero(case.disturbances.middle))]
+    uncertain = bool(changed[np.ix_(rows, acting)].any())
     bound = case.problem.disturbance
     free = [] if bound is None else [w for w, axis in enumerate(np.eye(bound.dimension)) if _is_wide(bound, axis)]
     pushed = bool(there[np.ix_(rows, [d + m + w for w in free])].any())

@@ -21,6 +21,7 @@ from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.known import known
+from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
     if nu.shape != (0 if case.answering else len(case.equalities),):  # under feedback they are constraints
         raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
     bound = case.problem.system.parameters
-    middle = [] if bound is None else bound.interior_point().tolist()
+    middle = [] if bound is None else nominal_point(bound).tolist()  # where the middle of the disturbance is followed
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
         if case.followed.are_best:

@@ -56,3 +56,33 @@ def test_a_state_that_a_known_push_moves_does_not_rest() -> None:
         ((off, _),) = constraints.missed(case)
         assert off.contains(0) and not constraints._rests(case, 0)
         assert constraints._rests(case_of("beside one that varies", decision=[[0.0] * 4]), 1)
+
+
+@pytest.mark.parametrize("push", [0.0, 1.0])
+def test_a_known_push_through_an_uncertain_entry_is_uncertain(push: float) -> None:
+    """``x' = u + (1 + p) w`` with ``w = 1`` ends at ``1.5 + p``: no value is fixed for every ``p``."""
+    system = sr.LinearSystem([[0.0]], [[1.0]], lambda p: np.array([[1.0 + p[0]]]), Box([-0.5], [0.5]))
+    problem = sr.OptimalControlProblem(
+        system=system, horizon=1.0, initial_state=[0.0], control=Box([-1.0], [1.0]),
+        disturbance=Box([push], [push]), terminal=[Equality(np.array([0.5 + push]))],
+    )  # fmt: skip
+    figures = {"cost": 0.5, "lower_bound": 0.5, "gap_tolerance": 1e-3}
+    held = {"multipliers": {"constraints": [], "equalities": [-1.0]}}
+    case = Case(
+        problem, PIECES, PIECES, {"format": 1, "status": "certified", "decision": [[0.5] * 4], **figures, **held}
+    )
+    assert verdicts(case)["equalities"] == ("not checked" if push else "holds")
+
+
+def test_a_row_of_a_fixed_state_is_that_of_the_parameter_at_which_known_pushes_are() -> None:
+    """In a triangle of parameters the middle of its box is another point than the one that is farthest inside."""
+    triangle = sr.Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.0, 0.0, 1.0])
+    system = sr.LinearSystem([[0.0]], lambda p: np.array([[1.0 + p[0]]]), lambda p: np.array([[1.0 + p[0]]]), triangle)
+    problem = sr.OptimalControlProblem(
+        system=system, horizon=1.0, initial_state=[0.0], control=Box([-1.0], [1.0]),
+        disturbance=Box([1.0], [1.0]), terminal=[Equality(np.array([2.95]))],
+    )  # fmt: skip
+    # at p = 1/2 the state ends at 1.5 (1 + u) <= 3, so that 2.95 is reached there; at p = 0.29 it is at most 2.59
+    held = {"multipliers": {"constraints": [], "equalities": [-1.0]}}
+    case = Case(problem, PIECES, PIECES, {"format": 1, "status": "infeasible", **held})
+    assert verdicts(case) == {"infeasibility": "fails"}
