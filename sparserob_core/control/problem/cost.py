@@ -269,11 +269,10 @@ def _numbers(path: str, given: object, shape: tuple[int, ...], expected: str) ->
 
 
 def _semidefinite(path: str, Q: Array) -> Array:
-    """Return a symmetric matrix that is positive semidefinite in exact arithmetic; raise `InputError` for other
-    matrices.
+    """Return a symmetric positive semidefinite matrix; raise `InputError` for other matrices.
 
-    A matrix that is semidefinite up to rounding is made semidefinite by a small addition to its diagonal. The
-    independent checker verifies the property in fractions.
+    A matrix that is semidefinite up to rounding is made so by a small addition to its diagonal, because the checker
+    shows the property in fractions.
     """
     form = require_convex(path, Q, Q.shape[0])
     Q, diagonal = form.toarray(), form.diagonal()

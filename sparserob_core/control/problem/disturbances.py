@@ -39,7 +39,7 @@ Breakpoints: TypeAlias = tuple[Array | None, ...]
 @final
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """One of several disturbances ``w_i`` of a problem, each with its own set, matrix, class, window of time and grid.
+    """A disturbance of a problem that has several of them, with its own set, matrix, class, window of time and grid.
 
     Parameters
     ----------
