@@ -18,7 +18,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-MOST_VALUES = 100_000_000  # entries of the largest table of values, 0.8 GB; ten times more exceeds common memories
+MOST_VALUES = 100_000_000  # entries of the largest table of values that is made (0.8 GB)
 
 
 @dataclass(frozen=True, eq=False, init=False)

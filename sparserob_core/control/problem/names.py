@@ -55,14 +55,14 @@ class Corners:
 
         Parameters
         ----------
-        directions : array (q, d)
-            The directions in the states.
+        directions : array (q, n)
+            The directions in the ``n`` states of the larger problem.
 
         Returns
         -------
         numbers : array (k,)
             The index of the direction to which each row belongs.
-        rows : array (k, d)
+        rows : array (k, n)
             The directions with their components along the states that parameters add. A direction that no parameter
             changes occurs once.
         """
@@ -88,19 +88,20 @@ class Corners:
         return [*range(d), *range(size, states)]
 
     def stated(self, direction: Array, states: Array) -> Array:
-        """Return trajectories ``(n, T)`` of the states of the user, at the corner to which a direction belongs.
+        """Return trajectories of the larger problem, of which the first ``d`` states are those at the corner of a
+        direction.
 
         Parameters
         ----------
-        direction : array (size,)
-            The direction, whose nearest corner is used.
+        direction : array (n,)
+            The direction in the ``n`` states of the larger problem; the corner that fits it best is used.
         states : array (n, T)
-            The trajectories of all states of the larger problem.
+            The trajectories of these states at ``T`` times.
 
         Returns
         -------
         array (n, T)
-            The trajectories, of which the first ``d`` are those at the corner.
+            The trajectories; where there are no corners, they are returned as they are.
         """
         if not self.rows:
             return states
@@ -114,8 +115,8 @@ class Corners:
         Returns
         -------
         str or None
-            The parameters in words. The text is empty where the direction belongs to all corners. The value is ``None``
-            where it belongs to no corner.
+            The parameters whose value the direction determines, in words; empty where it determines none. ``None``
+            where the direction belongs to no corner.
         """
         if not self.rows:
             return None
