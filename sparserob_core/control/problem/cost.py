@@ -345,8 +345,7 @@ def _is_nested(given: npt.ArrayLike) -> bool:
 
 
 def _rows(given: npt.ArrayLike, controls: int, horizon: float) -> Array:
-    """Return rows ``(r, 1 + m)`` of a time and the weights from then on; raise `InputError` where they are unsuitable.
-    """
+    """Return rows ``(r, 1 + m)`` of a time and the weights from then on; raise `InputError`."""
     expected = f"rows of {1 + controls} numbers, a time and a weight for every control"
     try:
         rows = np.array(given, dtype=float)
@@ -397,8 +396,7 @@ def counted(weights: object) -> Array:
 
 
 def weights_between(weights: object, begin: float, horizon: float) -> Array:
-    """Return the weights from the time ``begin`` on, for the duration ``horizon``, with times counted from ``begin``.
-    """
+    """Return the weights from the time ``begin`` on, for the duration ``horizon``; times count from ``begin``."""
     rows = np.asarray(weights, dtype=float)
     if rows.ndim == 1:
         return rows

@@ -259,8 +259,7 @@ class Dictionary:
 
     @shaped
     def at(self, pieces: Int[np.ndarray, "*k"]) -> Float[Array, "*nk"]:
-        """Return the values ``(N, ...)`` of the functions on some of the intervals, given by their indices ``(...,)``.
-        """
+        """Return the values ``(N, ...)`` of the functions on the intervals with given indices ``(...,)``."""
         if self._owner is not None:
             answer = np.zeros((self.functions, pieces.size))
             answer[self._owner[pieces.ravel()], np.arange(pieces.size)] = 1.0
@@ -368,8 +367,7 @@ def _dependent(values: Array) -> InputError:
 
 
 def _owner(values: Array) -> np.ndarray | None:
-    """Return the function ``(K,)`` that is 1 on each interval, or ``None`` where the functions are no such indicators.
-    """
+    """Return the function ``(K,)`` that is 1 on each interval; ``None`` where the functions are no indicators."""
     owner: np.ndarray = values.argmax(axis=0)
     ones = values[owner, np.arange(owner.size)] == 1.0
     if not ones.all() or np.count_nonzero(values) != owner.size or np.unique(owner).size != values.shape[0]:

@@ -304,8 +304,7 @@ class ExpressionMatrix:
         return np.array([[entry(values) for entry in row] for row in self.entries])
 
     def _with_defined(self, values: dict[str, Value]) -> dict[str, Value]:
-        """Return the values with those of the definitions where an entry uses any; each definition is evaluated once.
-        """
+        """Return the values with those of the definitions, where an entry uses any; each one is evaluated once."""
         if any(name in self._defined_names for row in self.entries for entry in row for name in entry.names):
             for name, expression in self.defined:
                 values[name] = expression(values)
@@ -331,8 +330,7 @@ Entries: TypeAlias = "Array | Callable[..., object] | ExpressionMatrix"
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """A matrix that consists of arrays and functions of the parameters, along the ``axis`` 0 (one above another) or 1.
-    """
+    """A matrix of arrays and functions of the parameters, one above another (``axis`` 0) or in a row (1)."""
 
     parts: tuple[Entries, ...]
     axis: int

@@ -190,8 +190,7 @@ class Phase:
         return self._through(partial(_with_parameter, parameter), domain, (TIME,), self.begin, self.until)
 
     def during(self, time: float, parameters: ConvexSet | None) -> Phase:
-        """Return the entries of a timed phase at one ``time``, as a phase whose arguments are the ``parameters`` alone.
-        """
+        """Return a timed phase at one ``time``, as a phase whose arguments are the ``parameters`` alone."""
         return self._through(partial(_at_time, time), parameters, self.names[1:], timed=False)
 
     def in_time(self, until: float) -> Phase:
@@ -429,8 +428,7 @@ class Phase:
         self._values("c", self.probes)
 
     def _matrix(self, name: str, value: object) -> _Entry:
-        """Return a matrix as given by the user as a checked array, as expressions or as a function; raise `InputError`.
-        """
+        """Return a matrix of the user as a checked array, as expressions or as a function; raise `InputError`."""
         if isinstance(value, ExpressionMatrix):
             return (
                 value(np.zeros(len(value.names))).astype(float) if value.is_constant else self._known_names(name, value)
@@ -499,7 +497,7 @@ class Phase:
         function = self._entry(name)
         assert callable(function)
         try:
-            with np.errstate(all="ignore"):  # what is not finite is reported with its parameter
+            with np.errstate(all="ignore"):  # entries that are not finite are reported with their arguments
                 return np.asarray(function(parameter), dtype=float)
         except (TypeError, ValueError, ArithmeticError, IndexError, KeyError, AttributeError) as error:
             raise InputError(

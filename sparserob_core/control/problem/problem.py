@@ -75,11 +75,11 @@ class OptimalControlProblem(Term):
 
     Minimise ``sum_i weights_i int_0^T |u_i(t)| dt``, or another `Cost`, subject to
 
-    * ``x' = A(p) x + B(p) u + E(p) w + c(p)`` and ``x(0)`` in ``initial_state + initial_set``,
-    * ``u(t)`` in ``control``,
-    * ``x(t)`` in every set of ``path`` during its window, or ``(x(t), u(t))`` in that of a `MixedConstraint`,
-    * ``x(T)`` in every set of ``terminal``, where ``T = horizon``,
-    * the bounds of every `IntegralConstraint` in ``integral``.
+    * ``x' = A(p) x + B(p) u + E(p) w + c(p)`` with ``x(0)`` in ``initial_state + initial_set``
+    * ``u(t)`` in ``control`` at all times
+    * ``x(t)`` in every set of ``path`` during its window; a `MixedConstraint` bounds ``x(t)`` and ``u(t)`` together
+    * ``x(T)`` in every set of ``terminal``, where ``T = horizon``
+    * the integrals of state and control within the bounds of every `IntegralConstraint`
 
     The state is ``x (d,)``, the control ``u (m,)``, the disturbance ``w (mw,)``, the parameter ``p (nu,)``. Times are
     in the time unit of the system.
@@ -154,9 +154,9 @@ class OptimalControlProblem(Term):
     stay inside of the set by the share `WITHIN`, so that a proof up to a tolerance holds for ever. A coordinate with a
     single initial value is fixed at the end, up to rounding.
 
-    Errors of execution. The delivered control differs from the commanded control by at most this share of the command,
-    as any function of time. A control that is commanded to be 0 is delivered exactly. Every constraint on the state
-    holds nonetheless. The set of the control, the set of its steps, the cost, and the control in mixed constraints and
+    Errors of execution. The delivered control differs from the commanded control by at most this share of the command.
+    The difference may be any function of time, and is 0 where the command is 0. Every constraint on the state holds
+    nonetheless. The set of the control, the set of its steps, the cost, and the control in mixed constraints and
     integrals refer to the command.
 
     Fields after construction. ``weights`` is ``(m,)``, or ``(r, 1 + m)`` where rows are given. ``path``, ``terminal``
@@ -200,7 +200,7 @@ class OptimalControlProblem(Term):
     control_step: ConvexSet | None = field(default=None, metadata=CONTROLS)
     names: Names = field(default=UNNAMED, metadata=UNITLESS)
     cost: Cost = field(default=Cost(), metadata=TERMS)
-    disturbances: Sequence[Disturbance] = field(default=(), metadata=UNITLESS)  # none after construction
+    disturbances: Sequence[Disturbance] = field(default=(), metadata=UNITLESS)  # empty after construction
     measurements: Measurements | None = field(default=None, metadata=TERMS)
     repeat: bool | Repeating = field(default=False, metadata=UNITLESS)
     execution: npt.ArrayLike | None = field(default=None, metadata=UNITLESS)

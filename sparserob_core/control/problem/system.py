@@ -302,8 +302,7 @@ class System:
 
     @cached_property
     def _depends(self) -> Dependence | int | None:
-        """The `dependence` or the `powers`; ``None`` where the system does not depend on the time or has no parameters.
-        """
+        """The `dependence` or the `powers`; ``None`` for a system without time or without parameters in its entries."""
         if not self.varies or self.parameters is None:
             return None
         return dependence([[phase.entry(name) for name in PARTS] for phase in self.phases], *self.deviations)
@@ -492,14 +491,14 @@ class LinearSystem(System):
 class SwitchedSystem(System):
     """A system of several linear systems that follow one another at known times.
 
-    Each piece has its own ``A``, ``B``, ``E`` and ``c``. All pieces have the same numbers of states, controls and
-    disturbances. The state is continuous at the switches.
+    Each of these phases has its own ``A``, ``B``, ``E`` and ``c``. All phases have the same numbers of states, controls
+    and disturbances. The state is continuous at the switches.
 
     Parameters
     ----------
     pieces : sequence of pairs (float, LinearSystem)
-        Each piece as the time until which it holds, and its system. The first piece begins at time 0; the last time is
-        the horizon. All pieces share their parameters; a piece without parameters is known.
+        Each phase as the time until which it holds, and its system. The first phase begins at time 0; the last time is
+        the horizon. All phases share their parameters; a phase without parameters is known.
     delay : float, default 0.0
         The time by which the control acts later than it is commanded. A control acts through the ``B`` of the time at
         which it acts.
@@ -507,8 +506,8 @@ class SwitchedSystem(System):
     Raises
     ------
     InputError
-        If there is no piece, if the times do not increase, if a piece is not a `LinearSystem` or has its own delay, or
-        if pieces differ in their parameters or in their numbers of states, controls or disturbances.
+        If there is no phase, if the times do not increase, if a phase is not a `LinearSystem` or has its own delay, or
+        if phases differ in their parameters or in their numbers of states, controls or disturbances.
 
     Examples
     --------
@@ -744,8 +743,7 @@ class _Uncertain:
 
     @staticmethod
     def of(parameters: ConvexSet | None, names: Sequence[str]) -> _Uncertain:
-        """Return the box and the names; raise `InputError` for a set that is no bounded box, or for unsuitable names.
-        """
+        """Return the box and the names; raise `InputError` for another set or for unsuitable names."""
         box = None if parameters is None else boxed(parameters)
         count = 0 if box is None else box.dimension
         given = tuple(names) or tuple(f"p{i + 1}" for i in range(count))

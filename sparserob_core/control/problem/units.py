@@ -31,7 +31,7 @@ def power_of_two(sizes: Array) -> Array:
         The powers of two; 1 where the size is 0 or infinite.
     """
     usable = np.isfinite(sizes) & (sizes > 0.0)
-    mantissa, exponent = np.frexp(np.where(usable, sizes, 1.0))  # in [1/2, 1)
+    mantissa, exponent = np.frexp(np.where(usable, sizes, 1.0))  # the mantissa is in [1/2, 1)
     lower = np.log2(mantissa) < OFFSET - 1.0
     return np.where(usable, np.ldexp(1.0, exponent - lower), 1.0)
 

@@ -454,8 +454,7 @@ class Product(ConvexSet):
 
     @shaped
     def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-        """Return an outward normal ``(..., d)``: a normal of the part with the largest gauge, and 0 along the others.
-        """
+        """Return an outward normal ``(..., d)``: that of the part with the largest gauge, and 0 along the others."""
         pairs = self.split(points)
         first = np.stack([part.gauge(own) for part, own in pairs]).argmax(axis=0)[..., None]
         return np.concatenate([np.where(first == i, part.normal(own), 0.0) for i, (part, own) in enumerate(pairs)], -1)

@@ -139,8 +139,7 @@ class Accumulated(PathConstraint):
 
 
 def _limits(where: str, entry: IntegralConstraint, count: int) -> tuple[Array, Array]:
-    """Return the lower and the upper bounds ``(r,)`` of an integral, infinite where there is none; raise `InputError`.
-    """
+    """Return the lower and upper bounds ``(r,)`` of an integral, infinite where there is none; raise `InputError`."""
     sides = []
     for name, given, none in (("lower", entry.lower, -np.inf), ("upper", entry.upper, np.inf)):
         filled = [none if v is None else v for v in given] if isinstance(given, list | tuple) else given
