@@ -136,8 +136,7 @@ class Cost(Term):
 
     @property
     def terms(self) -> tuple[Quadratic | None, Quadratic | None, Quadratic | None]:
-        """The quadratic terms of the state, the control and the final state, of a `checked` cost; ``None`` for an
-        absent term."""
+        """The quadratic terms of state, control and final state, of a `checked` cost; ``None`` where one is absent."""
         found = (self.state, self.control, self.final)
         assert all(term is None or isinstance(term, Quadratic) for term in found)
         return found  # type: ignore[return-value]
@@ -366,8 +365,10 @@ def _rows(given: npt.ArrayLike, controls: int, horizon: float) -> Array:
 
 
 def by_time(weights: object) -> tuple[Array, Array]:
-    """Return the times ``(r,)`` from which rows of `checked_weights` hold, the first of them 0, and the weights
-    ``(r, m)``."""
+    """Return the times ``(r,)`` from which weights hold, the first of them 0, and the weights ``(r, m)``.
+
+    The argument is the result of `checked_weights`.
+    """
     rows = np.asarray(weights, dtype=float)
     return (np.zeros(1), rows[None]) if rows.ndim == 1 else (rows[:, 0], rows[:, 1:])
 

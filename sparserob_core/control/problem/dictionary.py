@@ -269,8 +269,7 @@ class Dictionary:
         return np.asarray(self.values[:, pieces])
 
     def merged(self) -> Dictionary:
-        """Return the same functions on the fewest intervals: adjacent intervals on which no function changes become
-        one."""
+        """Return the same functions on the fewest intervals: those between which no function changes are joined."""
         if self.is_indicators:
             return self
         keep = np.concatenate([[True], self.changes])
@@ -304,8 +303,10 @@ class Dictionary:
 
 
 class DictionaryFactory(ABC):
-    """A dictionary that a config can name, which is built when the horizon is known; its options are the fields of the
-    class."""
+    """A dictionary that a config can name; its options are the fields of the class.
+
+    The dictionary is built when the horizon is known.
+    """
 
     @abstractmethod
     def build(self, horizon: float) -> Dictionary:

@@ -231,8 +231,7 @@ def _nothing(dimension: int) -> ConvexSet:
 
 
 def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:
-    """Return the times between which a disturbance acts; raise `InputError` where they are no window within the
-    horizon."""
+    """Return the times between which a disturbance acts; raise `InputError` for a window outside of the horizon."""
     start, stop = float(one.start), horizon if one.stop is None else float(one.stop)
     if not (0.0 <= start <= stop - SAME_TIME * horizon and stop <= horizon):
         raise InputError(
@@ -277,8 +276,7 @@ def _columns(phase: Phase) -> Entries:
 
 
 def _checked(where: str, bound: object, phase: Phase) -> ConvexSet:
-    """Return the set of a disturbance; raise `InputError` where it is no bounded set with one coordinate per column of
-    ``E``."""
+    """Return the set of a disturbance; raise `InputError` where it is unbounded or does not fit ``E``."""
     if not isinstance(bound, ConvexSet):
         raise InputError(path=where, expected="a convex set, such as Box", got=f"{type(bound).__name__}")
     if bound.dimension != phase.disturbances:

@@ -114,8 +114,7 @@ class _Parser:
         return Expression(self.text, frozenset(self.seen), evaluation)
 
     def parse(self, node: ast.expr, depth: int) -> Evaluation:
-        """Return the evaluation of a node at a depth of the tree; raise `InputError` for a node that is not on the
-        whitelist."""
+        """Return the evaluation of a node; raise `InputError` for a node that is too deep or not on the whitelist."""
         if depth > _DEPTH:
             raise self.fault(f"nested more than {_DEPTH} deep")
         if isinstance(node, ast.Constant):
@@ -298,8 +297,10 @@ class ExpressionMatrix:
         return not any(entry.names for row in self.entries for entry in row)
 
     def __call__(self, p: Iterable[Value]) -> Value:
-        """Return the matrix at one parameter vector: floats, or an object array where ``p`` holds other things than
-        numbers."""
+        """Return the matrix at one parameter vector ``p (nu,)``.
+
+        It is an array of floats, or an object array where ``p`` holds other things than numbers.
+        """
         values = self._with_defined(dict(zip(self.names, p, strict=True)))
         return np.array([[entry(values) for entry in row] for row in self.entries])
 
@@ -357,8 +358,7 @@ def above(upper: Entries, lower: Entries) -> Entries:
 
 
 def _joined(one: Entries, other: Entries, axis: int) -> Entries:
-    """Return two matrices as one along an axis: an array, expressions, or a function where one of the two is a
-    function."""
+    """Return two matrices as one along an axis: as an array, as expressions, or as a function."""
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         return np.concatenate([one, other], axis)
     of = next((part for part in (one, other) if isinstance(part, ExpressionMatrix)), None)

@@ -88,8 +88,7 @@ class Corners:
         return [*range(d), *range(size, states)]
 
     def stated(self, direction: Array, states: Array) -> Array:
-        """Return trajectories of the larger problem, of which the first ``d`` states are those at the corner of a
-        direction.
+        """Return trajectories of which the first ``d`` states are those at the corner of a direction.
 
         Parameters
         ----------
@@ -251,8 +250,7 @@ class Names:
 
     @property
     def effort(self) -> str:
-        """The unit of the integral of a control over time, where all controls have the same unit; empty where it is not
-        known.
+        """The unit of the integral of a control over time; empty where it is not known or controls differ in unit.
 
         The time of a rate cancels: ``l/s`` over ``s`` is ``l``, and ``m/s^2`` over ``s`` is ``m/s``.
         """

@@ -114,13 +114,15 @@ class Phase:
 
     @property
     def stated(self) -> Phase:
-        """The phase in the units of the user, which is the phase itself."""
+        """The phase in the units of the user, where the phase keeps them; here the phase itself."""
         return self
 
     @cached_property
     def forced(self) -> Phase:
-        """The phase whose drift is one more column of ``B``, with a control that is always 1; the phase itself without
-        a drift."""
+        """The phase whose drift is the last column of ``B``, with a control that is always 1.
+
+        It is the phase itself without a drift.
+        """
         if self.c is None:
             return self
         return replace(self, B=beside(self._entry("B"), self._entry("c")), c=None)
@@ -194,8 +196,10 @@ class Phase:
         return self._through(partial(_at_time, time), parameters, self.names[1:], timed=False)
 
     def in_time(self, until: float) -> Phase:
-        """Return the phase as a timed phase that ends at ``until``; raise `InputError` where the domain is no bounded
-        box."""
+        """Return the phase as a timed phase that ends at ``until``.
+
+        Raises `InputError` where the domain is no bounded box.
+        """
         domain = and_time(self.begin, until, None if self.domain is None else boxed(self.domain))
         return self._through(_without_time, domain, (TIME, *self.names), self.begin, until)
 
@@ -370,14 +374,15 @@ class Phase:
 
     @shaped
     def describe(self, arguments: Float[Array, " n"]) -> str:
-        """Return arguments in words, such as ``p1 = 0.1, p2 = -0.1``; a shorter vector is taken for the last of the
-        arguments."""
+        """Return arguments in words, such as ``p1 = 0.1, p2 = -0.1``.
+
+        A vector that is shorter than ``n`` holds the last of the arguments.
+        """
         names = self.names[len(self.names) - arguments.size :]
         return ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, arguments, strict=True))
 
     def entry(self, name: str) -> _Entry | None:
-        """Return the matrix ``A``, ``B``, ``E`` or ``c (d, 1)`` as an array, as expressions, or as a function of the
-        arguments.
+        """Return ``A``, ``B``, ``E`` or ``c (d, 1)`` as an array, as expressions, or as a function of the arguments.
 
         The value is ``None`` for the drift of a phase without a drift.
         """
@@ -389,8 +394,7 @@ class Phase:
         return entry
 
     def _check_domain(self) -> None:
-        """Keep the names of the arguments; raise `InputError` where the domain is no bounded set, or the names do not
-        fit it."""
+        """Keep the names of the arguments; raise `InputError` where the domain or the names are unsuitable."""
         given: object = self.domain
         if not isinstance(given, ConvexSet | None):
             raise InputError(
@@ -409,8 +413,7 @@ class Phase:
         object.__setattr__(self, "names", names)
 
     def _check_drift(self, d: int) -> None:
-        """Keep the drift as a matrix of one column; raise `InputError` where it has not one number for each of ``d``
-        states."""
+        """Keep the drift as a matrix of one column; raise `InputError` where it does not fit ``d`` states."""
         given = self.c
         if callable(given) and not isinstance(given, ExpressionMatrix | _AsColumn):
             given = _AsColumn(given)
@@ -483,8 +486,7 @@ class Phase:
 
     @property
     def probes(self) -> Array:
-        """The arguments ``(k, n)`` at which the entries are evaluated for checks: a point inside the domain and support
-        points."""
+        """The arguments ``(k, n)`` at which entries are evaluated for checks: an interior point and support points."""
         if self.domain is None:
             return np.empty((1, 0))
         axes = np.eye(self.count)
@@ -492,8 +494,7 @@ class Phase:
         return np.vstack([self.domain.interior_point(), points])
 
     def _called(self, name: str, parameter: Array) -> Array:
-        """Return the matrix that a function returns at one argument ``(n,)``; raise `InputError` where the function
-        fails."""
+        """Return the value of a function at one argument ``(n,)``; raise `InputError` where the function fails."""
         function = self._entry(name)
         assert callable(function)
         try:
@@ -506,8 +507,7 @@ class Phase:
 
     @shaped
     def _values(self, name: str, points: Float[Array, "k n"]) -> Float[Array, "k rows columns"]:
-        """Return a matrix at several points ``(k, n)``; raise `InputError` where its shape changes or an entry is not
-        finite."""
+        """Return a matrix at points ``(k, n)``; raise `InputError` where its shape changes or it is not finite."""
         entry = self._entry(name)
         if isinstance(entry, np.ndarray):
             return np.broadcast_to(entry, (len(points), *entry.shape)) if len(points) != 1 else _still(entry[None])

@@ -63,8 +63,10 @@ SYSTEM = {
 
 
 def _pieces(times: Array, begin: float, horizon: float) -> Array:
-    """Return breakpoints from the time ``begin`` on, counted from there; the first interval is the rest of a present
-    one."""
+    """Return breakpoints from the time ``begin`` on, counted from there.
+
+    The first interval is the rest of the interval that contains ``begin``.
+    """
     later = [time - begin for time in times.tolist() if not over(time, begin, horizon)]
     return np.array([0.0, *later[:-1], horizon])
 
@@ -256,8 +258,7 @@ class OptimalControlProblem(Term):
 
     @property
     def measurable(self) -> ConvexSet | None:
-        """The set of the measurable disturbances, which is 0 along the columns of others; ``None`` where there are
-        none."""
+        """The set of the measurable disturbances, 0 along the columns of others; ``None`` where there are none."""
         return apart(self.disturbance, self.disturbance_class, "measurable")
 
     @property
@@ -267,8 +268,7 @@ class OptimalControlProblem(Term):
 
     @property
     def sums(self) -> dict[str, tuple[Window, ...]]:
-        """The constraints that accumulate state and control over time, by the name of their field; fields without any
-        are left out."""
+        """The constraints that accumulate state and control over time, by their field, where there are any."""
         return {name: entries for name, entries in self.lists.items() if name != "path" and entries}
 
     def called(self, name: str) -> list[str]:
@@ -403,8 +403,7 @@ class OptimalControlProblem(Term):
         return state
 
     def _deviations(self) -> ConvexSet | None:
-        """Return the set of initial deviations, or ``None`` where it holds 0 alone; raise `InputError` where 0 is not
-        in it."""
+        """Return the set of initial deviations, or ``None`` for 0 alone; raise `InputError` where 0 is not in it."""
         if self.initial_set is None:
             return None
         bound = checked_set("initial_set", self.initial_set, self.system.states, "states", bounded=True)
@@ -419,8 +418,7 @@ class OptimalControlProblem(Term):
         return bound if size > 0.0 else None
 
     def prices(self, breakpoints: Array) -> Array:
-        """Return the cost ``(m, K)`` of an absolute value of 1 of each control on each interval between breakpoints
-        ``(K + 1,)``.
+        """Return the cost ``(m, K)`` of each control per absolute value on the intervals of ``breakpoints (K + 1,)``.
 
         The cost is the integral of the weight, which is exact, times the factor of the L1 norm.
         """
@@ -428,8 +426,10 @@ class OptimalControlProblem(Term):
 
     @property
     def counts(self) -> Array:
-        """The number ``(m,)`` by which each control counts per time that it is active: its weight, or 1 where weights
-        change."""
+        """The number ``(m,)`` by which each control counts per active time.
+
+        It is the weight of the control, or 1 where weights change with time.
+        """
         return counted(self.weights)
 
     @property
@@ -478,8 +478,7 @@ class OptimalControlProblem(Term):
         return control
 
     def _check_disturbance(self) -> None:
-        """Raise `InputError` where the disturbance, its class and its breakpoints do not fit together, or not the
-        system."""
+        """Raise `InputError` where the disturbance, its class, its breakpoints and the system do not fit."""
         kinds, bound = self.disturbance_class, self.disturbance
         if isinstance(kinds, tuple) and isinstance(bound, Product) and len(bound.parts) == len(kinds):
             known = set(kinds) == {"piecewise_constant", "measurable"}
@@ -564,8 +563,7 @@ class OptimalControlProblem(Term):
         self._set("terminal", (*self.terminal, *ends))
 
     def _terminal(self) -> list[ConvexSet | Equality]:
-        """Return the checked sets and equalities of the final state, without those that restrict nothing; raise
-        `InputError`."""
+        """Return the checked sets and equalities of the final state that restrict anything; raise `InputError`."""
         kept: list[ConvexSet | Equality] = []
         for i, item in enumerate(_listed("terminal", self.terminal)):
             if not isinstance(item, Equality):

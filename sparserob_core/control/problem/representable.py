@@ -22,8 +22,7 @@ KEYS = {"initial_set": "initial_state", "stop": "to", "start": "from"}
 
 
 def require_representable(problem: OptimalControlProblem) -> None:
-    """Raise `InputError` for a problem with a number larger than `LARGEST`, or with a state that grows by more than
-    this.
+    """Raise `InputError` for a problem with a number larger than `LARGEST`, or a state that grows by more.
 
     The growth is ``e^(a T)`` for a phase of duration ``T``, where ``a`` is the largest real part of an eigenvalue of
     the phase at its `probes`. The growth of a system whose entries depend on the time is not checked.

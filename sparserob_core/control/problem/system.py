@@ -26,8 +26,7 @@ InTime: TypeAlias = tuple[
     Sequence[Sequence[str | float]] | None,
     Sequence[str | float] | None,
 ]
-"""The matrices ``A``, ``B``, ``E`` and ``c`` of one phase, whose entries are numbers or expressions in the time ``t``.
-"""
+"""The matrices ``A``, ``B``, ``E`` and ``c`` of one phase, whose entries are numbers or expressions in ``t``."""
 PERIODIC = 1e-9
 """The largest relative difference between the values of one entry at both ends of a period.
 
@@ -40,8 +39,7 @@ LOOKS = 65  # times per phase at which sizes are estimated; with ten times fewer
 
 @dataclass(frozen=True, eq=False, repr=False)
 class System:
-    """A linear system ``x'(t) = A(t, p) x(t) + B(t, p) u(t - delay) + E(t, p) w(t) + c(t, p)`` in one or several
-    phases.
+    """A linear system ``x'(t) = A(t, p) x(t) + B(t, p) u(t - delay) + E(t, p) w(t) + c(t, p)`` in phases.
 
     The state is ``x (d,)``, the control ``u (m,)``, the disturbance ``w (mw,)``. The parameter ``p (nu,)`` is constant
     and unknown. Users make a system by `LinearSystem`, `SwitchedSystem` or `VaryingSystem`.
@@ -161,8 +159,9 @@ class System:
 
     @cached_property
     def forced(self) -> System:
-        """The system whose drift is one more column of ``B``, with a control that is always 1; the system itself
-        without a drift.
+        """The system whose drift is the last column of ``B``, with a control that is always 1.
+
+        It is the system itself without a drift.
 
         A system that is made so has no delay, because a delay belongs to the times at which the controls act.
         """
@@ -170,8 +169,7 @@ class System:
 
     @cached_property
     def modes(self) -> tuple[Phase, ...]:
-        """The phases with entries that are constant in time, from which the sizes of the numbers of a problem are
-        estimated.
+        """The phases at fixed times, from which the sizes of the numbers of a problem are estimated.
 
         Where the entries do not depend on the time, the modes are the `phases`. Otherwise they are the system at
         several times of each phase, and nothing is proven by them. Where the state is then an affine function of the
@@ -287,14 +285,16 @@ class System:
 
     @property
     def dependence(self) -> Dependence | None:
-        """The affine dependence of the state on the parameters, of a system that depends on the time; ``None`` for any
-        other."""
+        """The affine dependence of the state on the parameters, or ``None``.
+
+        The value is ``None`` for a system that does not depend on the time or has no parameters, or whose state is not
+        affine in them.
+        """
         return None if isinstance(self._depends, int) else self._depends
 
     @property
     def powers(self) -> int | None:
-        """The largest degree of those entries that are polynomials in the parameters, where the state is not affine in
-        these.
+        """The largest degree of the entries that are polynomials in the parameters, where the state is not affine.
 
         The value is ``None`` where the system does not depend on the time, has no parameters, or is affine in them.
         """
@@ -309,8 +309,7 @@ class System:
 
     @property
     def deviations(self) -> tuple[Array, Array]:
-        """The middle ``(nu,)`` of the box of the parameters, and the largest deviation ``(nu,)`` from it, rounded
-        upwards."""
+        """The middle ``(nu,)`` of the box of the parameters, and the largest deviations ``(nu,)``, rounded upwards."""
         if self.parameters is None:
             return np.zeros(0), np.zeros(0)
         centre, box = self.box.interior_point(), self.box
@@ -381,7 +380,10 @@ class System:
 
     @property
     def stated(self) -> System:
-        """The system in the units of the user; the system itself where it is in them."""
+        """The system in the units of the user, where its phases keep them; the system itself elsewhere.
+
+        A constant system without parameters does not keep them.
+        """
         first = self.phases[0]
         if not isinstance(first, PhaseInUnits):
             return self
@@ -718,8 +720,10 @@ def _check_ends(ends: Sequence[float], horizon: float, whole: bool) -> None:
 
 
 def _check_piece(i: int, pair: object, before: float) -> None:
-    """Raise `InputError` where one piece of a switched system is no pair of a later time and a `LinearSystem` without
-    delay."""
+    """Raise `InputError` where a phase of a switched system is no pair of a later time and a `LinearSystem`.
+
+    A delay of its own is refused too.
+    """
     if not isinstance(pair, Sequence) or len(pair) != 2:
         raise InputError(path=f"system.pieces.{i}", expected="a pair of a time and a LinearSystem", got=f"{pair!r}")
     until, system = pair

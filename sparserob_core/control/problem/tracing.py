@@ -125,8 +125,7 @@ def traced(name: str, function: Callable[..., object], names: Sequence[str], pro
 
 
 def _agree(written: ExpressionMatrix, function: Callable[..., object], point: Array) -> bool:
-    """Return True where a matrix of expressions and the function have the same values at one point ``(nu,)``, up to
-    `SAME`."""
+    """Return True where a matrix of expressions agrees with the function at one point ``(nu,)``, up to `SAME`."""
     given, found = np.asarray(function(point), dtype=float), np.asarray(written(point), dtype=float)
     return given.shape == found.shape and bool(np.allclose(given, found, rtol=SAME, atol=0.0))
 

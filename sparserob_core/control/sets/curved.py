@@ -96,8 +96,10 @@ class Ellipsoid(ConvexSet):
 
     @cached_property
     def frame(self) -> Array:
-        """The matrix ``L^-1``, rounded to a few digits: in its coordinates ``z`` the support function about the centre
-        is ``|z|``."""
+        """The matrix ``L^-1``, rounded to a few digits.
+
+        In its coordinates ``z`` of a direction, the support function about the centre is the 2-norm of ``z``.
+        """
         return few_digits(np.asarray(np.linalg.solve(self.factor, np.eye(self.dimension)), dtype=float))
 
     @shaped
@@ -184,8 +186,7 @@ class Ellipsoid(ConvexSet):
 
     @shaped
     def _solved(self, matrix: Float[Array, "d d"], points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-        """Return the solutions ``(..., d)`` of linear equations with a matrix, for the differences of points and the
-        centre."""
+        """Return the solutions ``(..., d)`` of ``matrix y = point - centre``."""
         rays = np.asarray(points, dtype=float) - self.centre
         return np.asarray(np.linalg.solve(matrix, rays.reshape(-1, self.dimension).T).T.reshape(rays.shape))
 
@@ -194,8 +195,10 @@ class Ellipsoid(ConvexSet):
         return self.centre, self.factor
 
     def scaled(self, factor: float) -> Ellipsoid:
-        """Return the ellipsoid scaled by a ``factor`` about its centre; raise `InputError` for 0, which leaves no
-        interior."""
+        """Return the ellipsoid scaled by a ``factor`` about its centre; raise `InputError` for the factor 0.
+
+        An ellipsoid has an interior, and a point has none.
+        """
         return Ellipsoid(self.centre, factor**2 * self.shape)
 
     @shaped
@@ -382,8 +385,7 @@ class NormBall(ConvexSet):
 
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
-        """Return a mask ``(...,)`` that is true where points ``(..., d)`` violate the ball by at most the absolute
-        ``tolerance``.
+        """Return a mask ``(...,)`` of the points ``(..., d)`` that violate the ball by at most ``tolerance``.
 
         The ``p``-norm is at most ``most`` times the Euclidean norm, and the Euclidean norm is at most ``least`` times
         the ``p``-norm. The projection is computed only for points that these bounds leave undecided.
@@ -529,8 +531,10 @@ def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
 
 
 def _in_ball(p: float, dimension: int, count: int, rng: np.random.Generator) -> Array:
-    """Return ``count`` uniform points in the unit ball of the ``p``-norm (Barthe, Guedon, Mendelson and Naor 2005,
-    Theorem 1)."""
+    """Return ``count`` uniform points in the unit ball of the ``p``-norm.
+
+    The method is that of Barthe, Guedon, Mendelson and Naor 2005, Theorem 1.
+    """
     sizes = rng.gamma(1.0 / p, size=(count, dimension)) ** (1.0 / p)
     norms = ((sizes**p).sum(axis=1, keepdims=True) + rng.exponential(size=(count, 1))) ** (1.0 / p)
     return np.asarray(np.where(rng.integers(0, 2, size=(count, dimension), dtype=np.int8) > 0, sizes, -sizes) / norms)

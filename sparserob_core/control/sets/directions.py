@@ -87,8 +87,10 @@ def across(convex_set: ConvexSet, z: Float[Array, "k b"], slopes: Float[Array, "
 
 @shaped
 def _rooms(convex_set: ConvexSet, directions: Float[Array, "k d"]) -> Float[Array, " k"]:
-    """Return the extent ``(k,)`` of a set from its interior point along directions ``(k, d)``; their length where it is
-    0."""
+    """Return the extent ``(k,)`` of a set from its interior point along directions ``(k, d)``.
+
+    Where the extent is 0, the length of the direction is returned.
+    """
     rooms = convex_set.support(directions) - directions @ convex_set.interior_point()
     sizes = np.linalg.norm(directions, axis=1)
     return np.asarray(np.where(rooms > 0, rooms, np.where(sizes > 0, sizes, 1.0)))

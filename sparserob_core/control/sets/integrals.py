@@ -27,8 +27,10 @@ NEAR_END = 1e-9  # share of an interval next to its ends: an interval with a sig
 
 
 def enclosed(bound: ConvexSet) -> bool:
-    """Return True where integrals of the support function of a set can be enclosed: the set is flat, or known to be
-    analytic."""
+    """Return True where integrals of the support function of a set can be enclosed.
+
+    The set has to be flat, or its analytic continuation known.
+    """
     nowhere = np.zeros((1, bound.dimension))
     return bound.halfspaces() is not None or bound.continued(nowhere, nowhere) is not None
 
@@ -95,8 +97,10 @@ def _series(count: int) -> Array:
 
 @cache
 def _moved(count: int, share: float, begin: float) -> Array:
-    """Return the matrix ``(count, count)`` from coefficients of powers of ``x`` to those of ``y``,
-    ``x = begin + share y``."""
+    """Return the matrix from coefficients of powers of ``x`` to those of ``y``, ``x = begin + share y``.
+
+    Its shape is ``(count, count)``.
+    """
     found = np.zeros((count, count))
     power = np.ones(1)
     for j in range(count):
@@ -176,8 +180,9 @@ def absolute(terms: Array, accuracy: Array) -> Array:
 
 
 def _sign_changes(points: Array) -> Array:
-    """Return approximate points ``(l,)`` at which polynomials change their signs, by the Illinois variant of the secant
-    method.
+    """Return approximate points ``(l,)`` at which polynomials change their signs.
+
+    They are computed by the Illinois variant of the secant method.
 
     The value is the middle where both ends have the same sign.
 

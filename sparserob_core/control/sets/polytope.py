@@ -134,8 +134,9 @@ class Polytope(ConvexSet):
 
     @cached_property
     def chebyshev(self) -> tuple[Array, float]:
-        """The centre ``(d,)`` and the radius of a largest ball in the set; the radius is capped, and negative for an
-        empty set.
+        """The centre ``(d,)`` and the radius of a largest ball in the set.
+
+        The radius is capped, and is negative for an empty set.
 
         The ball is one in balanced coordinates where rows or columns differ much in size.
         """
@@ -162,8 +163,10 @@ class Polytope(ConvexSet):
 
     @shaped
     def amid(self) -> Float[Array, " d"]:
-        """Return the mean ``(d,)`` of the vertices where these are known; the Chebyshev centre elsewhere, which depends
-        on units."""
+        """Return the mean ``(d,)`` of the vertices; the Chebyshev centre where these are not known.
+
+        The Chebyshev centre depends on the units.
+        """
         return self.interior_point() if self.vertices is None else np.asarray(self.vertices.mean(axis=0))
 
     @cached_property
@@ -175,8 +178,7 @@ class Polytope(ConvexSet):
 
     @cached_property
     def vertices(self) -> Array | None:
-        """All vertices ``(v, d)`` of a bounded polytope; ``None`` where there are too many of them or the set is
-        unbounded."""
+        """All vertices ``(v, d)``; ``None`` where there may be too many of them or the set is unbounded."""
         rows, d = self.H.shape
         if d > _VERTEX_DIMENSIONS or rows > _VERTEX_ROWS or not self.is_bounded:
             return None
@@ -272,8 +274,7 @@ class Polytope(ConvexSet):
 
     @shaped
     def _maximise_all(self, directions: Float[Array, "k d"]) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
-        """Return the support function ``(k,)`` and maximisers ``(k, d)`` of directions ``(k, d)``, as `_maximise` does
-        for one.
+        """Return the support function ``(k,)`` and maximisers ``(k, d)`` of directions ``(k, d)``.
 
         Several linear programs are solved together as one, because a call of the solver costs far more than a small
         program. Where this fails, they are solved one by one.
@@ -318,15 +319,19 @@ class Polytope(ConvexSet):
         return np.asarray(answer.x).reshape(directions.shape), multipliers
 
     def _endless(self, directions: Array) -> npt.NDArray[np.bool_]:
-        """Return a mask ``(k,)`` that is true for directions ``(k, d)`` with a clear part along a line that is in the
-        set."""
+        """Return a mask ``(k,)`` of the directions ``(k, d)`` with a clear part along a line that is in the set.
+
+        Directions are in balanced coordinates.
+        """
         along = np.linalg.norm(directions @ self._lines.T, axis=1)
         return np.asarray(along > _CLEAR * np.linalg.norm(directions, axis=1))
 
     @cached_property
     def _lines(self) -> Array:
-        """The lines in the set as orthonormal rows ``(l, d)``, in balanced coordinates; no rows where rounding leaves a
-        doubt."""
+        """The lines in the set as orthonormal rows ``(l, d)``, in balanced coordinates.
+
+        There are no rows where rounding leaves a doubt.
+        """
         _, sizes, turned = np.linalg.svd(self._balanced[0])
         sizes = np.concatenate([sizes, np.zeros(self.dimension - sizes.size)]) / max(
             float(sizes.max(initial=0.0)), 1e-300
@@ -337,8 +342,10 @@ class Polytope(ConvexSet):
 
     @shaped
     def _maximise(self, direction: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:
-        """Return the support function and a maximiser ``(d,)`` by a linear program; infinity and any point where it is
-        unbounded."""
+        """Return the support function and a maximiser ``(d,)`` of one direction ``(d,)`` by a linear program.
+
+        The value is infinite where the set is unbounded; the point is then any point of the set.
+        """
         from scipy.optimize import linprog
 
         H, h, units = self._balanced
@@ -355,8 +362,9 @@ class Polytope(ConvexSet):
         return max(float(scaled @ answer.x), float(proven)), np.asarray(answer.x) * units
 
     def _dual_bound(self, directions: Array, multipliers: Array) -> Array:
-        """Return proven upper bounds ``(k,)`` of the support function of ``directions (k, d)``, in balanced
-        coordinates.
+        """Return proven upper bounds ``(k,)`` of the support function of directions ``(k, d)``.
+
+        All are in balanced coordinates.
 
         Weak duality: ``c'x = (c - H'y)'x + y'H x <= |c - H'y|_1 R + y'h`` for ``y >= 0`` and ``|x_i| <= R``. The bound
         does not rest on the accuracy of the linear program, except for the rounding of these sums. It is ``-inf`` where

@@ -161,8 +161,7 @@ class Equality:
 
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
-        """Return a mask ``(...,)`` that is true where points ``(..., d)`` deviate by at most the absolute
-        ``tolerance``."""
+        """Return a mask ``(...,)`` of the points ``(..., d)`` that deviate by at most the absolute ``tolerance``."""
         inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
         return inside
 

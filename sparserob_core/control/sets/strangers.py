@@ -85,8 +85,7 @@ def _contradiction(convex: ConvexSet) -> str:
 
 
 def _sides(convex: ConvexSet, points: Array, close: Array) -> Iterator[tuple[Array, Array, str]]:
-    """Yield for the half-spaces of a set a mask of the ones that disagree with its support function, the normals, and
-    words."""
+    """Yield the checks of the half-spaces of a set, each as a mask of failures, the normals, and words."""
     flat = convex.halfspaces()
     if flat is not None and flat[1].size:
         H, h = flat

@@ -149,8 +149,10 @@ class Zonotope(ConvexSet):
 
     @staticmethod
     def _across(generators: Array, d: int) -> list[Array]:
-        """Return a normal for every pair of opposite facets, from generators of length 1 that span all ``d``
-        dimensions."""
+        """Return a normal for every pair of opposite facets, from generators that span all ``d`` dimensions.
+
+        The generators have length 1.
+        """
         normals = []
         for chosen in combinations(generators, d - 1):
             _, values, rows = np.linalg.svd(np.array(chosen).reshape(d - 1, d))

@@ -143,7 +143,7 @@ class Window(Term, ABC):
         return [replace(cast("Any", self), name=called)]
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
-        """Return the constraint from the time ``begin`` on, for the duration ``horizon``; ``None`` where nothing of it
+        """Return the constraint from the time ``begin`` on, for the duration ``horizon``; ``None`` where nothing
         remains.
 
         Fields that are ``given`` replace those of the constraint; times are counted from ``begin``.
