@@ -374,9 +374,21 @@ def by_time(weights: object) -> tuple[Array, Array]:
 
 
 def integrals(weights: object, breakpoints: Array) -> Array:
-    """Return the integrals ``(m, K)`` of the weights over the intervals between ``breakpoints (K + 1,)``.
+    """Return the integrals of the weights over intervals of time.
 
     Weights may change within an interval. The integrals are exact except for the rounding of the sums.
+
+    Parameters
+    ----------
+    weights : array (m,) or (r, 1 + m)
+        The result of `checked_weights`.
+    breakpoints : array (K + 1,)
+        The times between which the intervals lie.
+
+    Returns
+    -------
+    array (m, K)
+        The integral of each weight over each interval.
     """
     times, values = by_time(weights)
     begins, ends = breakpoints[:-1], breakpoints[1:]
@@ -397,7 +409,22 @@ def counted(weights: object) -> Array:
 
 
 def weights_between(weights: object, begin: float, horizon: float) -> Array:
-    """Return the weights from the time ``begin`` on, for the duration ``horizon``; times count from ``begin``."""
+    """Return the weights that remain from one time on, with times counted from there.
+
+    Parameters
+    ----------
+    weights : array (m,) or (r, 1 + m)
+        The result of `checked_weights`.
+    begin : float
+        The time from which the weights remain.
+    horizon : float
+        The duration for which they are needed.
+
+    Returns
+    -------
+    array (m,) or (q, 1 + m)
+        The weights, or rows of a time and the weights from then on.
+    """
     rows = np.asarray(weights, dtype=float)
     if rows.ndim == 1:
         return rows

@@ -198,7 +198,22 @@ def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> 
 
 
 def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np.ndarray:
-    """Return a mask ``(mw,)`` that is true for the columns of ``E`` whose disturbances are of the class ``kind``."""
+    """Return the columns of ``E`` whose disturbances are of one class, as a mask.
+
+    Parameters
+    ----------
+    bound : ConvexSet
+        The set of all disturbances ``(mw,)``.
+    classes : str or tuple of str
+        The class of all disturbances, or of each part of the set.
+    kind : str
+        The class that is selected.
+
+    Returns
+    -------
+    array (mw,) of bool
+        True for the columns of this class.
+    """
     if isinstance(classes, str):
         return np.full(bound.dimension, classes == kind)
     return np.repeat([one == kind for one in classes], [part.dimension for part in bound.factors])

@@ -342,17 +342,33 @@ class Joined:
 
 
 def beside(left: Entries, right: Entries) -> Entries:
-    """Return the matrix of two matrices with as many rows, the ``left`` one and the ``right`` one.
+    """Return two matrices as one, in a row.
 
-    Each of them is an array, expressions, or a function of the parameters.
+    Parameters
+    ----------
+    left, right : array, expressions or function of the parameters
+        The matrices, which have as many rows.
+
+    Returns
+    -------
+    array, expressions or function of the parameters
+        The matrix; a function where one of the two is a function.
     """
     return _joined(left, right, 1)
 
 
 def above(upper: Entries, lower: Entries) -> Entries:
-    """Return the matrix of two matrices with as many columns, the ``upper`` one above the ``lower`` one.
+    """Return two matrices as one, one above the other.
 
-    Each of them is an array, expressions, or a function of the parameters.
+    Parameters
+    ----------
+    upper, lower : array, expressions or function of the parameters
+        The matrices, which have as many columns.
+
+    Returns
+    -------
+    array, expressions or function of the parameters
+        The matrix; a function where one of the two is a function.
     """
     return _joined(upper, lower, 0)
 

@@ -82,7 +82,7 @@ class Corners:
     def own(self, states: int) -> list[int]:
         """Return the indices of those of ``states`` states that no parameter added.
 
-        The tubes of the other states contain the effect of the parameters.
+        The tubes of the returned states contain the effect of the parameters.
         """
         d, size = self.added
         return [*range(d), *range(size, states)]

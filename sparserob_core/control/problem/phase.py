@@ -128,7 +128,13 @@ class Phase:
         return replace(self, B=beside(self._entry("B"), self._entry("c")), c=None)
 
     def between(self, begin: float, until: float) -> Phase:
-        """Return the phase with another beginning and another end."""
+        """Return the phase from another time and until another time.
+
+        Parameters
+        ----------
+        begin, until : float
+            The times, in the time unit of the system; the entries do not change.
+        """
         return self if (begin, until) == (self.begin, self.until) else replace(self, begin=begin, until=until)
 
     def drifting(self) -> Phase:
@@ -192,7 +198,20 @@ class Phase:
         return self._through(partial(_with_parameter, parameter), domain, (TIME,), self.begin, self.until)
 
     def during(self, time: float, parameters: ConvexSet | None) -> Phase:
-        """Return a timed phase at one ``time``, as a phase whose arguments are the ``parameters`` alone."""
+        """Return a timed phase at one time, as a phase with constant entries in time.
+
+        Parameters
+        ----------
+        time : float
+            The time.
+        parameters : ConvexSet or None
+            The set of the uncertain parameters, which are the arguments of the new phase.
+
+        Returns
+        -------
+        Phase
+            The phase, which is not timed and has no end.
+        """
         return self._through(partial(_at_time, time), parameters, self.names[1:], timed=False)
 
     def in_time(self, until: float) -> Phase:
@@ -687,7 +706,20 @@ def boxed(parameters: ConvexSet) -> Box:
 
 
 def and_time(begin: float, until: float, parameters: Box | None) -> Box:
-    """Return the box of the times from ``begin`` until ``until`` and of the parameters after them."""
+    """Return the box of the times of a phase and of its parameters.
+
+    Parameters
+    ----------
+    begin, until : float
+        The times between which the phase holds.
+    parameters : Box or None
+        The box of the parameters ``(nu,)``, or ``None`` where there are none.
+
+    Returns
+    -------
+    Box
+        The box in ``1 + nu`` coordinates, of which the time is the first.
+    """
     if parameters is None:
         return Box([begin], [until])
     return Box(np.append(begin, parameters.lower), np.append(until, parameters.upper))

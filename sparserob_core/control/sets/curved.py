@@ -207,7 +207,20 @@ class Ellipsoid(ConvexSet):
 
     @shaped
     def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """Return ``count`` independent points ``(count, d)``, distributed uniformly."""
+        """Return independent points of the ellipsoid, distributed uniformly.
+
+        Parameters
+        ----------
+        count : int
+            The number of points.
+        rng : numpy.random.Generator
+            The source of random numbers.
+
+        Returns
+        -------
+        array (count, d)
+            The points.
+        """
         return np.asarray(self.centre + _in_ball(2.0, self.dimension, count, rng) @ self.factor.T)
 
     @shaped
@@ -385,8 +398,22 @@ class NormBall(ConvexSet):
 
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
-        """Return a mask ``(...,)`` of the points ``(..., d)`` that violate the ball by at most ``tolerance``.
+        """Return the points that violate the ball by at most a tolerance, as a mask.
 
+        Parameters
+        ----------
+        points : array (..., d)
+            The points.
+        tolerance : float, default 1e-9
+            The absolute tolerance, a Euclidean distance.
+
+        Returns
+        -------
+        array (...,) of bool
+            True for points in the ball.
+
+        Notes
+        -----
         The ``p``-norm is at most ``most`` times the Euclidean norm, and the Euclidean norm is at most ``least`` times
         the ``p``-norm. The projection is computed only for points that these bounds leave undecided.
         """
@@ -439,7 +466,20 @@ class NormBall(ConvexSet):
 
     @shaped
     def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """Return ``count`` independent points ``(count, d)``, distributed uniformly."""
+        """Return independent points of the ball, distributed uniformly.
+
+        Parameters
+        ----------
+        count : int
+            The number of points.
+        rng : numpy.random.Generator
+            The source of random numbers.
+
+        Returns
+        -------
+        array (count, d)
+            The points.
+        """
         unit = (
             rng.uniform(-1.0, 1.0, size=(count, self.dimension))
             if self.p == np.inf

@@ -252,7 +252,22 @@ class Polytope(ConvexSet):
 
     @shaped
     def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """Return ``count`` random vertices ``(count, d)``, each known vertex with the same probability."""
+        """Return random vertices, each known vertex with the same probability.
+
+        Where the vertices are not known, support points of random directions stand for them.
+
+        Parameters
+        ----------
+        count : int
+            The number of points.
+        rng : numpy.random.Generator
+            The source of random numbers.
+
+        Returns
+        -------
+        array (count, d)
+            The points.
+        """
         known = self.vertices
         if known is None:
             known = self.support_point(rng.normal(size=(min(count, _PROGRAMS), self.dimension)))

@@ -161,7 +161,20 @@ class Equality:
 
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
-        """Return a mask ``(...,)`` of the points ``(..., d)`` that deviate by at most the absolute ``tolerance``."""
+        """Return the points that satisfy the equality up to a tolerance, as a mask.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            The points.
+        tolerance : float, default 1e-9
+            The absolute deviation that is allowed in every fixed coordinate.
+
+        Returns
+        -------
+        array (...,) of bool
+            True for points that deviate by no more.
+        """
         inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
         return inside
 

@@ -72,7 +72,20 @@ def ending(bound: ConvexSet | None, centre: Array, horizon: float) -> tuple[list
 
 
 def widths(bound: ConvexSet | None, states: int) -> Array:
-    """Return the width ``(d,)`` of a set of deviations along every axis, which is 0 without a set."""
+    """Return the width of a set of deviations along every axis.
+
+    Parameters
+    ----------
+    bound : ConvexSet or None
+        The set; ``None`` stands for 0 alone.
+    states : int
+        The number ``d`` of axes.
+
+    Returns
+    -------
+    array (d,)
+        The widths, 0 without a set.
+    """
     if bound is None:
         return np.zeros(states)
     axes = np.eye(states)

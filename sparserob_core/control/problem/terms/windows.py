@@ -143,10 +143,21 @@ class Window(Term, ABC):
         return [replace(cast("Any", self), name=called)]
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
-        """Return the constraint from the time ``begin`` on, for the duration ``horizon``; ``None`` where nothing
-        remains.
+        """Return the constraint that remains from one time on, with times counted from there.
 
-        Fields that are ``given`` replace those of the constraint; times are counted from ``begin``.
+        Parameters
+        ----------
+        begin : float
+            The time from which the constraint remains.
+        horizon : float
+            The duration of the problem that remains.
+        given
+            Values of fields that replace those of the constraint.
+
+        Returns
+        -------
+        Window or None
+            The constraint, or ``None`` where nothing of it remains.
         """
         end = begin + horizon
         late = over(end, self.start) if self.lasting else not over(self.start, end)
@@ -198,7 +209,15 @@ class PathConstraint(Window):
 
     @classmethod
     def of(cls, where: str, entry: object) -> Window:
-        """Return the constraint for an entry of a path, in which a bare set holds at all times."""
+        """Return the constraint for an entry of a path, in which a bare set holds at all times.
+
+        Parameters
+        ----------
+        where : str
+            The key of a config at which the entry stands.
+        entry : object
+            A constraint, or a set. Any other entry fails when the constraint is checked.
+        """
         if isinstance(entry, PathConstraint | MixedConstraint):
             return entry
         return PathConstraint(cast("ConvexSet", entry))  # an entry that is no set fails when it is checked
@@ -408,12 +427,38 @@ class UntilHorizon(float):
 
 
 def end_of(stop: float | None, horizon: float) -> float:
-    """Return the end of a window: its ``stop`` where one is given, else the horizon."""
+    """Return the end of a window as a number.
+
+    Parameters
+    ----------
+    stop : float or None
+        The end that the user gave, or an `UntilHorizon`, or ``None`` where there is none.
+    horizon : float
+        The horizon.
+
+    Returns
+    -------
+    float
+        The given end, else the horizon as an `UntilHorizon`.
+    """
     return UntilHorizon(horizon) if stop is None or isinstance(stop, UntilHorizon) else float(stop)
 
 
 def columns(rows: Any, count: int) -> Array:
-    """Return rows of numbers with ``count`` columns, of which the additional ones are 0."""
+    """Return rows of numbers with additional columns of zeros.
+
+    Parameters
+    ----------
+    rows : array (q, n)
+        The rows.
+    count : int
+        The number of columns that is required, at least ``n``.
+
+    Returns
+    -------
+    array (q, count)
+        The rows, followed by zeros.
+    """
     given = np.asarray(rows)
     return np.pad(given, ((0, 0), (0, count - given.shape[1])))
 
