@@ -1,1 +1,1 @@
-"""What is to be controlled: systems, sets, windows, and the dictionaries that controls are written in."""
+"""The statement of a control problem: its system, sets, windows, and the dictionaries of its controls."""

@@ -1,5 +1,7 @@
-"""What a control costs: its integral of absolute values or of norms, with weights that are constant or piecewise
-constant in time, and quadratic terms of the nominal trajectory."""
+"""The cost of a control: an integral of absolute values or norms, and quadratic terms of the nominal trajectory.
+
+The weights of the integral are constant or piecewise constant in time.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,21 @@ from sparserob_core.shapes import dense
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
 from sparserob_core.sip.convexity import ROUNDED, is_definite, require_convex
 
-EXACT = 16  # states up to which a matrix is shown to be positive semidefinite in fractions
+EXACT = 16  # rows up to which a matrix is shown to be positive semidefinite in fractions
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Quadratic(Term):
-    """``(v - reference)' Q (v - reference)``: ``Q (d, d)`` symmetric and positive semidefinite, ``reference (d,)``."""
+    """A quadratic term ``(v - reference)' Q (v - reference)`` of a vector ``v (d,)``.
+
+    Parameters
+    ----------
+    Q : array (d, d)
+        A symmetric, positive semidefinite matrix.
+    reference : array (d,)
+        The vector with which ``v`` is compared, in the units of ``v``.
+    """
 
     Q: Array = field(metadata=measured(lambda of: of.cost / np.outer(of.states, of.states)))
     reference: Array = field(metadata=measured(lambda of: of.states))
@@ -40,16 +50,39 @@ OF_CONTROLS = measured(lambda of: replace(of, states=of.controls, cost=of.cost /
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cost(Term):
-    """``J = l1 int sum_i weights_i |u_i| dt + int (x - r)' Q (x - r) dt + int u' R u dt + (x(T) - r)' Q (x(T) - r)``,
-    ``x`` the nominal trajectory.
+    """The cost ``J = l1 int sum_i weights_i |u_i| dt + int (x - r)' Q (x - r) dt + int u' R u dt + (x(T) - r)' Q (x(T)
+    - r)``.
 
-    ``l1``: factor of the first integral, 0 for a purely quadratic cost. ``group``: channels, counted from 1, that count
-    with their Euclidean norm instead of their absolute values, as ``[[1, 2], [3]]``, or ``all`` for one group; a
-    channel in no group counts alone. ``state``, ``final``: ``{Q: (d, d), reference: (d,)}``, the reference 0 unless
-    given; ``control``: ``{R: (m, m)}``. All matrices symmetric and positive semidefinite. Units: ``l1`` has none,
-    ``Q`` and ``R`` make the integrals cost per time, ``final`` is a cost.
+    Here ``x (d,)`` is the nominal trajectory, that of the `nominal_point` of every uncertainty set, and ``u (m,)`` is
+    the control. The ``weights`` are those of the `OptimalControlProblem`. All matrices are symmetric and positive
+    semidefinite.
 
-    The nominal trajectory is that of the `nominal_point` of every uncertainty set.
+    Parameters
+    ----------
+    l1 : float, default 1.0
+        The factor of the first integral, without unit; 0 for a purely quadratic cost.
+    group : list of lists of int, or "all", optional
+        Groups of channels, counted from 1, as in ``[[1, 2], [3]]``; ``all`` is one group. The Euclidean norm of a group
+        replaces the sum of its absolute values. A channel in no group counts by its absolute value. No groups unless
+        given.
+    state : mapping {"Q": (d, d), "reference": (d,)}, optional
+        The matrix and the reference of the integral over the state; the reference is 0 unless given. ``Q`` makes the
+        integrand a cost per time. No such term unless given.
+    control : mapping {"R": (m, m)}, optional
+        The matrix of the integral over the control. ``R`` makes the integrand a cost per time. No such term unless
+        given.
+    final : mapping {"Q": (d, d), "reference": (d,)}, optional
+        The matrix and the reference of the term of the final state, which is a cost. No such term unless given.
+
+    Notes
+    -----
+    The fields are checked when a problem is made with the cost (`checked`).
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> sr.Cost(l1=0.5, group="all", control={"R": [[0.1, 0], [0, 0.1]]}).l1
+    0.5
     """
 
     l1: float = field(default=1.0, metadata=UNITLESS)
@@ -61,8 +94,25 @@ class Cost(Term):
     __repr__ = noun
 
     def checked(self, states: int, controls: int, weights: Array) -> Cost:
-        """The same cost for that many states and controls, with `Quadratic` terms and tuples for groups; raises
-        `InputError` that begins with the key below ``cost``."""
+        """Return the cost with `Quadratic` terms and with tuples for groups, after a check of all fields.
+
+        Parameters
+        ----------
+        states, controls : int
+            The numbers ``d`` of states and ``m`` of controls.
+        weights : array (m,) or (r, 1 + m)
+            The weights of the problem, which must be equal within a group.
+
+        Returns
+        -------
+        Cost
+            The checked cost.
+
+        Raises
+        ------
+        InputError
+            If a field is unsuitable, or nothing is left to be minimised; the error begins with the key below ``cost``.
+        """
         try:
             l1 = float(self.l1)
         except (TypeError, ValueError):
@@ -80,29 +130,29 @@ class Cost(Term):
 
     @property
     def blocks(self) -> tuple[tuple[int, ...], ...]:
-        """The groups of two channels or more, counted from 0."""
+        """The groups with at least two channels, counted from 0, of a `checked` cost."""
         assert self.group != "all"
         return tuple(tuple(int(c) - 1 for c in group) for group in self.group or () if len(group) > 1)
 
     @property
     def terms(self) -> tuple[Quadratic | None, Quadratic | None, Quadratic | None]:
-        """The quadratic terms of state, control and final state, of a `checked` cost."""
+        """The quadratic terms of state, control and final state, of a `checked` cost; ``None`` where one is absent."""
         found = (self.state, self.control, self.final)
         assert all(term is None or isinstance(term, Quadratic) for term in found)
         return found  # type: ignore[return-value]
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether there are quadratic terms."""
+        """True where there is a quadratic term."""
         return any(term is not None for term in self.terms)
 
     @property
     def is_linear(self) -> bool:
-        """Whether it is a weighted sum of absolute values."""
+        """True where the cost is a weighted sum of absolute values, without groups and quadratic terms."""
         return not self.is_quadratic and not self.blocks
 
     def words(self) -> str:
-        """What is added up to the cost, in a few words; empty where that is the L1 norm alone."""
+        """Return the parts of the cost in a few words, or an empty text where the cost is the L1 norm alone."""
         if self.is_linear and self.l1 == 1.0:
             return ""
         state, control, final = self.terms
@@ -115,8 +165,11 @@ class Cost(Term):
 
 
 def nominal_point(convex: ConvexSet) -> Array:
-    """The centre of an uncertainty set ``(d,)``, which the nominal trajectory is that of: the middle of its bounding
-    box if that is inside, else the mean of its vertices, or an interior point where there are none."""
+    """Return the centre ``(d,)`` of an uncertainty set, to which the nominal trajectory belongs.
+
+    The centre is the middle of the bounding box where the set contains it. Elsewhere it is the mean of the vertices, or
+    an interior point of a set without known vertices.
+    """
     box = convex.bounding_box()
     middle = (box.lower + box.upper) / 2
     if bool(convex.contains(middle)):
@@ -126,6 +179,7 @@ def nominal_point(convex: ConvexSet) -> Array:
 
 
 def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ...], ...] | None:
+    """Return the groups of channels, counted from 1, as tuples; raise `InputError` where they are unsuitable."""
     if given is None:
         return None
     if isinstance(given, str):
@@ -162,7 +216,24 @@ def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ..
 
 
 def _term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
-    """One quadratic term from ``{letter: matrix, reference: vector}``."""
+    """Return one quadratic term from a mapping ``{letter: matrix, reference: vector}``, or ``None`` where it is absent.
+
+    Parameters
+    ----------
+    key : str
+        The key of the term: ``state``, ``control`` or ``final``.
+    given : object
+        The mapping, a `Quadratic`, or ``None``.
+    letter : str
+        The key of the matrix in the mapping.
+    size : int
+        The number of rows of the matrix.
+
+    Raises
+    ------
+    InputError
+        If the mapping has other keys, if a shape is wrong, or if the matrix is not positive semidefinite.
+    """
     if given is None:
         return None
     reference: object
@@ -186,6 +257,7 @@ def _term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
 
 
 def _numbers(path: str, given: object, shape: tuple[int, ...], expected: str) -> Array:
+    """Return an array of finite numbers of the given shape; raise `InputError`."""
     try:
         array = np.asarray(dense(given), dtype=float)
     except (TypeError, ValueError):
@@ -196,8 +268,11 @@ def _numbers(path: str, given: object, shape: tuple[int, ...], expected: str) ->
 
 
 def _semidefinite(path: str, Q: Array) -> Array:
-    """A symmetric positive semidefinite matrix, or one that is but for rounding, which is then made so: the checker
-    shows it in fractions."""
+    """Return a symmetric positive semidefinite matrix; raise `InputError` for other matrices.
+
+    A matrix that is semidefinite up to rounding is made so by a small addition to its diagonal, because the checker
+    shows the property in fractions.
+    """
     form = require_convex(path, Q, Q.shape[0])
     Q, diagonal = form.toarray(), form.diagonal()
     small, kept = ROUNDED * Q.shape[0], np.flatnonzero(diagonal > 0.0)
@@ -209,7 +284,10 @@ def _semidefinite(path: str, Q: Array) -> Array:
 
 
 def _exactly_semidefinite(Q: Array) -> bool:
-    """Symmetric elimination in fractions: no pivot is negative, and none is 0 beside an entry that is not."""
+    """Return True where symmetric elimination in fractions shows that a matrix is positive semidefinite.
+
+    No pivot may be negative, and the rest of the row of a pivot that is 0 must be 0 too.
+    """
     rows = [[Fraction(float(entry)) for entry in row] for row in Q]
     for k in range(len(rows)):
         pivot = rows[k][k]
@@ -223,10 +301,28 @@ def _exactly_semidefinite(Q: Array) -> bool:
 
 
 def checked_weights(given: npt.ArrayLike | None, controls: int, horizon: float) -> Array:
-    """Weights ``(m,)``, all positive, or rows ``(r, 1 + m)`` of a time and the weights from then on, none negative. A
-    number serves every control, ``None`` is 1; a single row of positive weights is ``(m,)``.
+    """Return the weights of the controls as an array, after a check.
 
-    The rows begin at 0, their times increase, and the last one is before the ``horizon``. Raises `InputError`.
+    Parameters
+    ----------
+    given : array-like or None
+        A number for all controls, one number per control, or rows of a time and the weights from then on. ``None`` is
+        1.
+    controls : int
+        The number ``m`` of controls.
+    horizon : float
+        The horizon, before which the last row must begin.
+
+    Returns
+    -------
+    array (m,) or (r, 1 + m)
+        Positive weights, or rows of a time and weights that are not negative. A single row of positive weights is
+        returned as ``(m,)``. The times begin at 0 and increase.
+
+    Raises
+    ------
+    InputError
+        If the numbers are not of this form.
     """
     given = 1.0 if given is None else given
     if isinstance(given, str | bytes) or not _is_nested(given):
@@ -241,12 +337,14 @@ def checked_weights(given: npt.ArrayLike | None, controls: int, horizon: float) 
 
 
 def _is_nested(given: npt.ArrayLike) -> bool:
+    """Return True where weights are given as rows."""
     if isinstance(given, np.ndarray):
         return given.ndim > 1
     return isinstance(given, list | tuple) and any(isinstance(row, list | tuple | np.ndarray) for row in given)
 
 
 def _rows(given: npt.ArrayLike, controls: int, horizon: float) -> Array:
+    """Return rows ``(r, 1 + m)`` of a time and the weights from then on; raise `InputError`."""
     expected = f"rows of {1 + controls} numbers, a time and a weight for every control"
     try:
         rows = np.array(given, dtype=float)
@@ -267,14 +365,31 @@ def _rows(given: npt.ArrayLike, controls: int, horizon: float) -> Array:
 
 
 def by_time(weights: object) -> tuple[Array, Array]:
-    """The times ``(r,)`` from which `checked_weights` count, the first of them 0, and these, ``(r, m)``."""
+    """Return the times ``(r,)`` from which weights hold, the first of them 0, and the weights ``(r, m)``.
+
+    The argument is the result of `checked_weights`.
+    """
     rows = np.asarray(weights, dtype=float)
     return (np.zeros(1), rows[None]) if rows.ndim == 1 else (rows[:, 0], rows[:, 1:])
 
 
 def integrals(weights: object, breakpoints: Array) -> Array:
-    """The integrals ``(m, K)`` of the weights over the pieces between ``breakpoints (K + 1,)``, also where they change
-    within a piece: exact but for the rounding of the sums."""
+    """Return the integrals of the weights over intervals of time.
+
+    Weights may change within an interval. The integrals are exact except for the rounding of the sums.
+
+    Parameters
+    ----------
+    weights : array (m,) or (r, 1 + m)
+        The result of `checked_weights`.
+    breakpoints : array (K + 1,)
+        The times between which the intervals lie.
+
+    Returns
+    -------
+    array (m, K)
+        The integral of each weight over each interval.
+    """
     times, values = by_time(weights)
     begins, ends = breakpoints[:-1], breakpoints[1:]
     if times.size == 1:
@@ -284,15 +399,32 @@ def integrals(weights: object, breakpoints: Array) -> Array:
 
 
 def counted(weights: object) -> Array:
-    """What a control counts per time that it acts ``(m,)``: its weight, and 1 where weights change with time, since
-    activity counts time and not what it costs."""
+    """Return the number ``(m,)`` by which each control counts per time that it is active.
+
+    The number is the weight of the control. It is 1 where weights change with time, since activity measures time and
+    not cost.
+    """
     rows = np.asarray(weights, dtype=float)
     return rows if rows.ndim == 1 else np.ones(rows.shape[1] - 1)
 
 
 def weights_between(weights: object, begin: float, horizon: float) -> Array:
-    """The weights of the times from ``begin`` on for as long as ``horizon``, with times that are counted from
-    ``begin``."""
+    """Return the weights that remain from one time on, with times counted from there.
+
+    Parameters
+    ----------
+    weights : array (m,) or (r, 1 + m)
+        The result of `checked_weights`.
+    begin : float
+        The time from which the weights remain.
+    horizon : float
+        The duration for which they are needed.
+
+    Returns
+    -------
+    array (m,) or (q, 1 + m)
+        The weights, or rows of a time and the weights from then on.
+    """
     rows = np.asarray(weights, dtype=float)
     if rows.ndim == 1:
         return rows

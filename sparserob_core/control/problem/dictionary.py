@@ -1,4 +1,4 @@
-"""Dictionaries of piecewise constant functions, in which controls and disturbances are written."""
+"""Dictionaries of piecewise constant functions, whose combinations are the controls and the disturbances."""
 
 from __future__ import annotations
 
@@ -18,24 +18,41 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-MOST_VALUES = 100_000_000  # entries of a table of values that is made when asked for (0.8 GB)
+MOST_VALUES = 100_000_000  # entries of the largest table of values that is made (0.8 GB)
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Dictionary:
-    """``N`` linearly independent functions of time, constant on ``K >= N`` pieces.
+    """A list of ``N`` linearly independent functions of time, which are constant on ``K >= N`` intervals.
 
-    ``breakpoints (K + 1,)``: increasing times, the first is 0, the last the horizon. ``values (N, K)``:
-    ``values[i, k]`` is function ``i`` on ``[breakpoints[k], breakpoints[k + 1])``, as an array or as a sparse array of
-    scipy. Raises `InputError` when any of that fails.
+    Parameters
+    ----------
+    breakpoints : array (K + 1,)
+        Increasing times, the first of which is 0 and the last the horizon, in the time unit of the system.
+    values : array (N, K) or sparse array of scipy
+        The values of the functions: ``values[i, k]`` is function ``i`` on ``[breakpoints[k], breakpoints[k + 1])``.
 
-    What is kept of indicators is which function each piece has, and of a sparse array its entries: `control` and
-    `gathered` are the products with ``values`` and its transpose, and need no table of all of them.
+    Raises
+    ------
+    InputError
+        If the times do not increase from 0, a shape is wrong, an entry is not finite, or the functions are linearly
+        dependent.
+
+    Notes
+    -----
+    A dictionary of indicators keeps the function of each interval only, and a sparse dictionary its nonzero entries.
+    The methods `control` and `gathered` multiply by ``values`` and by its transpose without a full table.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> sr.Dictionary([0.0, 1.0, 3.0], [[1.0, 1.0]]).lengths
+    array([1., 2.])
     """
 
     breakpoints: Array
-    _owner: ClassVar[np.ndarray | None] = None  # of indicators: the function (K,) that is 1 on each piece
-    _entries: ClassVar[csr_array | None] = None  # of a sparse array
+    _owner: ClassVar[np.ndarray | None] = None  # for indicators, the function (K,) that is 1 on each interval
+    _entries: ClassVar[csr_array | None] = None  # for a sparse array, its entries
 
     __repr__ = noun
 
@@ -63,8 +80,26 @@ class Dictionary:
 
     @classmethod
     def indicators(cls, breakpoints: npt.ArrayLike, owner: npt.ArrayLike | None = None) -> Dictionary:
-        """One function for each piece, that is 1 on it and 0 elsewhere; or, with ``owner (K,)``, function ``owner[k]``
-        is 1 on piece ``k``: whole numbers from 0 on, each of them at least once. Takes memory for ``K`` numbers."""
+        """Return a dictionary of functions that are 0 or 1, with one function that is 1 on each interval.
+
+        Parameters
+        ----------
+        breakpoints : array (K + 1,)
+            Increasing times, the first of which is 0.
+        owner : array (K,) of int, optional
+            The function that is 1 on each interval: whole numbers from 0 on, each of which occurs. Function ``k``
+            belongs to interval ``k`` unless given.
+
+        Returns
+        -------
+        Dictionary
+            The dictionary, which takes memory for ``K`` numbers.
+
+        Raises
+        ------
+        InputError
+            If the times do not increase from 0, or ``owner`` is not of this form.
+        """
         times = _times(breakpoints)
         if owner is None:
             return cls._made(times, _owner=np.arange(times.size - 1))
@@ -83,21 +118,25 @@ class Dictionary:
 
     @classmethod
     def _made(cls, breakpoints: Array, **kept: object) -> Dictionary:
+        """Return a dictionary with checked fields."""
         made = cls.__new__(cls)
         made._keep(breakpoints=breakpoints, **kept)
         return made
 
     def _keep(self, **kept: object) -> None:
+        """Keep fields of the frozen dictionary."""
         self.__dict__.update(kept)
 
     def by_values(self) -> Dictionary:
-        """Indicators of the pieces, where the functions span every value there: the same controls, written as what they
-        are on each piece; itself where they do not."""
+        """Return the indicators of the intervals where the functions span all values; the dictionary itself elsewhere.
+
+        The controls remain the same; their coefficients become their values on the intervals.
+        """
         full = self.functions == self.pieces and not self.is_indicators
         return Dictionary._made(self.breakpoints, _owner=np.arange(self.pieces)) if full else self
 
     def on(self, breakpoints: npt.ArrayLike) -> Dictionary:
-        """The same functions on as many pieces between other ``breakpoints (K + 1,)``."""
+        """Return the same functions on as many intervals between other ``breakpoints (K + 1,)``; raise `InputError`."""
         times = _times(breakpoints)
         if times.size != self.breakpoints.size:
             raise InputError(f"expected {self.breakpoints.size} breakpoints, got {times.size}", path="dictionary")
@@ -105,14 +144,17 @@ class Dictionary:
 
     @property
     def _kept(self) -> dict[str, object]:
+        """The field that holds the values."""
         if self._owner is not None:
             return {"_owner": self._owner}
         return {"values": self.values} if self._entries is None else {"_entries": self._entries}
 
     @cached_property
     def values(self) -> Array:
-        """The table ``(N, K)`` of all functions on all pieces, made when it is asked for the first time; raises
-        `InputError` where that would take more than 0.8 GB."""
+        """The table ``(N, K)`` of the values of all functions on all intervals, made at the first use.
+
+        Raises `InputError` where the table would take more than 0.8 GB.
+        """
         N, K = self.functions, self.pieces
         if N * K > MOST_VALUES:
             raise InputError(
@@ -126,34 +168,34 @@ class Dictionary:
 
     @property
     def horizon(self) -> float:
-        """Time at which the last piece ends."""
+        """The time at which the last interval ends."""
         return float(self.breakpoints[-1])
 
     @property
     def pieces(self) -> int:
-        """Number ``K`` of pieces."""
+        """The number ``K`` of intervals."""
         return int(self.breakpoints.size - 1)
 
     @cached_property
     def functions(self) -> int:
-        """Number ``N`` of functions."""
+        """The number ``N`` of functions."""
         if self._owner is not None:
             return int(self._owner.max()) + 1
         return int((self.values if self._entries is None else self._entries).shape[0])
 
     @property
     def lengths(self) -> Array:
-        """Length of every piece ``(K,)``."""
+        """The length ``(K,)`` of each interval."""
         return np.diff(self.breakpoints)
 
     @cached_property
     def is_indicators(self) -> bool:
-        """Whether function ``k`` is the indicator of piece ``k``."""
+        """True where function ``k`` is the indicator of interval ``k``."""
         return self._owner is not None and np.array_equal(self._owner, np.arange(self.pieces))
 
     @cached_property
     def sparse(self) -> csr_array:
-        """``values (N, K)`` without the entries that are 0."""
+        """The table ``values (N, K)`` as a sparse array."""
         from scipy.sparse import csr_array
 
         if self._entries is not None:
@@ -165,7 +207,18 @@ class Dictionary:
 
     @shaped
     def control(self, theta: Float[Array, "*n"]) -> Float[Array, "m K"]:
-        """The control ``(m, K)`` on the pieces, from coefficients ``(m N,)``, raveled channel by channel."""
+        """Return the control on the intervals.
+
+        Parameters
+        ----------
+        theta : array (m N,)
+            The coefficients, channel by channel.
+
+        Returns
+        -------
+        array (m, K)
+            The value of each channel on each interval.
+        """
         coefficients = theta.reshape(-1, self.functions)
         if self.is_indicators:
             return coefficients
@@ -173,14 +226,24 @@ class Dictionary:
 
     @shaped
     def summands(self, theta: Float[Array, "*n"]) -> Float[Array, "m K"]:
-        """The sum ``(m, K)`` of the absolute values of what is added up to `control`."""
+        """Return the sums ``(m, K)`` of the absolute values of the terms that are added up in `control`."""
         size = np.abs(theta).reshape(-1, self.functions)
         return self.control(size) if self._owner is not None else np.asarray(size @ np.abs(self._table))
 
     @shaped
     def gathered(self, weights: Float[Array, "*k K m"]) -> Float[Array, "*k N m"]:
-        """Weights ``(..., K, m)`` on the values of a control on the pieces, as weights ``(..., N, m)`` on its
-        coefficients."""
+        """Return the weights on coefficients that are equivalent to weights on the values of a control.
+
+        Parameters
+        ----------
+        weights : array (..., K, m)
+            The weights on the values of the control on the intervals.
+
+        Returns
+        -------
+        array (..., N, m)
+            The weights on the coefficients: the product with ``values``.
+        """
         if self.is_indicators:
             return weights
         if self._owner is None and self._entries is None:
@@ -196,7 +259,7 @@ class Dictionary:
 
     @shaped
     def at(self, pieces: Int[np.ndarray, "*k"]) -> Float[Array, "*nk"]:
-        """The functions on some of the pieces ``(...,)``: ``(N, ...)``."""
+        """Return the values ``(N, ...)`` of the functions on the intervals with given indices ``(...,)``."""
         if self._owner is not None:
             answer = np.zeros((self.functions, pieces.size))
             answer[self._owner[pieces.ravel()], np.arange(pieces.size)] = 1.0
@@ -206,7 +269,7 @@ class Dictionary:
         return np.asarray(self.values[:, pieces])
 
     def merged(self) -> Dictionary:
-        """The same functions on the fewest pieces: adjacent pieces on which all of them agree become one."""
+        """Return the same functions on the fewest intervals: those between which no function changes are joined."""
         if self.is_indicators:
             return self
         keep = np.concatenate([[True], self.changes])
@@ -219,12 +282,12 @@ class Dictionary:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the functions span every piecewise constant function on the merged pieces."""
+        """True where the functions span every piecewise constant function on the merged intervals."""
         return self.is_indicators or self.functions == 1 + int(self.changes.sum())
 
     @cached_property
     def changes(self) -> np.ndarray:
-        """Whether any function changes from one piece to the next, ``(K - 1,)``."""
+        """The mask ``(K - 1,)`` that is true where a function changes from one interval to the next."""
         if self._owner is not None:
             return np.asarray(np.diff(self._owner) != 0)
         if self._entries is None:
@@ -235,19 +298,23 @@ class Dictionary:
 
     @property
     def _table(self) -> Array | csr_array:
-        """``values (N, K)`` as they are kept."""
+        """The table ``values (N, K)`` as it is kept, full or sparse."""
         return self.values if self._entries is None else self._entries
 
 
 class DictionaryFactory(ABC):
-    """Makes a dictionary once the horizon is known."""
+    """A dictionary that a config can name; its options are the fields of the class.
+
+    The dictionary is built when the horizon is known.
+    """
 
     @abstractmethod
     def build(self, horizon: float) -> Dictionary:
-        """The dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit the horizon."""
+        """Return the dictionary on ``[0, horizon]``; raise `InputError` where the options do not fit the horizon."""
 
 
 def _times(value: object) -> Array:
+    """Return breakpoints as an array; raise `InputError` where they do not increase from 0."""
     breakpoints = _real("breakpoints", value)
     if breakpoints.ndim != 1 or breakpoints.size < 2 or breakpoints[0] != 0.0 or (np.diff(breakpoints) <= 0).any():
         raise InputError(
@@ -257,6 +324,7 @@ def _times(value: object) -> Array:
 
 
 def _real(name: str, value: object) -> Array:
+    """Return an array of finite numbers; raise `InputError`."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
@@ -267,6 +335,7 @@ def _real(name: str, value: object) -> Array:
 
 
 def _sparse(values: object) -> csr_array:
+    """Return a sparse array of finite numbers without stored zeros; raise `InputError`."""
     from scipy.sparse import csr_array
 
     try:
@@ -281,6 +350,7 @@ def _sparse(values: object) -> csr_array:
 
 
 def _at_most(functions: int, pieces: int) -> None:
+    """Raise `InputError` where there are more functions than intervals."""
     if functions > pieces:
         raise InputError(
             f"{functions} functions on {pieces} pieces; there can be at most as many functions as pieces, or they are"
@@ -290,6 +360,7 @@ def _at_most(functions: int, pieces: int) -> None:
 
 
 def _dependent(values: Array) -> InputError:
+    """Return the error for functions that are linearly dependent."""
     return InputError(
         f"the {values.shape[0]} functions must be linearly independent, their rank is {np.linalg.matrix_rank(values)}",
         path="dictionary",
@@ -297,7 +368,7 @@ def _dependent(values: Array) -> InputError:
 
 
 def _owner(values: Array) -> np.ndarray | None:
-    """The function that is 1 on each piece, ``(K,)``; ``None`` for other functions than indicators."""
+    """Return the function ``(K,)`` that is 1 on each interval; ``None`` where the functions are no indicators."""
     owner: np.ndarray = values.argmax(axis=0)
     ones = values[owner, np.arange(owner.size)] == 1.0
     if not ones.all() or np.count_nonzero(values) != owner.size or np.unique(owner).size != values.shape[0]:
@@ -306,13 +377,16 @@ def _owner(values: Array) -> np.ndarray | None:
 
 
 def _orthogonal(entries: csr_array) -> bool:
-    """Whether the rows are orthogonal to one another, and none is 0."""
+    """Return True where the rows are orthogonal to one another, and none of them is 0."""
     gram = (entries @ entries.T).tocoo()
     return bool((np.diff(entries.indptr) > 0).all() and (gram.data[gram.row != gram.col] == 0.0).all())
 
 
 def _independent(values: Array) -> bool:
-    """Full row rank; disjoint supports and orthogonal rows are recognised without a singular value decomposition."""
+    """Return True where a table has full row rank.
+
+    Disjoint supports and orthogonal rows are recognised without a singular value decomposition.
+    """
     occupied = values != 0
     if not occupied.any(axis=1).all():
         return False

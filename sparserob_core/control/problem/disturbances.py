@@ -1,12 +1,14 @@
-"""Several disturbances of one problem, and the one that they are together.
+"""Several disturbances of one problem, and the single disturbance that replaces them.
 
-Disturbances ``E_i w_i`` of one class, with ``w_i`` in ``W_i``, push the state as ``[E_1 E_2 ...] w`` does, with ``w``
-in the product of the ``W_i``: every signal of the one is a signal of the other. So a problem that lists them is a
-problem with one, and whatever is proven of one disturbance is proven of a list. Of two classes they are one in a
-`Product`, each part of it of a class of its own; what each class does is that of the set that is 0 along the columns of
-the other, and both add up (`apart`). One that acts in a window of time alone
-enters a system that takes turns, whose ``E`` is 0 outside of the window. Those that are constant on pieces of their own
-are one on the pieces of all, of which some parts stay what they are from one to the next.
+Disturbances ``E_i w_i`` with ``w_i`` in ``W_i`` act as ``[E_1 E_2 ...] w`` does, with ``w`` in the product of the
+``W_i``: each signal of the list is a signal of the product, and the reverse. A problem with a list is therefore a
+problem with one disturbance, and every proof for one disturbance holds for the list.
+
+* Two classes: the single disturbance is a `Product`, each part of which has its own class. The disturbances of one
+  class are in the set that is 0 along the columns of the other class; the effects of both classes are added (`apart`).
+* A window of time: the disturbance enters a system with several phases, in which ``E`` is 0 outside of the window.
+* Different grids: the single disturbance is constant on the intervals of the common refinement. A part that has a
+  coarser grid is held over several of these intervals.
 """
 
 from __future__ import annotations
@@ -37,10 +39,35 @@ Breakpoints: TypeAlias = tuple[Array | None, ...]
 @final
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """One of several disturbances: its bounded ``set``, how it enters, ``E (d, mw)`` as in `LinearSystem` (that of the
-    system unless given), its ``kind``, the class of functions that it may be, the window ``[start, stop]`` in which it
-    acts, ``stop`` is the horizon when ``None``, and the ``breakpoints (K + 1,)`` between which it is constant,
-    increasing from 0 to the horizon; those of the disturbance's dictionary when ``None``."""
+    """A disturbance of a problem that has several of them, with its own set, matrix, class, window of time and grid.
+
+    Parameters
+    ----------
+    set : ConvexSet
+        The bounded set of the disturbance ``(mw,)``.
+    E : array (d, mw) or function of the parameters, optional
+        The matrix by which the disturbance enters, as in `LinearSystem`; the ``E`` of the system unless given.
+    kind : {"piecewise_constant", "measurable", "l1_ball"}, default "piecewise_constant"
+        The class of the functions of time; see `OptimalControlProblem`.
+    start : float, default 0.0
+        The time, in the time unit of the system, at which the disturbance begins to act.
+    stop : float, optional
+        The time at which the disturbance ceases to act; the horizon unless given.
+    breakpoints : array (K + 1,), optional
+        The times between which the disturbance is constant, increasing from 0 to the horizon. They are those of the
+        disturbance's dictionary unless given.
+
+    Notes
+    -----
+    The fields are checked when a problem is made of the disturbances.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> gust = sr.Disturbance(sr.Box([-0.01], [0.01]), [[0], [1]], start=1.0)
+    >>> gust.kind
+    'piecewise_constant'
+    """
 
     set: ConvexSet
     E: Matrix | None = None
@@ -55,7 +82,25 @@ class Disturbance:
         sealed(self)
 
     def entering(self, where: str, phase: Phase) -> Phase:
-        """A phase under this disturbance alone; raises `InputError` where it does not fit."""
+        """Return a phase under this disturbance alone.
+
+        Parameters
+        ----------
+        where : str
+            The key of a config at which the disturbance stands, for messages.
+        phase : Phase
+            The phase, with the ``E`` of the system.
+
+        Returns
+        -------
+        Phase
+            The phase with the ``E`` of this disturbance, where that is given.
+
+        Raises
+        ------
+        InputError
+            If ``E`` does not fit the phase.
+        """
         if self.E is None:
             return phase
         try:
@@ -67,9 +112,34 @@ class Disturbance:
 def joined(
     system: System, every: Sequence[Disturbance], horizon: float
 ) -> tuple[System, ConvexSet, Classes, Breakpoints | None]:
-    """The system under all of these disturbances side by side until the ``horizon``, the set of them together, their
-    class, or that of every part of the set, and the breakpoints of every part where one has its own; raises
-    `InputError` that begins with ``disturbance`` and the number of the one at fault."""
+    """Return a system under all disturbances together, and the single disturbance that replaces them.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    every : sequence of Disturbance
+        The disturbances; at least one.
+    horizon : float
+        The time until which the system is considered.
+
+    Returns
+    -------
+    system : System
+        The system, whose ``E`` has the columns of all disturbances, one disturbance after another. They are 0 in phases
+        outside of a window.
+    set : ConvexSet
+        The product of the sets.
+    classes : str or tuple of str
+        The class of the disturbances; one class for each part of the product where they differ.
+    breakpoints : tuple or None
+        The breakpoints of each part, or ``None`` for a part without its own; ``None`` where no part has its own.
+
+    Raises
+    ------
+    InputError
+        If a disturbance does not fit; the error begins with ``disturbance`` and its number.
+    """
     kind, first = every[0].kind, system.phases[0]
     for i, one in enumerate(every):
         if one.kind not in get_args(DisturbanceClass):
@@ -104,8 +174,23 @@ def joined(
 
 
 def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
-    """The set of the disturbances in ``bound`` that are of one class, which is 0 along the columns of others; ``None``
-    where there are none."""
+    """Return the set of the disturbances of one class, which is 0 along the columns of the other classes.
+
+    Parameters
+    ----------
+    bound : ConvexSet or None
+        The set of all disturbances ``(mw,)``.
+    classes : str or tuple of str
+        The class of all disturbances, or of each part of the set.
+    kind : str
+        The class that is selected.
+
+    Returns
+    -------
+    ConvexSet or None
+        The set in all ``mw`` coordinates; ``None`` where there are no disturbances. A single class that is another one
+        also gives ``None``.
+    """
     if bound is None or isinstance(classes, str):
         return bound if classes == kind else None
     every = zip(bound.factors, classes, strict=True)
@@ -113,14 +198,29 @@ def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> 
 
 
 def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np.ndarray:
-    """Which columns of ``E`` are of disturbances of one class, ``(mw,)``."""
+    """Return the columns of ``E`` whose disturbances are of one class, as a mask.
+
+    Parameters
+    ----------
+    bound : ConvexSet
+        The set of all disturbances ``(mw,)``.
+    classes : str or tuple of str
+        The class of all disturbances, or of each part of the set.
+    kind : str
+        The class that is selected.
+
+    Returns
+    -------
+    array (mw,) of bool
+        True for the columns of this class.
+    """
     if isinstance(classes, str):
         return np.full(bound.dimension, classes == kind)
     return np.repeat([one == kind for one in classes], [part.dimension for part in bound.factors])
 
 
 def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: float) -> Array | None:
-    """The breakpoints of one of several disturbances, ``None`` where it has none of its own."""
+    """Return the own breakpoints of one of several disturbances, or ``None`` where it has none; raise `InputError`."""
     if one.breakpoints is None:
         return None
     if {other.kind for other in every} != {"piecewise_constant"}:
@@ -141,10 +241,12 @@ def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: fl
 
 
 def _nothing(dimension: int) -> ConvexSet:
+    """Return the set of so many coordinates that holds 0 alone."""
     return Box(np.zeros(dimension), np.zeros(dimension))
 
 
 def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:
+    """Return the times between which a disturbance acts; raise `InputError` for a window outside of the horizon."""
     start, stop = float(one.start), horizon if one.stop is None else float(one.stop)
     if not (0.0 <= start <= stop - SAME_TIME * horizon and stop <= horizon):
         raise InputError(
@@ -156,7 +258,23 @@ def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]
 
 
 def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[Phase]:
-    """The phases of a system, cut at more times than its own, but not at rounding."""
+    """Yield the phases of a system until the horizon, divided at further times.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    cuts : collection of float
+        The times at which phases are divided, in any order. A time that differs from an end of a phase only by rounding
+        is ignored.
+    horizon : float
+        The time at which the last phase ends.
+
+    Yields
+    ------
+    Phase
+        The phases in the order of time.
+    """
     for phase in system.until(horizon):
         begin, until = phase.begin, phase.until
         for time in sorted(cuts):
@@ -167,12 +285,13 @@ def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[Ph
 
 
 def _columns(phase: Phase) -> Entries:
-    """``E`` as an array, expressions or a function."""
+    """Return ``E`` of a phase as an array, as expressions or as a function."""
     entry: Entries = phase.E  # type: ignore[assignment]  # a phase has made it one of these
     return entry
 
 
 def _checked(where: str, bound: object, phase: Phase) -> ConvexSet:
+    """Return the set of a disturbance; raise `InputError` where it is unbounded or does not fit ``E``."""
     if not isinstance(bound, ConvexSet):
         raise InputError(path=where, expected="a convex set, such as Box", got=f"{type(bound).__name__}")
     if bound.dimension != phase.disturbances:

@@ -1,4 +1,4 @@
-"""Arithmetic expressions in named parameters, parsed against a whitelist and never evaluated as code."""
+"""Arithmetic expressions in named parameters, which are parsed against a whitelist and never executed as code."""
 
 from __future__ import annotations
 
@@ -35,15 +35,27 @@ _LENGTH, _NODES, _DEPTH = 1000, 400, 40
 
 @dataclass(frozen=True, eq=False)
 class Expression:
-    """A parsed expression: ``text`` as written, the ``names`` that occur in it, and how to evaluate it."""
+    """A parsed expression in named parameters.
+
+    Parameters
+    ----------
+    text : str
+        The expression as the user wrote it.
+    names : frozenset of str
+        The names that occur in it.
+    evaluation : function
+        The function that takes a mapping from names to values and returns the value.
+    """
 
     text: str
     names: frozenset[str]
     evaluation: Evaluation
 
     def __call__(self, values: Mapping[str, Value]) -> Value:
-        """Its value for parameter values by name; arrays are taken entry by entry. NaN or infinite where it is
-        undefined."""
+        """Return the value for the given values of the names.
+
+        Arrays are taken entry by entry. The value is NaN or infinite where the expression is undefined.
+        """
         with np.errstate(all="ignore"):
             return self.evaluation(values)
 
@@ -52,11 +64,29 @@ class Expression:
 
 
 def parse_expression(source: str | float, names: Sequence[str]) -> Expression:
-    """Parse numbers, the given names, ``pi``, ``e``, ``+ - * / **`` (or ``^``), parentheses, the functions sin, cos,
-    tan, exp, sqrt, log, tanh, and ``kepler(M, e)``: the ``E`` with ``E - e sin E = M``, for a number ``0 <= e < 1``.
+    """Return the expression that a text or a number stands for.
 
-    Raises `InputError`, which names the expression, the part at fault and the known parameters. Lengths and depths are
-    limited.
+    An expression consists of numbers, the given names, ``pi``, ``e``, ``+ - * / **`` (or ``^``), parentheses, and the
+    functions sin, cos, tan, exp, sqrt, log, tanh. ``kepler(M, e)`` is the ``E`` with ``E - e sin E = M``, for a number
+    ``0 <= e < 1``.
+
+    Parameters
+    ----------
+    source : str or float
+        The text or the number.
+    names : sequence of str
+        The names that may occur.
+
+    Returns
+    -------
+    Expression
+        The parsed expression.
+
+    Raises
+    ------
+    InputError
+        If the text is no such expression, or is too long or too deeply nested. The error names the expression, the part
+        at fault and the known parameters.
     """
     text = str(source)
     if len(text) > _LENGTH:
@@ -72,17 +102,19 @@ def parse_expression(source: str | float, names: Sequence[str]) -> Expression:
 
 
 class _Parser:
-    """One walk over a syntax tree; every node is either on the whitelist or an error."""
+    """A parser that visits each node of a syntax tree once; a node that is not on the whitelist is an error."""
 
     def __init__(self, text: str, names: tuple[str, ...]) -> None:
         self.text, self.names = text, names
         self.seen: set[str] = set()
 
     def expression(self, tree: ast.expr) -> Expression:
+        """Return the expression of a syntax tree."""
         evaluation = self.parse(tree, 0)
         return Expression(self.text, frozenset(self.seen), evaluation)
 
     def parse(self, node: ast.expr, depth: int) -> Evaluation:
+        """Return the evaluation of a node; raise `InputError` for a node that is too deep or not on the whitelist."""
         if depth > _DEPTH:
             raise self.fault(f"nested more than {_DEPTH} deep")
         if isinstance(node, ast.Constant):
@@ -105,6 +137,7 @@ class _Parser:
         )
 
     def number(self, node: ast.Constant) -> Evaluation:
+        """Return the evaluation of a number."""
         if isinstance(node.value, bool) or not isinstance(node.value, int | float):
             raise self.fault(f"{node.value!r} is not a real number")
         try:
@@ -114,6 +147,7 @@ class _Parser:
         return lambda values: value
 
     def name(self, name: str) -> Evaluation:
+        """Return the evaluation of a parameter or of a constant such as ``pi``."""
         if name in self.names:
             self.seen.add(name)
             return lambda values: values[name]
@@ -125,10 +159,12 @@ class _Parser:
         )
 
     def sign(self, node: ast.UnaryOp, depth: int) -> Evaluation:
+        """Return the evaluation of a signed operand."""
         operand = self.parse(node.operand, depth + 1)
         return (lambda values: -operand(values)) if isinstance(node.op, ast.USub) else operand
 
     def call(self, node: ast.Call, depth: int) -> Evaluation:
+        """Return the evaluation of a function of one argument, or of ``kepler``."""
         name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
         if name == KEPLER:
             return self.kepler(node, depth)
@@ -140,6 +176,7 @@ class _Parser:
         return lambda values: function(argument(values))
 
     def kepler(self, node: ast.Call, depth: int) -> Evaluation:
+        """Return the evaluation of ``kepler(M, e)``, in which ``e`` is a number."""
         if len(node.args) != 2 or node.keywords or any(isinstance(one, ast.Starred) for one in node.args):
             raise self.fault("kepler takes two arguments, as in kepler(M, 0.2)")
         seen, self.seen = self.seen, set()
@@ -156,15 +193,25 @@ class _Parser:
         return lambda values: kepler(anomaly(values), eccentricity)
 
     def nearest(self, name: str) -> str:
+        """Return a suggestion for an unknown name; empty where no known name is close."""
         close = difflib.get_close_matches(name, [*self.names, *CONSTANTS], n=1)
         return f", did you mean {close[0]!r}?" if close else ""
 
     def fault(self, reason: str) -> InputError:
+        """Return the error for this expression."""
         return InputError(f"expression {self.text!r}: {reason}")
 
 
 def kepler(anomaly: Value, eccentricity: float) -> Value:
-    """The eccentric anomaly ``E`` with ``E - e sin E = M``, of numbers, arrays, or whatever has a ``kepler``."""
+    """Return the eccentric anomaly ``E`` with ``E - e sin E = M``.
+
+    Parameters
+    ----------
+    anomaly : float, array or object with a method ``kepler``
+        The mean anomaly ``M``, in radians.
+    eccentricity : float
+        The eccentricity ``e``, from 0 to below 1.
+    """
     return anomaly.kepler(eccentricity) if hasattr(anomaly, "kepler") else eccentric_anomaly(anomaly, eccentricity)
 
 
@@ -172,8 +219,26 @@ Definitions: TypeAlias = "tuple[tuple[str, Expression], ...]"
 
 
 def parse_definitions(given: Mapping[str, str | float], names: Sequence[str]) -> Definitions:
-    """Names for expressions in ``names`` and in each other, each after those that it uses, in whatever order they are
-    given. Raises `InputError`, also where names are defined in a circle."""
+    """Return named expressions in an order in which each follows those that it uses.
+
+    Parameters
+    ----------
+    given : mapping
+        The names and their expressions, in any order.
+    names : sequence of str
+        The names of the parameters, which the expressions may contain besides each other's names.
+
+    Returns
+    -------
+    tuple of pairs (str, Expression)
+        The names with their parsed expressions.
+
+    Raises
+    ------
+    InputError
+        If a name has another meaning already, an expression cannot be read, or definitions depend on one another in a
+        cycle.
+    """
     for name in given:
         usable = name.isidentifier() and name not in CONSTANTS and name not in FUNCTIONS and name != KEPLER
         if not usable or name in names or name in keyword.kwlist:
@@ -203,10 +268,18 @@ def parse_definitions(given: Mapping[str, str | float], names: Sequence[str]) ->
 
 @dataclass(frozen=True, eq=False)
 class ExpressionMatrix:
-    """A matrix whose entries are expressions in ``names``; a function of the parameter vector ``p (nu,)``.
+    """A matrix whose entries are expressions in parameters, as a function of the parameter vector ``p (nu,)``.
 
-    ``entries``: rows of `Expression`, in ``names`` and in those of ``defined``. Calling it takes any sequence of ``nu``
-    numbers, arrays or Taylor models.
+    It may be called with any sequence of ``nu`` numbers, arrays or Taylor models.
+
+    Parameters
+    ----------
+    entries : tuple of tuples of Expression
+        The entries, row by row, in the names of the parameters and of the definitions.
+    names : tuple of str
+        The names of the parameters.
+    defined : tuple of pairs (str, Expression), optional
+        The definitions, as `parse_definitions` returns them.
     """
 
     entries: tuple[tuple[Expression, ...], ...]
@@ -215,21 +288,24 @@ class ExpressionMatrix:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """``(rows, columns)``."""
+        """The numbers of rows and of columns."""
         return len(self.entries), len(self.entries[0])
 
     @property
     def is_constant(self) -> bool:
-        """Whether no entry depends on a parameter."""
+        """True where no entry depends on a parameter or a definition."""
         return not any(entry.names for row in self.entries for entry in row)
 
     def __call__(self, p: Iterable[Value]) -> Value:
-        """The matrix at one parameter vector: floats, or an object array when ``p`` holds other things than numbers."""
+        """Return the matrix at one parameter vector ``p (nu,)``.
+
+        It is an array of floats, or an object array where ``p`` holds other things than numbers.
+        """
         values = self._with_defined(dict(zip(self.names, p, strict=True)))
         return np.array([[entry(values) for entry in row] for row in self.entries])
 
     def _with_defined(self, values: dict[str, Value]) -> dict[str, Value]:
-        """The values with those of the definitions, where an entry needs one: each once, whatever uses it."""
+        """Return the values with those of the definitions, where an entry uses any; each one is evaluated once."""
         if any(name in self._defined_names for row in self.entries for entry in row for name in entry.names):
             for name, expression in self.defined:
                 values[name] = expression(values)
@@ -237,10 +313,11 @@ class ExpressionMatrix:
 
     @cached_property
     def _defined_names(self) -> frozenset[str]:
+        """The names that are defined."""
         return frozenset(name for name, _ in self.defined)
 
     def evaluate(self, parameters: Array) -> Array:
-        """The matrices ``(k, rows, columns)`` at parameters ``(k, nu)``."""
+        """Return the matrices ``(k, rows, columns)`` at parameters ``(k, nu)``."""
         values = self._with_defined({name: parameters[:, i] for i, name in enumerate(self.names)})
         out = np.empty((len(parameters), *self.shape))
         for i, row in enumerate(self.entries):
@@ -254,29 +331,50 @@ Entries: TypeAlias = "Array | Callable[..., object] | ExpressionMatrix"
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """Functions of the parameters, or arrays, that make one matrix: one above another along the ``axis`` 0, side by
-    side along 1."""
+    """A matrix of arrays and functions of the parameters, one above another (``axis`` 0) or in a row (1)."""
 
     parts: tuple[Entries, ...]
     axis: int
 
     def __call__(self, p: Iterable[Value]) -> Value:
-        """The matrix at one parameter vector."""
+        """Return the matrix at one parameter vector."""
         return np.concatenate([np.asarray(part(p) if callable(part) else part) for part in self.parts], self.axis)
 
 
 def beside(left: Entries, right: Entries) -> Entries:
-    """Two matrices with as many rows side by side, each an array, expressions or a function of the parameters."""
+    """Return two matrices as one, in a row.
+
+    Parameters
+    ----------
+    left, right : array, expressions or function of the parameters
+        The matrices, which have as many rows.
+
+    Returns
+    -------
+    array, expressions or function of the parameters
+        The matrix; a function where one of the two is a function.
+    """
     return _joined(left, right, 1)
 
 
 def above(upper: Entries, lower: Entries) -> Entries:
-    """Two matrices with as many columns one above the other, each an array, expressions or a function of the
-    parameters."""
+    """Return two matrices as one, one above the other.
+
+    Parameters
+    ----------
+    upper, lower : array, expressions or function of the parameters
+        The matrices, which have as many columns.
+
+    Returns
+    -------
+    array, expressions or function of the parameters
+        The matrix; a function where one of the two is a function.
+    """
     return _joined(upper, lower, 0)
 
 
 def _joined(one: Entries, other: Entries, axis: int) -> Entries:
+    """Return two matrices as one along an axis: as an array, as expressions, or as a function."""
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         return np.concatenate([one, other], axis)
     of = next((part for part in (one, other) if isinstance(part, ExpressionMatrix)), None)
@@ -289,7 +387,7 @@ def _joined(one: Entries, other: Entries, axis: int) -> Entries:
 
 
 def _written(part: Entries) -> tuple[tuple[Expression, ...], ...] | None:
-    """The entries of a matrix as expressions; ``None`` for a function."""
+    """Return the entries of a matrix as expressions, or ``None`` for a function."""
     if isinstance(part, ExpressionMatrix):
         return part.entries
     if not isinstance(part, np.ndarray):
@@ -298,14 +396,36 @@ def _written(part: Entries) -> tuple[tuple[Expression, ...], ...] | None:
 
 
 def _number(value: np.float64) -> Expression:
+    """Return a number as an expression."""
     return Expression(repr(float(value)), frozenset(), lambda values: value)
 
 
 def parse_matrix(
     name: str, rows: Sequence[Sequence[str | float]], names: Sequence[str], defined: Definitions = ()
 ) -> ExpressionMatrix:
-    """A matrix of numbers and expressions, given row by row, in ``names`` and in those of ``defined``; ``name`` is for
-    the errors (`InputError`)."""
+    """Return a matrix of numbers and expressions.
+
+    Parameters
+    ----------
+    name : str
+        The key of a config at which the matrix stands, for messages.
+    rows : rows of numbers and expressions
+        The entries, row by row.
+    names : sequence of str
+        The names of the parameters.
+    defined : tuple of pairs (str, Expression), optional
+        The definitions that entries may use.
+
+    Returns
+    -------
+    ExpressionMatrix
+        The parsed matrix.
+
+    Raises
+    ------
+    InputError
+        If rows differ in length, an entry cannot be read, or a constant entry is not finite.
+    """
     known = [*names, *(one for one, _ in defined)]
     if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
         raise InputError(
@@ -325,16 +445,33 @@ def parse_matrix(
 def parse_column(
     name: str, entries: Sequence[str | float], names: Sequence[str], defined: Definitions = ()
 ) -> ExpressionMatrix:
-    """A matrix of one column; as `parse_matrix`."""
+    """Return a matrix of one column from its entries, which are numbers and expressions.
+
+    Parameters
+    ----------
+    name : str
+        The key of a config at which the column stands, for messages.
+    entries : sequence of str and float
+        The entries.
+    names : sequence of str
+        The names of the parameters.
+    defined : tuple of pairs (str, Expression), optional
+        The definitions that entries may use.
+
+    Raises
+    ------
+    InputError
+        If an entry cannot be read, or a constant entry is not finite.
+    """
     try:
         return parse_matrix(name, [[entry] for entry in entries], names, defined)
     except InputError as error:
-        error.path = error.path[:-1]  # every row has one entry
+        error.path = error.path[:-1]  # a row has one entry, whose index in the row says nothing
         raise
 
 
 def _finite(expression: Expression) -> Expression:
-    """The same expression; raises `InputError` for a constant that is not a finite number."""
+    """Return the expression itself; raise `InputError` where it is a constant that is not a finite number."""
     if not expression.names and not np.isfinite(expression({})):
         raise InputError(f"expression {expression.text!r}: its value is not a finite number")
     return expression

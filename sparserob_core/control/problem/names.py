@@ -1,4 +1,4 @@
-"""What the states, controls and disturbances of a problem are called, and what they are measured in."""
+"""The names and the units of the states, controls and disturbances of a problem."""
 
 from __future__ import annotations
 
@@ -15,14 +15,27 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 KINDS = {"states": "x", "controls": "u", "disturbances": "w"}
-ROUNDING = 1e-12  # of the largest entry of a direction: products that are added up in another order differ by less
+ROUNDING = 1e-12  # relative to the largest entry of a direction; the order of summation changes a product by less
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """The corners of the parameters beside the time, one row of the larger problem each (`at_corners`), with the
-    ``values (k, nu)`` of the parameters called ``names``; none where there are no such parameters."""
+    """The corners of the box of parameters, for a system that depends on the time and on parameters.
+
+    The state of such a problem is larger: it holds further states, by which the parameters act. At each corner one
+    matrix gives the states of the user from the larger state (`at_corners`). Without such parameters all fields are
+    empty.
+
+    Parameters
+    ----------
+    rows : list of arrays (d, size)
+        The matrix of each corner: the identity, and the factors of the further states.
+    values : array (k, nu)
+        The parameters at each corner.
+    names : sequence of str
+        The names of the parameters.
+    """
 
     rows: list[Array] = field(default_factory=list)
     values: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -33,13 +46,26 @@ class Corners:
 
     @property
     def added(self) -> tuple[int, int]:
-        """The first of the states that parameters add, and the one after the last of them."""
+        """The index of the first state that parameters add, and the index after the last of these states."""
         d, size = self.rows[0].shape if self.rows else (0, 0)
         return d, size
 
     def everywhere(self, directions: Array) -> tuple[np.ndarray, Array]:
-        """Rows ``(k, d)`` of ``directions (q, d)``, after the number of each, at every corner; one that looks at no
-        state which the parameters reach is there once."""
+        """Return directions at every corner of the parameters.
+
+        Parameters
+        ----------
+        directions : array (q, n)
+            The directions in the ``n`` states of the larger problem.
+
+        Returns
+        -------
+        numbers : array (k,)
+            The index of the direction to which each row belongs.
+        rows : array (k, n)
+            The directions with their components along the states that parameters add. A direction that no parameter
+            changes occurs once.
+        """
         if not self.rows:
             return np.arange(len(directions)), directions
         d, size = self.added
@@ -49,18 +75,33 @@ class Corners:
         return np.repeat(np.arange(len(kept)), [len(part) for part in kept]), np.concatenate(kept)
 
     def without(self, direction: Array) -> Array:
-        """A direction without what the parameters add to the states."""
+        """Return a direction whose components along the states that parameters add are 0."""
         d, size = self.added
         return np.concatenate([direction[:d], np.zeros(size - d), direction[size:]])
 
     def own(self, states: int) -> list[int]:
-        """Those of so many states that no parameter added: what parameters add is in the tubes of the others."""
+        """Return the indices of those of ``states`` states that no parameter added.
+
+        The tubes of the returned states contain the effect of the parameters.
+        """
         d, size = self.added
         return [*range(d), *range(size, states)]
 
     def stated(self, direction: Array, states: Array) -> Array:
-        """Trajectories ``(n, T)`` of all states, with the first of them at the corner that a direction is nearest
-        to."""
+        """Return trajectories of which the first ``d`` states are those at the corner of a direction.
+
+        Parameters
+        ----------
+        direction : array (n,)
+            The direction in the ``n`` states of the larger problem; the corner that fits it best is used.
+        states : array (n, T)
+            The trajectories of these states at ``T`` times.
+
+        Returns
+        -------
+        array (n, T)
+            The trajectories; where there are no corners, they are returned as they are.
+        """
         if not self.rows:
             return states
         d, size = self.added
@@ -68,8 +109,14 @@ class Corners:
         return np.concatenate([corner @ states[:size], states[d:]])
 
     def at(self, direction: Array) -> str | None:
-        """The parameters whose corner a direction is about, such as ``gain = 0.1``; empty where it is about all,
-        ``None`` where it is about none alone."""
+        """Return the parameters to whose corner a direction belongs, such as ``gain = 0.1``.
+
+        Returns
+        -------
+        str or None
+            The parameters whose value the direction determines, in words; empty where it determines none. ``None``
+            where the direction belongs to no corner.
+        """
         if not self.rows:
             return None
         d, size = self.added
@@ -85,14 +132,36 @@ class Corners:
 @final
 @dataclass(frozen=True, kw_only=True)
 class Names:
-    """Names and units for messages, tables, figures and recordings; they change no number.
+    """The names and units of states, controls and disturbances, for messages, tables, figures and recordings.
 
-    ``states``, ``controls``, ``disturbances``: one name each, or nothing: then they are ``x1``, ``u1``, ``w1`` and
-    so on; ``state_units``, ``control_units``, ``disturbance_units``: one unit each, such as ``m/s`` (empty:
-    none is known), and ``time`` the unit of time. ``plane``: the two states that are a place, first the one that is
-    drawn to the right, then the one upwards, for a figure of where the system moves. ``corners``: of a problem that
-    parameters beside the time made larger, by which its rows are told as those of the stated one. Raises `InputError`
-    for a name that is empty or occurs twice, and for a plane that is none.
+    Names and units change no number.
+
+    Parameters
+    ----------
+    states, controls, disturbances : sequence of str, optional
+        One name each; ``x1``, ``u1``, ``w1`` and so on unless given.
+    state_units, control_units, disturbance_units : sequence of str, optional
+        One unit each, such as ``m/s``; an empty text where a unit is not known. No units are known unless given.
+    time : str, default ""
+        The unit of time.
+    plane : sequence of two str, optional
+        The names of two states that are a position, for a figure of the path in the plane. The first one is drawn to
+        the right, the second one upwards.
+    corners : Corners
+        The corners of the parameters, by which a larger problem is reported in the states of the user. Users do not
+        give them.
+
+    Raises
+    ------
+    InputError
+        If a name is empty or occurs twice, or if ``plane`` does not name two different states with the same unit.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> names = sr.Names(states=["position", "speed"], state_units=["m", "m/s"], time="s")
+    >>> names.state(1)
+    'speed'
     """
 
     states: Sequence[str] = ()
@@ -132,18 +201,29 @@ class Names:
 
     @property
     def in_plane(self) -> tuple[int, int] | None:
-        """The positions of the two states that are a place; ``None`` where the problem has not said any."""
+        """The indices of the two states that are a position in the plane; ``None`` where none are given."""
         across, up = [self._place(name) for name in self.plane] or [None, None]
         return None if across is None or up is None else (across, up)
 
     def _place(self, name: str) -> int | None:
-        """The position of a state of that name."""
+        """Return the index of the state with a name, or ``None`` where no state has it."""
         if self.states:
             return self.states.index(name) if name in self.states else None
         return int(name[1:]) - 1 if re.fullmatch("x[1-9][0-9]*", name) else None
 
     def fitting(self, states: int, controls: int, disturbances: int) -> Names:
-        """The same names, checked against how many there are; raises `InputError`."""
+        """Return the names themselves, after a check of their number.
+
+        Parameters
+        ----------
+        states, controls, disturbances : int
+            The numbers of states, controls and disturbances of the problem.
+
+        Raises
+        ------
+        InputError
+            If the number of names or units of a kind is another one.
+        """
         for kind, count in (("states", states), ("controls", controls), ("disturbances", disturbances)):
             for key, given in ((kind, getattr(self, kind)), (f"units.{kind}", getattr(self, f"{kind[:-1]}_units"))):
                 if given and len(given) != count:
@@ -157,21 +237,23 @@ class Names:
         return self
 
     def state(self, index: int) -> str:
-        """The name of a state, such as ``x1``."""
+        """Return the name of the state with an index from 0 on, such as ``x1``."""
         return self.states[index] if self.states else f"x{index + 1}"
 
     def control(self, index: int) -> str:
-        """The name of a control, such as ``u1``."""
+        """Return the name of the control with an index from 0 on, such as ``u1``."""
         return self.controls[index] if self.controls else f"u{index + 1}"
 
     def disturbance(self, index: int) -> str:
-        """The name of a component of the disturbance, such as ``w1``."""
+        """Return the name of the component of the disturbance with an index from 0 on, such as ``w1``."""
         return self.disturbances[index] if self.disturbances else f"w{index + 1}"
 
     @property
     def effort(self) -> str:
-        """The unit of a control's integral over time, where every control has the same; empty where it is not known. A
-        rate's time cancels: ``l/s`` over ``s`` is ``l``, ``m/s^2`` over ``s`` is ``m/s``."""
+        """The unit of the integral of a control over time; empty where it is not known or controls differ in unit.
+
+        The time of a rate cancels: ``l/s`` over ``s`` is ``l``, and ``m/s^2`` over ``s`` is ``m/s``.
+        """
         unit = next(iter(self.control_units), "")
         if not unit or not self.time or set(self.control_units) != {unit}:
             return ""
@@ -181,6 +263,7 @@ class Names:
         return f"{unit} {self.time}"
 
     def _texts(self, field: str) -> tuple[str, ...]:
+        """Return a field as a tuple of texts, which is kept; raise `InputError` for anything else."""
         given = getattr(self, field)
         if isinstance(given, str) or not all(isinstance(text, str) for text in given):
             raise InputError(path=f"names.{field}", expected="a list of texts", got=f"{given!r}")
@@ -192,8 +275,22 @@ UNNAMED = Names()
 
 
 def measured_in(normal: npt.NDArray[np.float64], names: Names, states: int | None = None) -> str:
-    """The unit of a combination, with a space before it, where all that it adds up has the same; empty elsewhere. What
-    is beyond the number of ``states`` is the control's."""
+    """Return the unit of a linear combination, with a space before it, where all its summands have the same unit.
+
+    Parameters
+    ----------
+    normal : array (n,)
+        The coefficients of the states, followed by those of the controls.
+    names : Names
+        The names and units.
+    states : int, optional
+        The number of states; all coefficients belong to states unless given.
+
+    Returns
+    -------
+    str
+        The unit; empty where the summands differ in unit or a unit is not known.
+    """
     last = normal.size if states is None else states
     units = {
         (names.state_units[i] if names.state_units else "")
@@ -208,8 +305,17 @@ def measured_in(normal: npt.NDArray[np.float64], names: Names, states: int | Non
 def unit_of_row(normal: npt.NDArray[np.float64], names: Names, states: int | None = None) -> str:
     """Return the unit of a row as the user wrote it, with a space before it; empty where it is not known.
 
-    Coefficients may have units themselves, as stiffnesses do. They are numbers where one of them is 1, or where they
-    are a direction of length 1; of others the unit of the row is not known.
+    Coefficients may have units, as stiffnesses do. They are pure numbers where one of them is 1 in absolute value, or
+    where the row is a direction of length 1. For other coefficients the unit of the row is not known.
+
+    Parameters
+    ----------
+    normal : array (n,)
+        The coefficients of the states, followed by those of the controls.
+    names : Names
+        The names and units.
+    states : int, optional
+        The number of states; all coefficients belong to states unless given.
     """
     sizes = np.abs(normal)
     numbers = (sizes == 1.0).any() or abs(np.linalg.norm(sizes) - 1.0) <= ROUNDING
@@ -217,7 +323,10 @@ def unit_of_row(normal: npt.NDArray[np.float64], names: Names, states: int | Non
 
 
 def joined(units: Iterable[str]) -> str:
-    """The unit of a number that is one of several rows', with a space before it: ``m``, or ``m or m/s`` where rows have
-    different ones; empty where one of them is not known."""
+    """Return the unit of a number that belongs to one of several rows, with a space before it.
+
+    The result is ``m`` where all rows have this unit, ``m or m/s`` where rows differ, and empty where a unit is not
+    known.
+    """
     known = list(dict.fromkeys(units))
     return f" {' or '.join(known)}" if known and all(known) else ""

@@ -1,5 +1,7 @@
-"""What a system does between two times: ``x' = A x + B u + E w + c``, whose entries are numbers, or functions of
-uncertain parameters, or of the time and of them."""
+"""A phase of a linear system: ``x' = A x + B u + E w + c`` between two times.
+
+Its entries are numbers, or functions of uncertain parameters, or functions of the time and of these parameters.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +32,37 @@ _Arguments: TypeAlias = npt.NDArray[np.object_]
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """``x' = A x + B u + E w + c`` from the time ``begin`` ``until`` another.
+    """A phase ``x' = A x + B u + E w + c`` of a linear system, from the time ``begin`` until the time ``until``.
 
-    ``A (d, d)``, ``B (d, m)``, ``E (d, mw)`` and ``c (d, 1)`` are arrays, or functions of arguments ``(n,)`` that
-    return such arrays; ``E`` is the identity unless given, and without a ``c`` there is no drift. The arguments are in
-    the bounded ``domain``, which is ``None`` where there are none, and have ``names`` for messages, p1, p2, ... unless
-    given. Of a phase that is ``timed`` the first one is the time. Raises `InputError` when shapes disagree or an entry
-    is not finite somewhere that was looked at.
+    The entries are arrays, or functions of arguments ``(n,)``. The arguments are the uncertain parameters; in a
+    ``timed`` phase the time stands before them.
+
+    Parameters
+    ----------
+    A : array (d, d) or function of the arguments
+        The system matrix.
+    B : array (d, m) or function of the arguments
+        The input matrix.
+    E : array (d, mw) or function of the arguments, optional
+        The matrix by which the disturbance enters; the identity unless given.
+    domain : ConvexSet, optional
+        The bounded set of the arguments; ``None`` (the default) where there are no arguments.
+    names : sequence of str, optional
+        The names of the arguments in messages; ``p1``, ``p2``, ... unless given.
+    c : array (d,) or (d, 1), or function of the arguments, optional
+        The drift, kept as one column; no drift unless given.
+    begin : float, default 0.0
+        The time at which the phase begins.
+    until : float, default infinity
+        The time at which the phase ends.
+    timed : bool, default False
+        True where the first argument is the time.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, if the domain is no bounded set, if the number of names is wrong, or if an entry is not
+        finite at one of the `probes`.
     """
 
     A: Matrix
@@ -68,53 +94,93 @@ class Phase:
 
     @property
     def states(self) -> int:
-        """Number ``d`` of states."""
+        """The number ``d`` of states."""
         return self._shape("A")[0]
 
     @property
     def controls(self) -> int:
-        """Number ``m`` of controls."""
+        """The number ``m`` of controls."""
         return self._shape("B")[1]
 
     @property
     def disturbances(self) -> int:
-        """Number ``mw`` of disturbances that ``E`` takes."""
+        """The number ``mw`` of disturbances, which is the number of columns of ``E``."""
         return self._shape("E")[1]
 
     @property
     def count(self) -> int:
-        """Number ``n`` of arguments, 0 where all entries are numbers."""
+        """The number ``n`` of arguments, 0 where all entries are numbers."""
         return 0 if self.domain is None else self.domain.dimension
 
     @property
     def stated(self) -> Phase:
-        """The phase in the units that it is stated in: itself."""
+        """The phase in the units of the user, where the phase keeps them; here the phase itself."""
         return self
 
     @cached_property
     def forced(self) -> Phase:
-        """The same with its drift as one more column of ``B``, whose control is always 1; itself without a drift."""
+        """The phase whose drift is the last column of ``B``, with a control that is always 1.
+
+        It is the phase itself without a drift.
+        """
         if self.c is None:
             return self
         return replace(self, B=beside(self._entry("B"), self._entry("c")), c=None)
 
     def between(self, begin: float, until: float) -> Phase:
-        """The same from and until other times."""
+        """Return the phase from another time and until another time.
+
+        Parameters
+        ----------
+        begin, until : float
+            The times, in the time unit of the system; the entries do not change.
+        """
         return self if (begin, until) == (self.begin, self.until) else replace(self, begin=begin, until=until)
 
     def drifting(self) -> Phase:
-        """The same with a drift, of 0 where it has none."""
+        """Return the phase with a drift, which is 0 where the phase has none."""
         return self if self.c is not None else replace(self, c=np.zeros((self.states, 1)))
 
     def within(self, parameters: ConvexSet | None, names: Sequence[str]) -> Phase:
-        """The same, its uncertain parameters in this set and with these names."""
+        """Return the phase whose uncertain parameters are in another set and have other names.
+
+        Parameters
+        ----------
+        parameters : ConvexSet or None
+            The set of the parameters without the time; a bounded box where the phase is timed.
+        names : sequence of str
+            The names of these parameters.
+
+        Returns
+        -------
+        Phase
+            The phase with the new domain; a timed phase keeps the name of its time.
+
+        Raises
+        ------
+        InputError
+            If the phase is timed and the set is no bounded box.
+        """
         if self.timed:
             box = None if parameters is None else boxed(parameters)
             return replace(self, domain=and_time(self.begin, self.until, box), names=(*self.names[:1], *names))
         return self if parameters is self.domain else replace(self, domain=parameters, names=tuple(names))
 
     def later(self, begin: float, until: float, later: float) -> Phase:
-        """The same from and until other times, of a clock that shows 0 so much ``later``."""
+        """Return the phase on a clock that shows 0 at the time ``later`` of the present clock.
+
+        Parameters
+        ----------
+        begin, until : float
+            The times between which the phase holds, on the new clock.
+        later : float
+            The time of the present clock at which the new clock shows 0.
+
+        Returns
+        -------
+        Phase
+            The phase whose entries at the time ``t`` are those of this phase at ``t + later``.
+        """
         if not self.timed:
             return self.between(begin, until)
         assert isinstance(self.domain, Box)
@@ -123,7 +189,7 @@ class Phase:
         return self._through(partial(_moved, later), domain, self.names, begin, until)
 
     def at(self, parameter: Array) -> Phase:
-        """The known phase at one uncertain ``parameter (nu,)``."""
+        """Return the known phase at one value ``(nu,)`` of the uncertain parameter."""
         if not self.timed:
             A, B, E = (part[0] for part in self.matrices(parameter[None]))
             drift = None if self.c is None else self._values("c", parameter[None])[0]
@@ -132,11 +198,27 @@ class Phase:
         return self._through(partial(_with_parameter, parameter), domain, (TIME,), self.begin, self.until)
 
     def during(self, time: float, parameters: ConvexSet | None) -> Phase:
-        """A timed phase as it is at one ``time``, whose arguments are the uncertain ``parameters`` alone."""
+        """Return a timed phase at one time, as a phase with constant entries in time.
+
+        Parameters
+        ----------
+        time : float
+            The time.
+        parameters : ConvexSet or None
+            The set of the uncertain parameters, which are the arguments of the new phase.
+
+        Returns
+        -------
+        Phase
+            The phase, which is not timed and has no end.
+        """
         return self._through(partial(_at_time, time), parameters, self.names[1:], timed=False)
 
     def in_time(self, until: float) -> Phase:
-        """The same as one that is timed, up to a time. Raises `InputError` where its parameters are in no box."""
+        """Return the phase as a timed phase that ends at ``until``.
+
+        Raises `InputError` where the domain is no bounded box.
+        """
         domain = and_time(self.begin, until, None if self.domain is None else boxed(self.domain))
         return self._through(_without_time, domain, (TIME, *self.names), self.begin, until)
 
@@ -149,15 +231,41 @@ class Phase:
         until: float = np.inf,
         timed: bool = True,
     ) -> Phase:
-        """The phase whose entries are functions of other ``arguments``."""
+        """Return the phase whose entries are functions of other arguments.
+
+        Parameters
+        ----------
+        arguments : function
+            The function that takes the new arguments and returns those of this phase.
+        domain : ConvexSet or None
+            The set of the new arguments.
+        names : sequence of str
+            The names of the new arguments.
+        begin, until : float
+            The times between which the new phase holds.
+        timed : bool
+            True where the first of the new arguments is the time.
+        """
         A, B, E, c = (through(self.entry(name), arguments) for name in PARTS)
         assert A is not None and B is not None
         return Phase(A, B, E, domain, names, c, begin, until, timed)
 
     @shaped
     def accumulating(self, rows: Float[Array, "k d"], inputs: Float[Array, "k m"]) -> Phase:
-        """The same with ``k`` more states after its own, ``z' = rows x + inputs u(t - delay)``: integrals of what its
-        state and its control do."""
+        """Return the phase with ``k`` more states, ``z' = rows x + inputs u(t - delay)``, after its own states.
+
+        Parameters
+        ----------
+        rows : array (k, d)
+            The factors of the state in the derivatives of the new states.
+        inputs : array (k, m)
+            The factors of the control in the derivatives of the new states.
+
+        Returns
+        -------
+        Phase
+            The phase with ``d + k`` states, the last ``k`` of which are integrals of state and control.
+        """
         k, d = rows.shape
         below = {"B": inputs, "E": np.zeros((k, self.disturbances)), "c": np.zeros((k, 1))}
         known = {
@@ -170,8 +278,23 @@ class Phase:
     def matrices(
         self, arguments: Float[Array, "k n"]
     ) -> tuple[Float[Array, "k d d"], Float[Array, "k d m"], Float[Array, "k d mw"]]:
-        """``A (k, d, d)``, ``B (k, d, m)``, ``E (k, d, mw)`` at parameters ``(k, nu)``; raises `InputError` where they
-        are not finite."""
+        """Return the matrices at several arguments.
+
+        Parameters
+        ----------
+        arguments : array (k, n)
+            The arguments, one row each.
+
+        Returns
+        -------
+        A, B, E : arrays (k, d, d), (k, d, m), (k, d, mw)
+            The matrices at each row of the arguments.
+
+        Raises
+        ------
+        InputError
+            If the shape of the arguments is wrong, or an entry is not finite.
+        """
         points = np.asarray(arguments, dtype=float)
         if points.ndim != 2 or points.shape[1] != self.count:
             raise InputError(f"parameters must have shape (k, {self.count}), got {points.shape}", path="system")
@@ -189,10 +312,30 @@ class Phase:
         Float[Array, "M d mw"],
         Float[Array, "d mw"],
     ]:
-        """Taylor models of all entries over the cell ``centre +- radius``, both ``(nu,)``.
+        """Return Taylor models of all entries over the cell ``centre +- radius`` of the arguments.
 
-        Returns ``A_coefficients (M, d, d), A_remainder (d, d)`` and the same for ``B`` and ``E``.
-        Raises `NotEnclosable` when a function cannot be evaluated on Taylor models, or has a singularity on the cell.
+        Parameters
+        ----------
+        space : TaylorSpace
+            The space of polynomials with ``M`` coefficients.
+        centre, radius : arrays (n,)
+            The middle and the half-widths of the cell.
+
+        Returns
+        -------
+        A_coefficients, A_remainder : arrays (M, d, d), (d, d)
+            The coefficients of each entry of ``A``, and a bound of the remainder of each entry.
+        B_coefficients, B_remainder : arrays (M, d, m), (d, m)
+            The coefficients and the bounds for ``B``.
+        E_coefficients, E_remainder : arrays (M, d, mw), (d, mw)
+            The coefficients and the bounds for ``E``.
+
+        Raises
+        ------
+        NotEnclosable
+            If a function cannot be evaluated on Taylor models, or has a singularity on the cell.
+        InputError
+            If a function returns other values for numbers than for Taylor models.
         """
         p = np.empty(self.count, dtype=object)
         p[:] = space.variables(centre, radius)
@@ -209,8 +352,24 @@ class Phase:
         c: Float[Array, "d 1"] | float = 1.0,
         time: float = 1.0,
     ) -> Phase:
-        """The phase whose matrices are ``A``, ``B``, ``E``, ``c`` times these factors, entry by entry, and whose
-        arguments and times are this one's divided by ``arguments (n,)`` and ``time``; exact for powers of two."""
+        """Return the phase in other units; the change is exact where all factors are powers of two.
+
+        Parameters
+        ----------
+        A, B, E : arrays (d, d), (d, m), (d, mw)
+            The factors by which the matrices are multiplied, entry by entry.
+        arguments : array (n,)
+            The numbers by which the arguments are divided.
+        c : array (d, 1) or float, default 1.0
+            The factors by which the drift is multiplied.
+        time : float, default 1.0
+            The number by which the times of the phase are divided.
+
+        Returns
+        -------
+        Phase
+            The same phase in these units.
+        """
         begin, until = self.begin / time, self.until / time
         if self.domain is None:
             ours = [matrix[0] for matrix in self.matrices(np.zeros((1, 0)))]
@@ -234,19 +393,27 @@ class Phase:
 
     @shaped
     def describe(self, arguments: Float[Array, " n"]) -> str:
-        """Arguments, or the last ones of them, in words, such as ``p1 = 0.1, p2 = -0.1``."""
+        """Return arguments in words, such as ``p1 = 0.1, p2 = -0.1``.
+
+        A vector that is shorter than ``n`` holds the last of the arguments.
+        """
         names = self.names[len(self.names) - arguments.size :]
         return ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, arguments, strict=True))
 
     def entry(self, name: str) -> _Entry | None:
-        """``A``, ``B``, ``E`` or ``c (d, 1)`` as an array, expressions, or a function of ``p (nu,)``."""
+        """Return ``A``, ``B``, ``E`` or ``c (d, 1)`` as an array, as expressions, or as a function of the arguments.
+
+        The value is ``None`` for the drift of a phase without a drift.
+        """
         return None if name == "c" and self.c is None else self._entry(name)
 
     def _entry(self, name: str) -> _Entry:
+        """Return a matrix of the phase, which is known to exist, as an array, expressions or a function."""
         entry: _Entry = getattr(self, name)
         return entry
 
     def _check_domain(self) -> None:
+        """Keep the names of the arguments; raise `InputError` where the domain or the names are unsuitable."""
         given: object = self.domain
         if not isinstance(given, ConvexSet | None):
             raise InputError(
@@ -265,7 +432,7 @@ class Phase:
         object.__setattr__(self, "names", names)
 
     def _check_drift(self, d: int) -> None:
-        """``c`` as a matrix of one column; raises `InputError` when it has not one number per state."""
+        """Keep the drift as a matrix of one column; raise `InputError` where it does not fit ``d`` states."""
         given = self.c
         if callable(given) and not isinstance(given, ExpressionMatrix | _AsColumn):
             given = _AsColumn(given)
@@ -283,6 +450,7 @@ class Phase:
         self._values("c", self.probes)
 
     def _matrix(self, name: str, value: object) -> _Entry:
+        """Return a matrix of the user as a checked array, as expressions or as a function; raise `InputError`."""
         if isinstance(value, ExpressionMatrix):
             return (
                 value(np.zeros(len(value.names))).astype(float) if value.is_constant else self._known_names(name, value)
@@ -306,6 +474,7 @@ class Phase:
         return array
 
     def _known_names(self, name: str, matrix: ExpressionMatrix) -> ExpressionMatrix:
+        """Return the expressions; raise `InputError` where they are not in the names of this phase."""
         if matrix.names != tuple(self.names):
             raise InputError(
                 f"the expressions of {name} are in the parameters {', '.join(matrix.names)}, the system has"
@@ -315,6 +484,7 @@ class Phase:
         return matrix
 
     def _shape(self, name: str) -> tuple[int, int]:
+        """Return the numbers of rows and of columns of a matrix."""
         entry = self._entry(name)
         if isinstance(entry, np.ndarray | ExpressionMatrix):
             rows, columns = entry.shape
@@ -322,6 +492,7 @@ class Phase:
         return self._probed_shape(name)
 
     def _probed_shape(self, name: str) -> tuple[int, int]:
+        """Return the shape of the matrix that a function returns, which is called once for it."""
         cache: dict[str, tuple[int, int]] = self.__dict__.setdefault("_shapes", {})
         if name not in cache:
             value = np.asarray(self._called(name, self.probes[0]))
@@ -334,7 +505,7 @@ class Phase:
 
     @property
     def probes(self) -> Array:
-        """A few parameters ``(k, nu)`` at which a system is tried out: a middle one and support points."""
+        """The arguments ``(k, n)`` at which entries are evaluated for checks: an interior point and support points."""
         if self.domain is None:
             return np.empty((1, 0))
         axes = np.eye(self.count)
@@ -342,10 +513,11 @@ class Phase:
         return np.vstack([self.domain.interior_point(), points])
 
     def _called(self, name: str, parameter: Array) -> Array:
+        """Return the value of a function at one argument ``(n,)``; raise `InputError` where the function fails."""
         function = self._entry(name)
         assert callable(function)
         try:
-            with np.errstate(all="ignore"):  # what is not finite is reported with its parameter
+            with np.errstate(all="ignore"):  # entries that are not finite are reported with their arguments
                 return np.asarray(function(parameter), dtype=float)
         except (TypeError, ValueError, ArithmeticError, IndexError, KeyError, AttributeError) as error:
             raise InputError(
@@ -354,6 +526,7 @@ class Phase:
 
     @shaped
     def _values(self, name: str, points: Float[Array, "k n"]) -> Float[Array, "k rows columns"]:
+        """Return a matrix at points ``(k, n)``; raise `InputError` where its shape changes or it is not finite."""
         entry = self._entry(name)
         if isinstance(entry, np.ndarray):
             return np.broadcast_to(entry, (len(points), *entry.shape)) if len(points) != 1 else _still(entry[None])
@@ -374,6 +547,7 @@ class Phase:
         return values
 
     def _enclosed(self, name: str, space: TaylorSpace, p: npt.NDArray[np.object_]) -> tuple[Array, Array]:
+        """Return the coefficients and the bounds of the remainders of one matrix, as Taylor models; see `taylor`."""
         entry, shape = self._entry(name), self._shape(name)
         coefficients, remainder = np.zeros((space.size, *shape)), np.zeros(shape)
         if isinstance(entry, np.ndarray):
@@ -394,7 +568,7 @@ class Phase:
             )
         every, left = coefficients.reshape(space.size, -1), remainder.reshape(-1)
         for place, model in enumerate(models.ravel().tolist()):
-            if type(model) is int and not model:  # nearly all of them where states are coefficients of polynomials
+            if type(model) is int and not model:  # most entries, where the states are coefficients of an expansion
                 continue
             if isinstance(model, TaylorModel):
                 every[:, place], left[place] = model.coefficients, model.remainder
@@ -409,9 +583,20 @@ class Phase:
         return coefficients, remainder
 
     def _require_same(self, name: str, centre: Array, value: Array, remainder: Array) -> None:
-        """Raise `InputError` where a function of the parameters is another one for numbers than for Taylor models,
-        whose ``value`` at the ``centre (nu,)`` of a cell is told: rows would be those of one system, and proofs those
-        of another. An expression is one and the same for both."""
+        """Raise `InputError` where a function returns another matrix for numbers than for Taylor models.
+
+        The rows of the programs would then describe one system, and the proofs another. An expression needs no such
+        check, because its arithmetic is the same for both.
+
+        Parameters
+        ----------
+        name : str
+            The name of the matrix.
+        centre : array (n,)
+            The middle of the cell, at which both are compared.
+        value, remainder : arrays of the shape of the matrix
+            The constant coefficients of the Taylor models, and the bounds of their remainders.
+        """
         given = self._called(name, centre)
         apart = np.abs(given - value) - remainder
         if not (apart <= SAME * np.abs(given).max()).all():
@@ -427,7 +612,7 @@ class Phase:
 @final
 @dataclass(frozen=True, eq=False)
 class _AsColumn:
-    """A function of the parameters that returns ``(d,)`` as one that returns ``(d, 1)``."""
+    """A function of the parameters that returns ``(d,)``, as a function that returns ``(d, 1)``."""
 
     function: Callable[..., object]
 
@@ -438,6 +623,7 @@ class _AsColumn:
 
 
 def _holds_models(value: object) -> bool:
+    """Return True where a value has entries that are no numbers, such as Taylor models."""
     return not all(
         isinstance(entry, int | float | np.integer | np.floating) for entry in np.asarray(value, dtype=object).flat
     )
@@ -446,33 +632,43 @@ def _holds_models(value: object) -> bool:
 @final
 @dataclass(frozen=True, eq=False)
 class Through:
-    """An entry as a function of other arguments, of which ``arguments`` makes its own; times a ``factor (rows,
-    columns)``."""
+    """An entry as a function of other arguments, times a ``factor (rows, columns)``.
+
+    The function ``arguments`` takes the other arguments and returns those of the ``entry``.
+    """
 
     entry: Callable[..., object]
     arguments: Callable[[_Arguments], _Arguments]
     factor: Array | None = None
 
     def __call__(self, p: _Arguments) -> object:
-        """The entry at other arguments ``(n,)``."""
+        """Return the matrix at other arguments ``(n,)``."""
         found = self.entry(self.arguments(p))
         return found if self.factor is None else np.asarray(found, dtype=object) * self.factor
 
 
 def through(entry: _Entry | None, arguments: Callable[[_Arguments], _Arguments]) -> _Entry | None:
-    """An entry as a function of other arguments; itself where it has none."""
+    """Return an entry as a function of other arguments; an array is returned as it is.
+
+    Parameters
+    ----------
+    entry : array, expressions, function or None
+        The matrix.
+    arguments : function
+        The function that takes the other arguments and returns those of the entry.
+    """
     return Through(entry, arguments) if callable(entry) else entry
 
 
 def _moved(later: float, p: _Arguments) -> _Arguments:
-    """On a clock that shows 0 so much later, the time being the first argument."""
+    """Return the arguments ``p``, with ``later`` added to the time, which is the first of them."""
     moved = p.copy()
     moved[0] = p[0] + later
     return moved
 
 
 def _with_parameter(parameter: Array, p: _Arguments) -> _Arguments:
-    """The time, and one parameter ``(nu,)`` after it."""
+    """Return the time, followed by one parameter ``(nu,)``."""
     whole = np.empty(1 + parameter.size, dtype=object)
     whole[0], nothing = p[0], 0.0 * p[0]
     for i, value in enumerate(parameter.tolist()):
@@ -481,24 +677,27 @@ def _with_parameter(parameter: Array, p: _Arguments) -> _Arguments:
 
 
 def _at_time(time: float, p: _Arguments) -> _Arguments:
-    """One time before the parameters."""
+    """Return the parameters ``p``, after one time."""
     whole = np.empty(1 + len(p), dtype=object)
     whole[0], whole[1:] = time, p
     return whole
 
 
 def _without_time(p: _Arguments) -> _Arguments:
-    """The parameters after the time."""
+    """Return the parameters, which follow the time."""
     return p[1:]
 
 
 def _times(units: Array, p: _Arguments) -> _Arguments:
-    """Arguments in other units."""
+    """Return arguments ``p (n,)`` times ``units (n,)``."""
     return np.asarray(np.asarray(p, dtype=object) * units)
 
 
 def boxed(parameters: ConvexSet) -> Box:
-    """A set of parameters beside the time, which must be a box."""
+    """Return the box of parameters that a system has besides the time.
+
+    Raises `InputError` where the set of the parameters is no bounded box.
+    """
     if not parameters.is_box or not parameters.is_bounded:
         raise InputError(
             path="system.parameters", expected="a bounded box beside the time t, one interval each", got=parameters.kind
@@ -507,7 +706,20 @@ def boxed(parameters: ConvexSet) -> Box:
 
 
 def and_time(begin: float, until: float, parameters: Box | None) -> Box:
-    """The times from one to another, and the parameters."""
+    """Return the box of the times of a phase and of its parameters.
+
+    Parameters
+    ----------
+    begin, until : float
+        The times between which the phase holds.
+    parameters : Box or None
+        The box of the parameters ``(nu,)``, or ``None`` where there are none.
+
+    Returns
+    -------
+    Box
+        The box in ``1 + nu`` coordinates, of which the time is the first.
+    """
     if parameters is None:
         return Box([begin], [until])
     return Box(np.append(begin, parameters.lower), np.append(until, parameters.upper))
@@ -516,8 +728,21 @@ def and_time(begin: float, until: float, parameters: Box | None) -> Box:
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhaseInUnits(Phase):
-    """A phase in other units: the ``base`` at arguments times ``units (n,)``, its matrices times ``factors``, one unit
-    of time being ``clock`` of its own."""
+    """A phase in other units than those of the user.
+
+    Its matrices are those of the ``base`` at arguments times ``units``, multiplied by ``factors``.
+
+    Parameters
+    ----------
+    base : Phase
+        The phase in the units of the user.
+    factors : mapping of arrays
+        The factors of ``A (d, d)``, ``B (d, m)``, ``E (d, mw)`` and ``c (d, 1)``, entry by entry.
+    units : array (n,)
+        The numbers by which arguments of this phase are multiplied to be those of the base.
+    clock : float
+        The number by which times of this phase are multiplied to be those of the base.
+    """
 
     base: Phase
     factors: Mapping[str, Array]
@@ -525,7 +750,7 @@ class PhaseInUnits(Phase):
     clock: float
 
     def __post_init__(self) -> None:
-        pass  # the base was checked
+        pass  # the base has been checked, and units change no finding
 
     @property
     def stated(self) -> Phase:
@@ -605,10 +830,11 @@ class PhaseInUnits(Phase):
 
 
 def _still(view: Array) -> Array:
-    """A view that nobody writes to."""
+    """Return the view after it was made read-only."""
     view.flags.writeable = False
     return view
 
 
 def _seen(array: npt.NDArray[np.float64]) -> str:
+    """Return an array in words: its entries where it is small, its shape elsewhere."""
     return str(array.tolist()) if array.size <= 8 else f"an array of shape {array.shape}"

@@ -63,62 +63,127 @@ SYSTEM = {
 
 
 def _pieces(times: Array, begin: float, horizon: float) -> Array:
-    """Breakpoints from ``begin`` on, with what is left of the piece that has begun."""
+    """Return breakpoints from the time ``begin`` on, counted from there.
+
+    The first interval is the rest of the interval that contains ``begin``.
+    """
     later = [time - begin for time in times.tolist() if not over(time, begin, horizon)]
     return np.array([0.0, *later[:-1], horizon])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OptimalControlProblem(Term):
-    """Minimise a `Cost`, ``sum_i weights_i int_0^T |u_i(t)| dt`` unless told otherwise, such that for every disturbance
-    and every parameter
+    """The problem to minimise a `Cost` under constraints that hold for every disturbance, parameter and initial state.
 
-    ``x' = A(p) x + B(p) u + E(p) w + c(p)``, ``x(0) = initial_state (d,)``, ``u(t)`` in ``control``, ``x(t)`` in every
-    ``path`` set during its window (or ``(x(t), u(t))``: `MixedConstraint`), and ``x(T)`` in every ``terminal`` set,
-    where ``T = horizon`` (in the time unit of the system), at which the last piece of a `SwitchedSystem` must end.
+    Minimise ``sum_i weights_i int_0^T |u_i(t)| dt``, or another `Cost`, subject to
 
-    ``disturbance``: the bounded set of ``w``, or ``None``; ``disturbance_class`` says which functions it makes:
-    ``piecewise_constant`` (every piece of the disturbance's dictionary in the set), ``measurable`` (any measurable
-    function into the set), or ``l1_ball`` (the coefficients of channel ``i`` in the dictionary have absolute sum at
-    most ``upper_i`` of a symmetric box: a far smaller set). ``initial_control``: the control ``(m,)`` before time 0, or
-    ``None`` where it does not matter. ``control_step``: the set of every change ``u_{k+1} - u_k`` from one piece of the
-    control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any.
-    ``names`` are for messages, tables and figures.
+    * ``x' = A(p) x + B(p) u + E(p) w + c(p)`` with ``x(0)`` in ``initial_state + initial_set``
+    * ``u(t)`` in ``control`` at all times
+    * ``x(t)`` in every set of ``path`` during its window; a `MixedConstraint` bounds ``x(t)`` and ``u(t)`` together
+    * ``x(T)`` in every set of ``terminal``, where ``T = horizon``
+    * the integrals of state and control within the bounds of every `IntegralConstraint`
 
-    ``disturbances``: instead of ``disturbance``, a list of them, each with its set, its ``E``, its class, its window
-    of time and the pieces on which it is constant; ``w`` is made of all of them, one after another. After construction
-    ``disturbance`` is the product of their sets, ``E`` of the system has the columns of theirs (0 in pieces of the
-    system outside of a window), and the list is empty; where there are two classes, ``disturbance_class`` has that of
-    every part of the product, and where one has pieces of its own, ``disturbance_breakpoints`` has the ends of the
-    pieces of every part, ``None`` where these are those of the disturbance's dictionary.
+    The state is ``x (d,)``, the control ``u (m,)``, the disturbance ``w (mw,)``, the parameter ``p (nu,)``. Times are
+    in the time unit of the system.
 
-    ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
-    anywhere in ``initial_state + initial_set``, and every constraint holds from there.
+    Parameters
+    ----------
+    system : System
+        The system; its last phase ends at the horizon, unless it is a `LinearSystem`, which has no end.
+    horizon : float
+        The positive, finite horizon ``T``.
+    initial_state : array (d,)
+        The centre of the initial states. An initial state outside of a path set is legal; that problem is infeasible.
+    control : ConvexSet
+        The bounded set of ``u(t)``.
+    initial_set : ConvexSet, optional
+        The bounded set of deviations from ``initial_state``, which contains 0. Without it the initial state is known.
+    weights : float, array (m,) or array (r, 1 + m), optional
+        Positive weights of the controls, or rows of a time and the weights from then on, which may be 0. The first time
+        is 0. All weights are 1 unless given.
+    disturbance : ConvexSet, optional
+        The bounded set of ``w(t)``; ``None`` (the default) where there is no disturbance.
+    disturbance_class : {"piecewise_constant", "measurable", "l1_ball"}, default "piecewise_constant"
+        The class of the functions ``w``; see Notes.
+    path : sequence of PathConstraint, MixedConstraint or ConvexSet, optional
+        The constraints during windows of time. A set without a window holds at all times.
+    terminal : sequence of ConvexSet or Equality, optional
+        The sets of the final state, and values that are fixed.
+    integral : sequence of IntegralConstraint, optional
+        The bounds of integrals of state and control over windows of time.
+    title : str, default ""
+        The title in tables and figures.
+    initial_control : array (m,), optional
+        The control before time 0; ``None`` (the default) where it does not matter.
+    control_step : ConvexSet, optional
+        The set of every change ``u_{k+1} - u_k`` from one interval of the control's dictionary to the next. It also
+        holds ``u_0 - initial_control`` where that control is given. Steps are free unless it is given.
+    names : Names, optional
+        The names and units for messages, tables and figures.
+    cost : Cost, optional
+        The cost; the weighted L1 norm of the control unless given.
+    disturbances : sequence of Disturbance, optional
+        A list of disturbances instead of ``disturbance``; ``w`` holds all of them, one after another.
+    measurements : Measurements, optional
+        The measurements of a policy that answers them. Unless given, the whole state is measured without noise and at
+        once. A control that answers nothing does not depend on them.
+    repeat : bool, default False
+        True where the plan begins again at the horizon, for ever; see Notes.
+    execution : array (m,), optional
+        The relative error of execution of each control, from 0 to 1; see Notes. No errors unless given.
+    commanded : tuple of int, optional
+        The states that are integrals of the commanded control, which no error of execution reaches. They occur in
+        larger problems that are made of integrals; users do not give them.
+    disturbance_breakpoints : tuple, optional
+        The breakpoints of each part of a product of disturbances, made from ``disturbances``. A part has ``None`` where
+        its breakpoints are those of the disturbance's dictionary; users do not give them.
 
-    ``integral``: bounds of integrals of state and control over windows, `IntegralConstraint`.
+    Raises
+    ------
+    InputError
+        If a field is unsuitable, or if nothing can be proven yet of such a combination of fields.
 
-    ``measurements``: what a policy that answers measurements sees; the whole state, without noise and at once, unless
-    given. Of a control that answers nothing it changes nothing.
+    Notes
+    -----
+    Classes of disturbances. ``piecewise_constant``: the value on every interval of the disturbance's dictionary is in
+    the set. ``measurable``: any measurable function with values in the set. ``l1_ball``: the coefficients of channel
+    ``i`` in the dictionary have an absolute sum of at most ``upper_i``, where the set is a symmetric box; these are far
+    fewer disturbances.
 
-    ``repeat``: at the horizon the plan begins again, for ever. Every final state is then one of the initial states,
-    from which all constraints hold for another period, so that they hold for all time; the steps from any last control
-    to any first one are in ``control_step`` too. No set has to be invariant in between. What changes with time begins
-    again too, and has the horizon as its period. Final states stay inside by `WITHIN` of the set, so that what is
-    proven to a tolerance is proven for ever; coordinates of which there is one value are fixed at the end, to rounding.
+    Repetition. Every final state is one of the initial states. All constraints hold from there for another period, and
+    therefore for all time. The step from any last control to any first one is in ``control_step`` too. No set has to be
+    invariant within a period. Whatever changes with time begins again too, with the horizon as its period. Final states
+    stay inside of the set by the share `WITHIN`, so that a proof up to a tolerance holds for ever. A coordinate with a
+    single initial value is fixed at the end, up to rounding.
 
-    ``execution``: a share of the control, from 0 to 1, one for each: what is delivered differs from the command by at
-    most that share of it, any function of time, and every constraint on the state holds nonetheless; of nothing
-    nothing is missing. What a mixed constraint says of the control, the set of the control, that of its steps and the
-    cost are about the command, and what integrals say of it. ``None``: what is commanded is delivered. ``commanded``:
-    states that add up what is commanded, which no error reaches; those of a larger problem, made of integrals.
+    Errors of execution. The delivered control differs from the commanded control by at most this share of the command.
+    The difference may be any function of time, and is 0 where the command is 0. Every constraint on the state holds
+    nonetheless. The set of the control, the set of its steps, the cost, and the control in mixed constraints and
+    integrals refer to the command.
 
-    ``weights``: a positive number, one for each control, or rows of a time and the weights from then on, which are not
-    negative: prices, or a supply that is free for a while. The first time is 0.
+    Fields after construction. ``weights`` is ``(m,)``, or ``(r, 1 + m)`` where rows are given. ``path``, ``terminal``
+    and ``integral`` are tuples, every window has its ``stop``, and constraints that restrict nothing are gone. For a
+    problem that repeats, the `Return` is the last entry of the path, and the fixed values are the last terminal
+    equality.
 
-    After construction ``weights`` is ``(m,)``, or ``(r, 1 + m)`` of rows, ``path``, ``terminal`` and ``integral`` are
-    tuples, every window has its ``stop``, constraints that restrict nothing are gone, and of a problem that repeats the
-    `Return` is the last of the path, and what is fixed then the last of the terminal equalities. An initial state
-    outside a path set is legal: that problem is infeasible. Raises `InputError`.
+    Lists of disturbances. After construction ``disturbance`` is the product of their sets, and the list is empty. ``E``
+    of the system has the columns of all of them, which are 0 in phases outside of a window. Where there are two
+    classes, ``disturbance_class`` has the class of every part of the product. Where a disturbance has its own
+    breakpoints, ``disturbance_breakpoints`` has those of every part.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> problem = sr.OptimalControlProblem(
+    ...     system=sr.LinearSystem([[0, 1], [0, 0]], [[0], [1]]),
+    ...     horizon=4.0,
+    ...     initial_state=[1, 0],
+    ...     control=sr.Box([-1], [1]),
+    ...     disturbance=sr.Box([-0.01, -0.01], [0.01, 0.01]),
+    ...     terminal=[sr.Box([-0.2, -0.2], [0.2, 0.2])],
+    ... )
+    >>> problem.weights
+    array([1.])
     """
 
     system: System = field(metadata=SYSTEM)
@@ -137,7 +202,7 @@ class OptimalControlProblem(Term):
     control_step: ConvexSet | None = field(default=None, metadata=CONTROLS)
     names: Names = field(default=UNNAMED, metadata=UNITLESS)
     cost: Cost = field(default=Cost(), metadata=TERMS)
-    disturbances: Sequence[Disturbance] = field(default=(), metadata=UNITLESS)  # none after construction
+    disturbances: Sequence[Disturbance] = field(default=(), metadata=UNITLESS)  # empty after construction
     measurements: Measurements | None = field(default=None, metadata=TERMS)
     repeat: bool | Repeating = field(default=False, metadata=UNITLESS)
     execution: npt.ArrayLike | None = field(default=None, metadata=UNITLESS)
@@ -185,7 +250,7 @@ class OptimalControlProblem(Term):
 
     @property
     def classes(self) -> frozenset[DisturbanceClass]:
-        """Of which classes the disturbances are; none where there are none."""
+        """The classes of the disturbances; an empty set where there are no disturbances."""
         if self.disturbance is None:
             return frozenset()
         kinds = self.disturbance_class
@@ -198,49 +263,53 @@ class OptimalControlProblem(Term):
 
     @property
     def lists(self) -> dict[str, tuple[Window, ...]]:
-        """The constraints that are listed, by the field that lists them."""
+        """The constraints of the fields that are lists of terms, by the name of the field."""
         return {one.name: getattr(self, one.name) for one in fields(self) if KIND in one.metadata}
 
     @property
     def sums(self) -> dict[str, tuple[Window, ...]]:
-        """Those of them that are not on the path: they add up what state and control do."""
+        """The constraints that accumulate state and control over time, by their field, where there are any."""
         return {name: entries for name, entries in self.lists.items() if name != "path" and entries}
 
     def called(self, name: str) -> list[str]:
-        """What messages, tables and figures call the constraints of a list: by their own name, or by their place."""
+        """Return the names by which messages, tables and figures call the constraints of one list.
+
+        A constraint without a name is called by the name of the list, with its position where the user gave several.
+        """
         entries = self.lists[name]
         several = sum(entry.stated for entry in entries) > 1
         return [entry.name or (f"{name}[{i}]" if several else name) for i, entry in enumerate(entries)]
 
     @property
     def windows(self) -> list[PathConstraint | MixedConstraint]:
-        """The constraints on the path, of which none is a bare set any more."""
+        """The constraints on the path; none of them is a bare set after construction."""
         return [entry for entry in self.path if not isinstance(entry, ConvexSet)]
 
     @property
     def of_states(self) -> list[PathConstraint]:
-        """Those of the `windows` that are about the state alone."""
+        """The constraints on the path that bound the state alone."""
         return [entry for entry in self.windows if isinstance(entry, PathConstraint)]
 
     @property
     def terminal_sets(self) -> list[ConvexSet]:
-        """The sets that the final state must be in; those that fix values are not among them."""
+        """The sets of the final state, without those that fix values."""
         return [end for end in self.terminal if not isinstance(end, Equality)]
 
     @property
     def ends(self) -> list[ConvexSet]:
-        """Those sets, and what fixes values as sets."""
+        """The sets of the final state, and after them the equalities as sets."""
         return [*self.terminal_sets, *(end.box for end in self.terminal_equalities)]
 
     @property
     def terminal_equalities(self) -> list[Equality]:
-        """What fixes values of the final state."""
+        """The equalities that fix values of the final state."""
         return [end for end in self.terminal if isinstance(end, Equality)]
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
     def _check_system(self) -> None:
+        """Raise `InputError` where the system, its delay or its last phase does not fit the horizon."""
         if not isinstance(self.system, System):
             raise InputError(path="system", expected="a LinearSystem", got=f"{type(self.system).__name__}")
         if not (self.system.delay == 0.0 or SAME_TIME * self.horizon < self.system.delay < self.horizon):
@@ -252,7 +321,7 @@ class OptimalControlProblem(Term):
         self.system.check_horizon(self.horizon)
 
     def _check_uncertain(self) -> None:
-        """Raise `InputError` for what is not proven of a system that changes with time and has parameters."""
+        """Raise `InputError` for fixed final values that a parameter changes, of a system that depends on time."""
         system = self.system
         if system.powers is not None:
             self._check_expanded()
@@ -269,7 +338,7 @@ class OptimalControlProblem(Term):
                     )
 
     def _check_expanded(self) -> None:
-        """The same where the state is no affine function of the parameters."""
+        """Raise `InputError` for fixed final values where the state is no affine function of the parameters."""
         if self.terminal_equalities:
             raise InputError(
                 path="system.parameters",
@@ -279,8 +348,10 @@ class OptimalControlProblem(Term):
             )
 
     def _executed(self) -> Array | None:
-        """The errors of execution, ``None`` where there are none; raises `InputError` for what they are not proven
-        with yet."""
+        """Return the errors of execution ``(m,)``, or ``None`` where there are none.
+
+        Raises `InputError` for combinations with other fields of which nothing can be proven yet.
+        """
         if self.execution is None:
             return None
         m = self.system.controls
@@ -310,7 +381,7 @@ class OptimalControlProblem(Term):
         return shares
 
     def _is_boxed(self) -> bool:
-        """Whether parameters are in a box, or there are none."""
+        """Return True where the parameters are in a bounded box, or there are no parameters."""
         try:
             _ = self.system.in_time(self.horizon)
         except InputError:
@@ -318,10 +389,11 @@ class OptimalControlProblem(Term):
         return True
 
     def _is_expanded(self) -> bool:
-        """Whether there are such of which the state is no affine function."""
+        """Return True where the state is no affine function of the parameters, which are in a box."""
         return self._is_boxed() and self.system.in_time(self.horizon).powers is not None
 
     def _state(self) -> Array:
+        """Return the centre ``(d,)`` of the initial states; raise `InputError`."""
         d = self.system.states
         state = np.atleast_1d(as_bound("initial_state", self.initial_state))
         if state.size != d or not np.isfinite(state).all():
@@ -331,6 +403,7 @@ class OptimalControlProblem(Term):
         return state
 
     def _deviations(self) -> ConvexSet | None:
+        """Return the set of initial deviations, or ``None`` for 0 alone; raise `InputError` where 0 is not in it."""
         if self.initial_set is None:
             return None
         bound = checked_set("initial_set", self.initial_set, self.system.states, "states", bounded=True)
@@ -345,25 +418,33 @@ class OptimalControlProblem(Term):
         return bound if size > 0.0 else None
 
     def prices(self, breakpoints: Array) -> Array:
-        """What an absolute value of 1 of each control costs on every piece between ``breakpoints (K + 1,)``,
-        ``(m, K)``: the weights, integrated exactly, times the factor of the L1 norm."""
+        """Return the cost ``(m, K)`` of each control per absolute value on the intervals of ``breakpoints (K + 1,)``.
+
+        The cost is the integral of the weight, which is exact, times the factor of the L1 norm.
+        """
         return float(self.cost.l1) * integrals(self.weights, breakpoints)
 
     @property
     def counts(self) -> Array:
-        """What each control counts per time that it acts, ``(m,)``: its weight, or 1 where weights change with
-        time."""
+        """The number ``(m,)`` by which each control counts per active time.
+
+        It is the weight of the control, or 1 where weights change with time.
+        """
         return counted(self.weights)
 
     @property
     def cost_unit(self) -> str:
-        """What the cost is measured in: the unit of a control's integral over time; empty where it is not known, or
-        where weights or quadratic terms give it another one, which no name states."""
+        """The unit of the cost: the unit of the integral of a control over time.
+
+        The text is empty where this unit is not known. It is also empty where weights or quadratic terms give the cost
+        another unit, which no name states.
+        """
         weights = np.asarray(self.weights)
         priced = weights.ndim == 2 or bool((weights != 1.0).any())
         return "" if priced or self.cost.is_quadratic else self.names.effort
 
     def _measured(self) -> Measurements | None:
+        """Return the checked measurements, or ``None`` where there are none; raise `InputError`."""
         if self.measurements is None:
             return None
         if not isinstance(self.measurements, Measurements):
@@ -376,6 +457,7 @@ class OptimalControlProblem(Term):
         return measured
 
     def _costs(self) -> Cost:
+        """Return the checked cost; raise `InputError`."""
         if not isinstance(self.cost, Cost):
             raise InputError(path="cost", expected="a Cost", got=f"{type(self.cost).__name__}")
         try:
@@ -384,6 +466,7 @@ class OptimalControlProblem(Term):
             raise error.under("cost") from None
 
     def _control_before(self) -> Array | None:
+        """Return the control ``(m,)`` before time 0, or ``None`` where it is not given; raise `InputError`."""
         if self.initial_control is None:
             return None
         m = self.system.controls
@@ -395,6 +478,7 @@ class OptimalControlProblem(Term):
         return control
 
     def _check_disturbance(self) -> None:
+        """Raise `InputError` where the disturbance, its class, its breakpoints and the system do not fit."""
         kinds, bound = self.disturbance_class, self.disturbance
         if isinstance(kinds, tuple) and isinstance(bound, Product) and len(bound.parts) == len(kinds):
             known = set(kinds) == {"piecewise_constant", "measurable"}
@@ -424,7 +508,7 @@ class OptimalControlProblem(Term):
             )
 
     def _join_disturbances(self) -> None:
-        """One disturbance out of the list: that of all of them side by side."""
+        """Replace the list of disturbances by the single disturbance that holds all of them."""
         every: object = self.disturbances
         if not isinstance(every, Sequence) or not all(isinstance(one, Disturbance) for one in every):
             raise InputError(path="disturbance", expected="a list of Disturbance", got=f"{type(every).__name__}")
@@ -444,12 +528,13 @@ class OptimalControlProblem(Term):
         self._set("disturbances", ())
 
     def _check_names(self) -> None:
+        """Raise `InputError` where the names do not fit the numbers of states, controls and disturbances."""
         if not isinstance(self.names, Names):
             raise InputError(path="names", expected="Names(states=[...], ...)", got=f"{type(self.names).__name__}")
         self.names.fitting(self.system.states, self.system.controls, self.system.disturbances)
 
     def _constraints(self, name: str, kind: type[Window]) -> Iterator[Window]:
-        """Those that a field lists."""
+        """Yield the checked constraints of the field ``name`` that exclude anything, as terms of one ``kind``."""
         of = "sets" if kind is PathConstraint else kind.__name__
         setting = Setting(self.system.states, self.system.controls, self.system.delay, self.horizon)
         for i, entry in enumerate(_listed(name, getattr(self, name), of)):
@@ -458,7 +543,7 @@ class OptimalControlProblem(Term):
                 yield found
 
     def _return(self) -> None:
-        """Have every final state among the initial ones, where the plan repeats."""
+        """Require that every final state is one of the initial states, where the plan repeats."""
         if not isinstance(self.repeat, bool | np.bool_):
             raise InputError(path="repeat", expected="true or false", got=f"{self.repeat!r}")
         if not self.repeat:
@@ -478,6 +563,7 @@ class OptimalControlProblem(Term):
         self._set("terminal", (*self.terminal, *ends))
 
     def _terminal(self) -> list[ConvexSet | Equality]:
+        """Return the checked sets and equalities of the final state that restrict anything; raise `InputError`."""
         kept: list[ConvexSet | Equality] = []
         for i, item in enumerate(_listed("terminal", self.terminal)):
             if not isinstance(item, Equality):
@@ -495,14 +581,15 @@ class OptimalControlProblem(Term):
 
 
 class ProblemFactory(ABC):
-    """A problem that a config can name: its options are its fields."""
+    """A problem that a config can name; its options are the fields of the class."""
 
     @abstractmethod
     def build(self) -> OptimalControlProblem | SemiInfiniteProgram:
-        """The problem; raises `InputError` when the options do not describe one."""
+        """Return the problem; raise `InputError` where the options do not describe one."""
 
 
 def _listed(name: str, value: object, of: str = "sets") -> list[object]:
+    """Return the entries of a list, or the single entry that stands instead of a list; raise `InputError`."""
     if isinstance(value, ConvexSet | Window | Equality):
         return [value]
     if not isinstance(value, Sequence):

@@ -1,4 +1,4 @@
-"""Refuse problems whose numbers, or whose states, are too large to be computed with."""
+"""Checks that refuse problems whose numbers or states are too large for computations in doubles."""
 
 from __future__ import annotations
 
@@ -11,16 +11,32 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError, Path
 
 LARGEST = 1e75
-"""Numbers in a problem, and how much a state may grow until the horizon. Four of them are multiplied where a problem is
-put into its own units, and the product is a number; of ten times larger ones it is none. Of ten times smaller ones
-nothing else becomes possible: a double carries 16 digits, and no proof is left long before."""
+"""The largest size of a number in a problem, and the largest growth of a state until the horizon.
+
+Up to four such numbers are multiplied where a problem is scaled. Their product is a finite double; the product of ten
+times larger numbers is not. A bound that is ten times smaller would admit less and gain nothing: a double has 16
+digits, and proofs fail at far smaller numbers.
+"""
 KEYS = {"initial_set": "initial_state", "stop": "to", "start": "from"}
-"""Fields that a config calls otherwise."""
+"""The fields that have another name in a config."""
 
 
 def require_representable(problem: OptimalControlProblem) -> None:
-    """Raise `InputError`, which begins with the key, for a number beyond `LARGEST`, and for a system that grows by more
-    than that within the horizon: ``e^(a T)``, ``a`` the largest real part of an eigenvalue of a mode."""
+    """Raise `InputError` for a problem with a number larger than `LARGEST`, or a state that grows by more.
+
+    The growth is ``e^(a T)`` for a phase of duration ``T``, where ``a`` is the largest real part of an eigenvalue of
+    the phase at its `probes`. The growth of a system whose entries depend on the time is not checked.
+
+    Parameters
+    ----------
+    problem : OptimalControlProblem
+        The problem.
+
+    Raises
+    ------
+    InputError
+        The error begins with the key of a config.
+    """
     for path, value in _keyed(problem):
         _require_small(path, value)
     if problem.system.varies:
@@ -46,12 +62,12 @@ def require_representable(problem: OptimalControlProblem) -> None:
 
 
 def _keyed(problem: OptimalControlProblem) -> Iterator[tuple[Path, np.ndarray]]:
-    """Every array and number of a problem, with the keys of a config that lead to it."""
+    """Yield every array and number of a problem, with the keys of a config that lead to it."""
     several = len(problem.system.phases) > 1
     for path, value in _numbers(problem, ()):
         if path[:2] != ("system", "phases"):
             yield path, value
-        elif path[3] == "domain":  # the parameters of the system, and the times of the phase
+        elif path[3] == "domain":  # parameters and times, which are fields of the system and of the phase too
             continue
         elif several:
             yield ("system", "pieces", *path[2:]), value
@@ -60,13 +76,14 @@ def _keyed(problem: OptimalControlProblem) -> Iterator[tuple[Path, np.ndarray]]:
 
 
 def _require_small(path: Path, value: np.ndarray) -> None:
+    """Raise `InputError` where a finite number of an array is larger than `LARGEST`."""
     size = np.abs(value[np.isfinite(value)])
     if size.max(initial=0.0) > LARGEST:
         raise InputError(path=path, expected=f"numbers of at most {LARGEST:g} in size", got=f"{float(size.max()):g}")
 
 
 def _numbers(record: object, path: Path) -> Iterator[tuple[Path, np.ndarray]]:
-    """Every array and number of a record, with the keys that lead to it."""
+    """Yield every array and number of a record, with the keys that lead to it."""
     if isinstance(record, np.ndarray) and record.dtype.kind == "f":
         yield path, record
     elif isinstance(record, float):

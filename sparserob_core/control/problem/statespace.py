@@ -1,4 +1,4 @@
-"""Plants of other packages as systems of this one."""
+"""State-space models of other packages as systems of this package."""
 
 from __future__ import annotations
 
@@ -6,13 +6,27 @@ from typing import Any
 
 from sparserob_core.errors import InputError
 
-SAMPLED = ("dt", "sampling_time", "SamplingPeriod")  # where python-control and scipy.signal, others, harold keep it
+SAMPLED = ("dt", "sampling_time", "SamplingPeriod")  # the step in python-control and scipy.signal, others, harold
 
 
 def matrices_of(plant: object) -> tuple[Any, Any]:
-    """``A (d, d)`` and ``B (d, m)`` of whatever has them, under these names or as ``a`` and ``b``.
+    """Return the matrices of a state-space model.
 
-    Raises `InputError` for what has none, or is in discrete time."""
+    Parameters
+    ----------
+    plant : object
+        A model in continuous time with the attributes ``A`` and ``B``, or ``a`` and ``b``.
+
+    Returns
+    -------
+    A, B : arrays (d, d), (d, m)
+        The matrices as the model has them.
+
+    Raises
+    ------
+    InputError
+        If the model has no such attributes, or is in discrete time.
+    """
     given = {name: getattr(plant, name, getattr(plant, name.lower(), None)) for name in ("A", "B")}
     missing = [name for name, matrix in given.items() if matrix is None]
     if missing:
@@ -34,8 +48,10 @@ def matrices_of(plant: object) -> tuple[Any, Any]:
 
 
 def _step(plant: object) -> str | None:
-    """The sampling step of a plant in words; ``None`` in continuous time, which python-control writes as 0 and
-    scipy.signal as ``None``."""
+    """Return the sampling step of a model in words, or ``None`` where it is in continuous time.
+
+    The package python-control writes continuous time as 0, and scipy.signal as ``None``.
+    """
     for name in SAMPLED:
         step = getattr(plant, name, None)
         if step is True:

@@ -26,24 +26,44 @@ InTime: TypeAlias = tuple[
     Sequence[Sequence[str | float]] | None,
     Sequence[str | float] | None,
 ]
-"""``A``, ``B``, ``E`` and ``c`` with entries in the time."""
+"""The matrices ``A``, ``B``, ``E`` and ``c`` of one phase, whose entries are numbers or expressions in ``t``."""
 PERIODIC = 1e-9
-"""Of an entry, by how much its values at both ends of a period may differ. What a horizon of 53 bits misses of a period
-is a tenth of it where an entry changes by its size in a millionth of the period; of ten times more a rounded decimal
-would pass for the period."""
-LOOKS = 65  # times at which the size of a system is looked at; with ten times fewer a short pericentre is overlooked
+"""The largest relative difference between the values of one entry at both ends of a period.
+
+A horizon is a double of 53 bits, and therefore differs from the exact period by rounding. An entry that changes by its
+own size within a millionth of the period then differs by a tenth of this bound. With a bound that is ten times larger,
+a decimal that is rounded too early would be accepted as the period.
+"""
+LOOKS = 65  # times per phase at which sizes are estimated; with ten times fewer a short pericentre is overlooked
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class System:
-    """``x'(t) = A(t, p) x(t) + B(t, p) u(t - delay) + E(t, p) w(t) + c(t, p)`` with state ``x (d,)``, control
-    ``u (m,)``, disturbance ``w (mw,)`` and a constant, unknown parameter ``p (nu,)`` in the bounded set ``parameters``,
-    which is ``None`` when everything is known.
+    """A linear system ``x'(t) = A(t, p) x(t) + B(t, p) u(t - delay) + E(t, p) w(t) + c(t, p)`` in phases.
 
-    The ``phases`` hold one after another, the first from 0 on; the state goes on where it is. Their entries depend on
-    the time in all of them, or in none. All have as many states, controls and disturbances. ``delay``: by how much
-    later the control acts, through the ``B`` of the time at which it acts; until then ``initial_control`` of the
-    problem acts. Made by `LinearSystem`, `SwitchedSystem` and `VaryingSystem`. Raises `InputError`.
+    The state is ``x (d,)``, the control ``u (m,)``, the disturbance ``w (mw,)``. The parameter ``p (nu,)`` is constant
+    and unknown. Users make a system by `LinearSystem`, `SwitchedSystem` or `VaryingSystem`.
+
+    Parameters
+    ----------
+    phases : tuple of Phase
+        The phases in the order of time; the first one begins at time 0. All of them have the same numbers of states,
+        controls and disturbances. Their entries depend on the time in all phases, or in none.
+    parameters : ConvexSet, optional
+        The bounded set of the parameter ``p (nu,)``; ``None`` (the default) where everything is known.
+    delay : float, default 0.0
+        The time, in the time unit of the system, by which the control acts later than it is commanded. A control acts
+        through the ``B`` of the time at which it acts. Before ``delay`` the ``initial_control`` of the problem acts.
+
+    Raises
+    ------
+    InputError
+        If the delay is negative or not finite, or if the numbers of states, controls or disturbances differ between
+        phases.
+
+    Notes
+    -----
+    The state is continuous: each phase begins with the state in which the phase before it ends.
     """
 
     phases: tuple[Phase, ...]
@@ -69,86 +89,96 @@ class System:
 
     @property
     def noun_of(self) -> tuple[str, list[tuple[str, object]]]:
-        """The name under which it is shown, and the fields that are."""
+        """The name and the fields by which the system is shown in messages."""
         every, own = {**vars(self.phases[0]), **vars(self)}, ("phases", "parameters", "delay")
         names = ("A", "B", "E", "parameters", "names", "c", "delay") if self.kind == "LinearSystem" else own
         return self.kind, [(name, every[name]) for name in names]
 
     @property
     def kind(self) -> str:
-        """The constructor that makes such a system."""
+        """The name of the constructor that makes such a system."""
         if self.varies:
             return "VaryingSystem"
         return "LinearSystem" if self.horizon == np.inf else "SwitchedSystem"
 
     @property
     def states(self) -> int:
-        """Number ``d`` of states."""
+        """The number ``d`` of states."""
         return self.phases[0].states
 
     @property
     def controls(self) -> int:
-        """Number ``m`` of controls."""
+        """The number ``m`` of controls."""
         return self.phases[0].controls
 
     @property
     def disturbances(self) -> int:
-        """Number ``mw`` of disturbances that ``E`` takes."""
+        """The number ``mw`` of disturbances, which is the number of columns of ``E``."""
         return self.phases[0].disturbances
 
     @property
     def parameter_count(self) -> int:
-        """Number ``nu`` of parameters, 0 for a known system."""
+        """The number ``nu`` of parameters, 0 for a known system; the time is not among them."""
         return 0 if self.parameters is None else self.parameters.dimension
 
     @property
     def box(self) -> Box:
-        """The set of the parameters beside the time, which is a box."""
+        """The set of the parameters of a system that depends on time; this set is always a box."""
         assert isinstance(self.parameters, Box)
         return self.parameters
 
     @property
     def names(self) -> Sequence[str]:
-        """Names of the parameters."""
+        """The names of the parameters, without the time."""
         every = self.phases[0].names
         return every[len(every) - self.parameter_count :]
 
     @property
     def drifts(self) -> bool:
-        """Whether there is a drift."""
+        """True where the system has a drift ``c``."""
         return self.phases[0].c is not None
 
     @property
     def varies(self) -> bool:
-        """Whether entries depend on the time."""
+        """True where entries of the matrices depend on the time."""
         return self.phases[0].timed
 
     @property
     def horizon(self) -> float:
-        """When the last phase ends; infinite where one lasts as long as one likes."""
+        """The time at which the last phase ends; infinite for a `LinearSystem`, which has no end."""
         return self.phases[-1].until
 
     @property
     def switches(self) -> tuple[float, ...]:
-        """When one phase follows another, where the entries are constant between; of a system that varies none: no
-        piece of a grid has to end where another law takes over."""
+        """The times at which a new phase begins, where the entries are constant within phases.
+
+        The tuple is empty for a system whose entries depend on the time: there no piece of a grid has to end where the
+        next phase begins.
+        """
         return () if self.varies else tuple(phase.begin for phase in self.phases[1:])
 
     @cached_property
     def forced(self) -> System:
-        """The same system with its drift as one more column of ``B``, whose control is always 1; itself without a
-        drift. Then it has no delay: that belongs to the times at which the controls act."""
+        """The system whose drift is the last column of ``B``, with a control that is always 1.
+
+        It is the system itself without a drift.
+
+        A system that is made so has no delay, because a delay belongs to the times at which the controls act.
+        """
         return System(tuple(phase.forced for phase in self.phases), self.parameters) if self.drifts else self
 
     @cached_property
     def modes(self) -> tuple[Phase, ...]:
-        """The phases; of a system that varies what it is at several times, for what asks how large its numbers are:
-        nothing is proven by them. Of parameters that the state depends on affinely they are those in the middle of the
-        box."""
+        """The phases at fixed times, from which the sizes of the numbers of a problem are estimated.
+
+        Where the entries do not depend on the time, the modes are the `phases`. Otherwise they are the system at
+        several times of each phase, and nothing is proven by them. Where the state is then an affine function of the
+        parameters, these are in the middle of their box.
+        """
         if not self.varies:
             return self.phases
         found = list[Phase]()
-        # Chebyshev's points, closer to the ends: an entry that is 0 at evenly spaced times is seen
+        # Chebyshev points lie closer to the ends: an entry with zeros at evenly spaced times is not taken for 0
         shares = (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
         for phase in self.phases:
             times = phase.begin + (phase.until - phase.begin) * shares
@@ -162,32 +192,47 @@ class System:
         return tuple(found)
 
     def _arguments(self, times: Array) -> Array:
-        """``times (k, 1)`` as arguments of a phase, the parameters being in the middle of their box."""
+        """Return times ``(k, 1)`` as arguments of a phase, with the parameters in the middle of their box."""
         middle = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
         return np.hstack([times, np.tile(middle, (len(times), 1))])
 
     def until(self, horizon: float) -> tuple[Phase, ...]:
-        """The phases, the last one up to the horizon."""
+        """Return the phases, of which the last one ends at the ``horizon``."""
         last = self.phases[-1]
         return *self.phases[:-1], last.between(last.begin, horizon)
 
     def in_phases(self, phases: Sequence[Phase]) -> System:
-        """The same system in other phases up to the same time; a constant one alone lasts as long as this one."""
+        """Return the system with other phases up to the same time; a single phase lasts as long as this system."""
         if len(phases) == 1:
             phases = [phases[0].between(0.0, self.horizon)]
         return System(tuple(phases), self.parameters, self.delay)
 
     def with_parameters(self, parameters: ConvexSet) -> System:
-        """The same system with its parameters in another set."""
+        """Return the system with its parameters in another set."""
         phases = tuple(phase.within(parameters, self.names) for phase in self.phases)
         return System(phases, boxed(parameters) if self.varies else parameters, self.delay)
 
     def with_delay(self, delay: float) -> System:
-        """The same system whose control acts so much later."""
+        """Return the system with another ``delay``, in its time unit."""
         return System(self.phases, self.parameters, delay)
 
     def remaining(self, begin: float, horizon: float) -> System:
-        """What is left of it from a time on, which is 0 then, for as long as ``horizon``."""
+        """Return the system that remains from one time on, with a clock that is 0 at this time.
+
+        A `LinearSystem` has no end, and is returned as it is.
+
+        Parameters
+        ----------
+        begin : float
+            The time from which the system remains, on the present clock.
+        horizon : float
+            The duration of the system that is returned.
+
+        Returns
+        -------
+        System
+            The phases that act in ``[begin, begin + horizon]`` for longer than rounding.
+        """
         if self.horizon == np.inf:
             return self
         left = [
@@ -201,8 +246,11 @@ class System:
         return System(phases, self.parameters, self.delay)
 
     def in_time(self, horizon: float) -> System:
-        """The same system as one whose entries depend on the time, up to the ``horizon``; itself where they do. Raises
-        `InputError` where its parameters are in no box."""
+        """Return the system as a system whose entries depend on the time, up to the ``horizon``.
+
+        A system that already depends on the time is returned as it is. Raises `InputError` where the parameters are not
+        in a bounded box.
+        """
         if self.varies:
             return self
         ends = [*self.switches, horizon]
@@ -210,14 +258,17 @@ class System:
         return System(phases, None if self.parameters is None else boxed(self.parameters), self.delay)
 
     def check_horizon(self, horizon: float) -> None:
-        """Raise `InputError` where the phases do not fill the horizon."""
+        """Raise `InputError` where the last phase does not end at the horizon, or a phase is shorter than rounding."""
         if self.varies or self.horizon < np.inf:
             _check_ends([phase.until for phase in self.phases], horizon, self.varies and len(self.phases) == 1)
 
     def check_period(self) -> None:
-        """Raise `InputError` where the horizon is no period of a law, but for what rounding it explains. Nothing is
-        proven by that: the law of a plan that repeats begins again at the horizon, as phases of a system do. Laws that
-        take turns may differ there as at any other time, and so may constant phases."""
+        """Raise `InputError` where the horizon is not a period of the entries, up to `PERIODIC`.
+
+        No proof rests on this check: a plan that repeats begins again at the horizon with the entries of time 0, and
+        phases do the same. A system in several phases is not checked. Its entries may jump at the horizon as they may
+        between phases.
+        """
         if not self.varies or len(self.phases) > 1:
             return
         every = [[part[0] for part in mode.forced.matrices(mode.probes[:1])] for mode in self.modes]
@@ -234,25 +285,31 @@ class System:
 
     @property
     def dependence(self) -> Dependence | None:
-        """How the state depends on parameters beside the time, where that is affinely."""
+        """The affine dependence of the state on the parameters, or ``None``.
+
+        The value is ``None`` for a system that does not depend on the time or has no parameters, or whose state is not
+        affine in them.
+        """
         return None if isinstance(self._depends, int) else self._depends
 
     @property
     def powers(self) -> int | None:
-        """Where the state depends on parameters beside the time, and not affinely, the largest degree of an entry that
-        is a polynomial in them."""
+        """The largest degree of the entries that are polynomials in the parameters, where the state is not affine.
+
+        The value is ``None`` where the system does not depend on the time, has no parameters, or is affine in them.
+        """
         return self._depends if isinstance(self._depends, int) else None
 
     @cached_property
     def _depends(self) -> Dependence | int | None:
-        """One of both; nothing without parameters beside the time."""
+        """The `dependence` or the `powers`; ``None`` for a system without time or without parameters in its entries."""
         if not self.varies or self.parameters is None:
             return None
         return dependence([[phase.entry(name) for name in PARTS] for phase in self.phases], *self.deviations)
 
     @property
     def deviations(self) -> tuple[Array, Array]:
-        """The middle of a box of parameters, and the most that each deviates from it by."""
+        """The middle ``(nu,)`` of the box of the parameters, and the largest deviations ``(nu,)``, rounded upwards."""
         if self.parameters is None:
             return np.zeros(0), np.zeros(0)
         centre, box = self.box.interior_point(), self.box
@@ -260,7 +317,19 @@ class System:
         return centre, np.max([[_difference(a, b) for a, b in zip(*ends, strict=True)] for ends in sides], axis=0)
 
     def superposed(self, depends: Dependence | Spread) -> System:
-        """The known system of all states that a dependence tells of."""
+        """Return the known system of the coefficients of the state, where the state is expanded in the parameters.
+
+        Parameters
+        ----------
+        depends : Dependence or Spread
+            The affine dependence on the parameters, or the polynomial expansion in them.
+
+        Returns
+        -------
+        System
+            A system without parameters, whose entries depend on the time alone. Its state holds the coefficients one
+            after another.
+        """
         phases = []
         for phase in self.phases:
             parts = {name: phase.entry(name) for name in PARTS}
@@ -271,7 +340,7 @@ class System:
         return System(tuple(phases), None, self.delay)
 
     def at(self, parameter: Array) -> System:
-        """The known system at one parameter ``(nu,)``."""
+        """Return the known system at one value ``(nu,)`` of the parameter."""
         if self.parameters is None:
             return self
         return System(tuple(phase.at(parameter) for phase in self.phases), None, self.delay)
@@ -286,8 +355,24 @@ class System:
         c: Float[Array, "d 1"] | float = 1.0,
         time: float = 1.0,
     ) -> System:
-        """The system whose matrices are ``A``, ``B``, ``E``, ``c`` times these factors, entry by entry, and whose
-        parameters and times are this one's divided by ``parameters (nu,)`` and ``time``; exact for powers of two."""
+        """Return the system in other units; the change is exact where all factors are powers of two.
+
+        Parameters
+        ----------
+        A, B, E : arrays (d, d), (d, m), (d, mw)
+            The factors by which the matrices are multiplied, entry by entry.
+        parameters : array (nu,)
+            The numbers by which the parameters are divided.
+        c : array (d, 1) or float, default 1.0
+            The factors by which the drift is multiplied.
+        time : float, default 1.0
+            The number by which all times are divided.
+
+        Returns
+        -------
+        System
+            The same system in these units.
+        """
         arguments = np.concatenate([[time], parameters]) if self.varies else parameters
         phases = tuple(phase.in_units(A, B, E, arguments, c, time) for phase in self.phases)
         bound = None if self.parameters is None else self.parameters.in_units(parameters)
@@ -295,7 +380,10 @@ class System:
 
     @property
     def stated(self) -> System:
-        """The system in the units that it is stated in; itself where these are its own."""
+        """The system in the units of the user, where its phases keep them; the system itself elsewhere.
+
+        A constant system without parameters does not keep them.
+        """
         first = self.phases[0]
         if not isinstance(first, PhaseInUnits):
             return self
@@ -306,22 +394,51 @@ class System:
 
     @shaped
     def describe(self, parameter: Float[Array, " nu"]) -> str:
-        """A parameter vector in words, such as ``p1 = 0.1, p2 = -0.1``."""
+        """Return a parameter vector ``(nu,)`` in words, such as ``p1 = 0.1, p2 = -0.1``."""
         return self.phases[0].describe(parameter)
 
 
 @final
 class LinearSystem(System):
-    """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)`` with state ``x (d,)``, control ``u (m,)``,
-    disturbance ``w (mw,)`` and a constant, unknown parameter ``p (nu,)`` in ``parameters``.
+    """A system ``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)``, whose entries do not depend on the time.
 
-    ``A (d, d)``, ``B (d, m)``, ``E (d, mw)`` are arrays, or functions of ``p`` that return such arrays; ``E`` is the
-    identity unless given. ``parameters`` is a bounded set, or ``None`` when everything is known; ``names`` are for
-    messages, p1, p2, ... unless given. ``c (d,)``, an array or a function of ``p``, is a constant drift such as
-    gravity, in units of the state per time; none unless given. ``delay``: by how much later the control acts, in the
-    time unit of the system; until then ``initial_control`` of the problem acts. A function should be arithmetic with
-    numpy functions: then it can be enclosed over cells of parameters, for proofs. Raises `InputError` when shapes
-    disagree or an entry is not finite somewhere that was looked at.
+    The state is ``x (d,)``, the control ``u (m,)``, the disturbance ``w (mw,)``. The parameter ``p (nu,)`` is constant
+    and unknown.
+
+    Parameters
+    ----------
+    A : array (d, d) or function of p
+        The system matrix. A function takes ``p (nu,)`` and returns such an array.
+    B : array (d, m) or function of p
+        The input matrix.
+    E : array (d, mw) or function of p, optional
+        The matrix by which the disturbance enters; the identity unless given.
+    parameters : ConvexSet, optional
+        The bounded set of ``p``; ``None`` (the default) where everything is known.
+    names : sequence of str, optional
+        The names of the parameters in messages; ``p1``, ``p2``, ... unless given.
+    c : array (d,) or function of p, optional
+        A constant drift such as gravity, in units of the state per time; no drift unless given.
+    delay : float, default 0.0
+        The time, in the time unit of the system, by which the control acts later than it is commanded. Before ``delay``
+        the ``initial_control`` of the problem acts.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, if an entry is not finite at one of the parameters that are tried, if the set of the
+        parameters is not bounded, or if the delay is negative or not finite.
+
+    Notes
+    -----
+    A function of ``p`` should consist of arithmetic and numpy functions. Proofs can then enclose the function over
+    cells of parameters.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> sr.LinearSystem([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]).states
+    2
     """
 
     def __init__(
@@ -345,9 +462,28 @@ class LinearSystem(System):
         c: Matrix | None = None,
         delay: float = 0.0,
     ) -> LinearSystem:
-        """The system of a state-space model of another package (python-control, scipy.signal, harold, or whatever has
-        ``A`` and ``B``); its outputs play no part. The other arguments are those of the class. Raises `InputError` for
-        a plant without these matrices and for one in discrete time."""
+        """Return the system of a state-space model of another package.
+
+        The model may come from python-control, scipy.signal, harold, or from any package whose models have ``A`` and
+        ``B``.
+
+        Parameters
+        ----------
+        plant : object
+            A model in continuous time with the matrices ``A (d, d)`` and ``B (d, m)``. Its outputs are ignored.
+        E, parameters, names, c, delay
+            The arguments of `LinearSystem` with these names.
+
+        Returns
+        -------
+        LinearSystem
+            The system with the matrices of the model.
+
+        Raises
+        ------
+        InputError
+            If the model has no such matrices, or is in discrete time.
+        """
         from sparserob_core.control.problem.statespace import matrices_of
 
         return LinearSystem(*matrices_of(plant), E, parameters, names, c, delay)
@@ -355,13 +491,33 @@ class LinearSystem(System):
 
 @final
 class SwitchedSystem(System):
-    """Linear systems that take turns at known times: ``pieces`` are pairs ``(until, LinearSystem)``, each with its own
-    ``A``, ``B``, ``E`` and ``c``; the first begins at time 0, the last ``until`` is the horizon. The state goes on
-    where it is.
+    """A system of several linear systems that follow one another at known times.
 
-    All of them have as many states, controls and disturbances, and share their parameters: a piece without any is a
-    known one. ``delay``, as that of a `LinearSystem`: what was commanded acts through the ``B`` of the time at which it
-    acts. Raises `InputError`.
+    Each of these phases has its own ``A``, ``B``, ``E`` and ``c``. All phases have the same numbers of states, controls
+    and disturbances. The state is continuous at the switches.
+
+    Parameters
+    ----------
+    pieces : sequence of pairs (float, LinearSystem)
+        Each phase as the time until which it holds, and its system. The first phase begins at time 0; the last time is
+        the horizon. All phases share their parameters; a phase without parameters is known.
+    delay : float, default 0.0
+        The time by which the control acts later than it is commanded. A control acts through the ``B`` of the time at
+        which it acts.
+
+    Raises
+    ------
+    InputError
+        If there is no phase, if the times do not increase, if a phase is not a `LinearSystem` or has its own delay, or
+        if phases differ in their parameters or in their numbers of states, controls or disturbances.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> slow = sr.LinearSystem([[-1.0]], [[1.0]])
+    >>> fast = sr.LinearSystem([[-4.0]], [[1.0]])
+    >>> sr.SwitchedSystem([(2.0, slow), (5.0, fast)]).switches
+    (2.0,)
     """
 
     def __init__(self, pieces: Sequence[tuple[float, System]], delay: float = 0.0) -> None:
@@ -385,13 +541,29 @@ class SwitchedSystem(System):
 
 @final
 class VaryingSystem(System):
-    """``x'(t) = A(t) x(t) + B(t) u(t - delay) + E(t) w(t) + c(t)`` for ``t`` from 0 to the ``horizon``.
+    """A system ``x'(t) = A(t) x(t) + B(t) u(t - delay) + E(t) w(t) + c(t)`` for ``t`` from 0 to the ``horizon``.
 
-    ``law``: a `LinearSystem` whose first parameter is the time: its matrices at ``p = (t,)`` are those at the time
-    ``t``. ``later``: times, one after another, each with the law that holds from then on. ``delay``, as that of a
-    `LinearSystem`: what was commanded acts through the ``B`` of the time at which it acts. ``parameters``: a box of
-    uncertain parameters, which follow the time in the laws; ``None`` where everything is known. Made of expressions by
-    `of` and `taking_turns`. Raises `InputError`.
+    Users whose entries are expressions make such a system by `of` or `taking_turns`.
+
+    Parameters
+    ----------
+    law : LinearSystem
+        A system whose first parameter is the time: its matrices at ``p = (t,)`` are those at the time ``t``. Uncertain
+        parameters follow the time in ``p``.
+    horizon : float
+        The time until which the last law holds.
+    delay : float, default 0.0
+        The time by which the control acts later than it is commanded. A control acts through the ``B`` of the time at
+        which it acts.
+    later : sequence of pairs (float, LinearSystem), optional
+        Increasing times, each with the law that holds from then on; none unless given.
+    parameters : Box, optional
+        The box of the uncertain parameters ``(nu,)``; ``None`` (the default) where everything is known.
+
+    Raises
+    ------
+    InputError
+        If a law has another number of parameters or a delay of its own, or if the times do not increase.
     """
 
     def __init__(
@@ -428,9 +600,46 @@ class VaryingSystem(System):
         parameters: ConvexSet | None = None,
         names: Sequence[str] = (),
     ) -> System:
-        """The system whose entries are numbers and expressions in ``t``, in the ``names`` of uncertain ``parameters``
-        (p1, p2, ... unless given), and in those that ``define`` gives to such expressions; see `parse_expression`.
-        Raises `InputError` that begins with the key of a config."""
+        """Return the system whose entries are numbers and expressions in the time ``t``.
+
+        An entry may also contain the names of uncertain parameters and the names that ``define`` gives; see
+        `parse_expression`.
+
+        Parameters
+        ----------
+        A, B : rows of numbers and expressions
+            The matrices ``(d, d)`` and ``(d, m)``.
+        horizon : float
+            The time at which the system ends.
+        E : rows of numbers and expressions, optional
+            The matrix ``(d, mw)``; the identity unless given.
+        c : sequence of numbers and expressions, optional
+            The drift ``(d,)``; no drift unless given.
+        define : mapping, optional
+            Names for expressions, which entries may use.
+        delay : float, default 0.0
+            The time by which the control acts later than it is commanded.
+        parameters : ConvexSet, optional
+            The bounded box of the uncertain parameters; ``None`` (the default) where everything is known.
+        names : sequence of str, optional
+            The names of the parameters; ``p1``, ``p2``, ... unless given.
+
+        Returns
+        -------
+        System
+            The system from time 0 to the horizon.
+
+        Raises
+        ------
+        InputError
+            If an entry cannot be read or the shapes disagree; where it can, the error begins with the key of a config.
+
+        Examples
+        --------
+        >>> import sparserob_core as sr
+        >>> sr.VaryingSystem.of([["-(1 + 0.4 * cos(2 * t))"]], [[1]], 5.0).varies
+        True
+        """
         known = _Uncertain.of(parameters, names)
         return System((_phase("system", (A, B, E, c), (0.0, horizon), define, known),), known.box, delay)
 
@@ -442,8 +651,28 @@ class VaryingSystem(System):
         parameters: ConvexSet | None = None,
         names: Sequence[str] = (),
     ) -> System:
-        """Systems as those of `of`, each up to a time with its ``A``, ``B``, ``E`` and ``c``; ``t`` counts from 0 in
-        all of them, and the last one ends at the horizon."""
+        """Return the system of several phases, whose entries are numbers and expressions in the time ``t``.
+
+        The time ``t`` counts from 0 in all phases.
+
+        Parameters
+        ----------
+        pieces : sequence of pairs (float, (A, B, E, c))
+            Each phase as the time at which it ends, and its matrices. ``E`` and ``c`` may be ``None``. The last time is
+            the horizon.
+        define, delay, parameters, names
+            The arguments of `VaryingSystem.of` with these names, for all phases together.
+
+        Returns
+        -------
+        System
+            The system from time 0 to the horizon.
+
+        Raises
+        ------
+        InputError
+            If an entry cannot be read, the times do not increase, or the shapes disagree.
+        """
         ends, known = [0.0, *(float(until) for until, _ in pieces)], _Uncertain.of(parameters, names)
         phases = tuple(
             _phase(f"system.pieces.{i}", given, during, define, known)
@@ -453,7 +682,7 @@ class VaryingSystem(System):
 
 
 def _duration(value: object) -> float:
-    """A finite number that is not negative; raises `InputError`."""
+    """Return the delay as a float; raise `InputError` where it is no finite number of at least 0."""
     usable = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
     if not usable or not 0.0 <= float(value) < np.inf:  # type: ignore[arg-type]
         raise InputError(path="system.delay", expected="a finite time, not negative", got=f"{value!r}")
@@ -461,14 +690,16 @@ def _duration(value: object) -> float:
 
 
 def _difference(low: float, high: float) -> float:
-    """``high - low``, or the next double above it."""
+    """Return ``high - low`` as a double, rounded upwards."""
     exact, found = Fraction(float(high)) - Fraction(float(low)), float(high) - float(low)
     return found if Fraction(found) >= exact else float(np.nextafter(found, np.inf))
 
 
 def _check_ends(ends: Sequence[float], horizon: float, whole: bool) -> None:
-    """Raise `InputError` where the systems, or laws, that end at these times do not fill the horizon; ``whole``: it is
-    one law, of which no piece is named."""
+    """Raise `InputError` where phases that end at the times ``ends`` do not fill the horizon.
+
+    Where ``whole`` is true, the system is a single law, and messages name no piece of it.
+    """
     last, begin = len(ends) - 1, 0.0
     if not abs(ends[last] - horizon) <= SAME_TIME * horizon:
         raise InputError(
@@ -489,6 +720,10 @@ def _check_ends(ends: Sequence[float], horizon: float, whole: bool) -> None:
 
 
 def _check_piece(i: int, pair: object, before: float) -> None:
+    """Raise `InputError` where a phase of a switched system is no pair of a later time and a `LinearSystem`.
+
+    A delay of its own is refused too.
+    """
     if not isinstance(pair, Sequence) or len(pair) != 2:
         raise InputError(path=f"system.pieces.{i}", expected="a pair of a time and a LinearSystem", got=f"{pair!r}")
     until, system = pair
@@ -505,14 +740,14 @@ def _check_piece(i: int, pair: object, before: float) -> None:
 @final
 @dataclass(frozen=True, eq=False)
 class _Uncertain:
-    """The box of parameters beside the time, and the names of both."""
+    """The box of the uncertain parameters, and the names of the time and of these parameters."""
 
     box: Box | None
     names: tuple[str, ...]
 
     @staticmethod
     def of(parameters: ConvexSet | None, names: Sequence[str]) -> _Uncertain:
-        """Those that are given; raises `InputError` for a set that is no box, or as many names."""
+        """Return the box and the names; raise `InputError` for another set or for unsuitable names."""
         box = None if parameters is None else boxed(parameters)
         count = 0 if box is None else box.dimension
         given = tuple(names) or tuple(f"p{i + 1}" for i in range(count))
@@ -529,7 +764,31 @@ def _phase(
     define: Mapping[str, str | float] | None,
     uncertain: _Uncertain,
 ) -> Phase:
-    """The phase that is ``given`` at a key of a config, whose entries speak of the time between two."""
+    """Return the phase with the given matrices, whose entries are expressions in the time and the parameters.
+
+    Parameters
+    ----------
+    where : str
+        The key of a config at which the matrices stand, for messages.
+    given : tuple (A, B, E, c)
+        The matrices; ``E`` and ``c`` may be ``None``.
+    during : tuple of two floats
+        The times from which and until which the phase holds.
+    define : mapping or None
+        Names for expressions, which entries may use.
+    uncertain : _Uncertain
+        The box of the parameters, and the names of the time and of the parameters.
+
+    Returns
+    -------
+    Phase
+        The timed phase between these times.
+
+    Raises
+    ------
+    InputError
+        If an entry cannot be read, or the phase does not end after it begins.
+    """
     names, (A, B, E, c) = uncertain.names, given
     try:
         defined = parse_definitions(define or {}, names)

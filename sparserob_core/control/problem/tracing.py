@@ -1,5 +1,8 @@
-"""A Python function of the parameters as the expressions that it computes: run once on symbols, and compared with
-itself on numbers. Nothing of it is executed again where the expressions are read."""
+"""Expressions of a config from Python functions of the parameters.
+
+A function is called once with symbols, which gives its expressions. These are compared with the function at numbers.
+The function is not executed again where the expressions are read.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,11 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 SAME = 1e-9
-"""Relative difference between a function and its expressions that is rounding. Arithmetic in another order differs by
-some 1e-15; with 1e-8 a coefficient that was written down wrongly might pass, with 1e-10 a badly conditioned formula
-might be refused."""
+"""The relative difference between a function and its expressions that counts as rounding.
+
+Arithmetic in another order differs by some 1e-15. With 1e-8 a coefficient that was written down wrongly might pass;
+with 1e-10 a badly conditioned formula might be refused.
+"""
 NUMBER = int | float | np.integer | np.floating
 
 
@@ -67,7 +72,7 @@ class Symbol:
         return self
 
     def __getattr__(self, name: str) -> Callable[[], Symbol]:
-        """What numpy calls where it takes the sine and so on of an object."""
+        """Return the method that numpy calls where it takes the sine, or another elementary function, of an object."""
         if name not in FUNCTIONS:
             raise AttributeError(f"{name} is none of {', '.join(FUNCTIONS)}")
         return lambda: Symbol(f"{name}({self.text})")
@@ -80,11 +85,28 @@ class Symbol:
 
 
 def traced(name: str, function: Callable[..., object], names: Sequence[str], probes: Array) -> list[list[str | float]]:
-    """The entries, row by row, of a matrix that a function of the parameters ``names`` returns: numbers, and
-    expressions in the parameters. ``probes (k, nu)``: parameters at which both are compared.
+    """Return the entries of a matrix that a function of the parameters returns, as numbers and expressions.
 
-    Raises `InputError` where the function is more than arithmetic with numpy's functions, and where an expression is
-    longer than a config takes.
+    Parameters
+    ----------
+    name : str
+        The name of the matrix, for messages.
+    function : function
+        The function, which takes ``p (nu,)`` and returns a matrix.
+    names : sequence of str
+        The names of the parameters.
+    probes : array (k, nu)
+        The parameters at which the function and its expressions are compared.
+
+    Returns
+    -------
+    list of lists of str and float
+        The entries, row by row.
+
+    Raises
+    ------
+    InputError
+        If the function is more than arithmetic with numpy functions, or if an expression is too long for a config.
     """
     p = np.empty(len(names), dtype=object)
     p[:] = [Symbol(one) for one in names]
@@ -103,11 +125,13 @@ def traced(name: str, function: Callable[..., object], names: Sequence[str], pro
 
 
 def _agree(written: ExpressionMatrix, function: Callable[..., object], point: Array) -> bool:
+    """Return True where a matrix of expressions agrees with the function at one point ``(nu,)``, up to `SAME`."""
     given, found = np.asarray(function(point), dtype=float), np.asarray(written(point), dtype=float)
     return given.shape == found.shape and bool(np.allclose(given, found, rtol=SAME, atol=0.0))
 
 
 def _refused(name: str, why: str) -> str:
+    """Return the message for a function that cannot be written as expressions."""
     return (
         f"the function {name} cannot be written into a config: {why}; expected arithmetic and numpy's"
         f" {', '.join(FUNCTIONS)} of the parameters, or a matrix of expressions in a config"
@@ -115,6 +139,7 @@ def _refused(name: str, why: str) -> str:
 
 
 def _entry(value: object) -> str | float:
+    """Return an entry as text or number."""
     if isinstance(value, Symbol):
         return value.text
     if isinstance(value, NUMBER) and not isinstance(value, bool):
@@ -123,13 +148,18 @@ def _entry(value: object) -> str | float:
 
 
 def _joined(left: object, operator: str, right: object) -> Symbol:
-    """Both with an operator between them; ``NotImplemented`` beside an array, which then takes its turn."""
+    """Return both operands with an operator between them.
+
+    Returns ``NotImplemented`` for an operand that is neither a symbol nor a number, such as an array, which then
+    applies the operator to each of its entries.
+    """
     if not all(isinstance(value, Symbol | NUMBER) and not isinstance(value, bool) for value in (left, right)):
         return NotImplemented  # type: ignore[no-any-return]
     return Symbol(f"({_text(left)} {operator} {_text(right)})")
 
 
 def _text(value: Any) -> str:
+    """Return an operand as text, a negative number in parentheses."""
     if isinstance(value, Symbol):
         return value.text
     return repr(float(value)) if value >= 0 else f"({float(value)!r})"

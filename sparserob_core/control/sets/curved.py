@@ -28,22 +28,43 @@ from sparserob_core.sip.convex_set import (
 )
 
 _SIGN_DIMENSIONS = 10
-STEEP = 1e10  # powers up to which a rounding of the base is no more than there is room for in the power
-ROOM = 0.999  # of a sum of powers, by which it may move: it is away from 0 whatever rounding does
+STEEP = 1e10  # exponents up to which the rounding of a base changes the power by less than the bounds leave free
+ROOM = 0.999  # relative deviation of a sum of powers, below which the sum is away from 0 in spite of rounding
 
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid(ConvexSet):
-    """``{x : (x - centre)' shape^-1 (x - centre) <= 1} = {centre + L z : |z| <= 1}`` with ``L L' = shape``.
+    """An ellipsoid ``{x : (x - centre)' shape^-1 (x - centre) <= 1} = {centre + L z : |z| <= 1}`` with
+    ``L L' = shape``.
 
-    ``centre (d,)``, ``shape (d, d)`` symmetric positive definite. Raises `InputError` when it is not.
-    Support function ``c'centre + sqrt(c' shape c)``.
+    Parameters
+    ----------
+    centre : array (d,)
+        The centre.
+    shape : array (d, d)
+        A symmetric, positive definite matrix, in squared units of the coordinates.
+
+    Raises
+    ------
+    InputError
+        If the matrix is not symmetric and positive definite, or a number is not finite.
+
+    Notes
+    -----
+    The support function is ``c'centre + sqrt(c' shape c)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sparserob_core as sr
+    >>> sr.Ellipsoid([0, 0], [[4, 0], [0, 1]]).support(np.array([1.0, 0.0])).item()
+    2.0
     """
 
     centre: Array
     shape: Array
 
-    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+    if TYPE_CHECKING:  # users may give a list; the field is an array
 
         def __init__(self, centre: npt.ArrayLike, shape: npt.ArrayLike) -> None: ...
 
@@ -70,12 +91,15 @@ class Ellipsoid(ConvexSet):
 
     @cached_property
     def factor(self) -> Array:
-        """Lower triangular ``L (d, d)`` with ``L L' = shape``."""
+        """The lower triangular matrix ``L (d, d)`` with ``L L' = shape``."""
         return np.asarray(np.linalg.cholesky(self.shape), dtype=float)
 
     @cached_property
     def frame(self) -> Array:
-        """``L^-1``, but for its last digits: the support function about the centre is the 2-norm of ``z``."""
+        """The matrix ``L^-1``, rounded to a few digits.
+
+        In its coordinates ``z`` of a direction, the support function about the centre is the 2-norm of ``z``.
+        """
         return few_digits(np.asarray(np.linalg.solve(self.factor, np.eye(self.dimension)), dtype=float))
 
     @shaped
@@ -115,19 +139,34 @@ class Ellipsoid(ConvexSet):
 
     @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """Distance to the ellipsoid outside; inside, ``(gauge - 1) * shortest half-axis``, which is at least minus the
-        depth."""
-        # Half-axes from the factor: of its square, rounding leaves the shortest of very uneven ones without a sign. One
-        # that is shorter than rounding of the longest is no shorter than that, which moves the projection only.
+        """Return how far points are outside (positive) or inside (negative) of the ellipsoid.
+
+        Outside, the value is the Euclidean distance. Inside, it is ``(gauge - 1)`` times the shortest half-axis, which
+        is at least minus the depth.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            The points.
+
+        Returns
+        -------
+        array (...,)
+            The violation of each point.
+        """
+        # The half-axes are singular values of the factor: eigenvalues of its square may be negative by rounding where
+        # the half-axes differ much. A half-axis that is shorter than the rounding of the longest is replaced by this
+        # rounding, which changes the projection only.
         axes, lengths, _ = np.linalg.svd(self.factor)
         lengths = np.maximum(lengths, np.finfo(float).eps * lengths.max())
         axes, squares = axes[:, ::-1], lengths[::-1] ** 2
         z = np.abs((np.asarray(points, dtype=float) - self.centre) @ axes)
-        # Inside or outside by substitution in the triangular factor, which units of any kind leave as it is. A point of
-        # gauge g > 1 is at least (g - 1) * shortest half-axis away, for the set holds a ball of that radius.
+        # The gauge decides between inside and outside, by substitution in the triangular factor, which gives the same
+        # answer in all units. A point of gauge g > 1 is at least (g - 1) * shortest half-axis away, because the set
+        # contains a ball of that radius.
         gauge = self.gauge(points)
         depth = (gauge - 1.0) / np.linalg.norm(np.linalg.solve(self.factor, np.eye(self.dimension)), ord=2)
-        # The multiplier of the projection: |shape^(1/2) z / (shape + multiplier)| decreases to 1.
+        # The multiplier of the projection is where |shape^(1/2) z / (shape + multiplier)| has decreased to 1.
         _, high = bisect(
             lambda multiplier: (squares * (z / (squares + multiplier[..., None])) ** 2).sum(axis=-1) <= 1.0,
             np.zeros(gauge.shape),
@@ -147,6 +186,7 @@ class Ellipsoid(ConvexSet):
 
     @shaped
     def _solved(self, matrix: Float[Array, "d d"], points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
+        """Return the solutions ``(..., d)`` of ``matrix y = point - centre``."""
         rays = np.asarray(points, dtype=float) - self.centre
         return np.asarray(np.linalg.solve(matrix, rays.reshape(-1, self.dimension).T).T.reshape(rays.shape))
 
@@ -155,7 +195,10 @@ class Ellipsoid(ConvexSet):
         return self.centre, self.factor
 
     def scaled(self, factor: float) -> Ellipsoid:
-        """Raises `InputError` for the factor 0: an ellipsoid has an interior."""
+        """Return the ellipsoid scaled by a ``factor`` about its centre; raise `InputError` for the factor 0.
+
+        An ellipsoid has an interior, and a point has none.
+        """
         return Ellipsoid(self.centre, factor**2 * self.shape)
 
     @shaped
@@ -164,7 +207,20 @@ class Ellipsoid(ConvexSet):
 
     @shaped
     def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """Uniform."""
+        """Return independent points of the ellipsoid, distributed uniformly.
+
+        Parameters
+        ----------
+        count : int
+            The number of points.
+        rng : numpy.random.Generator
+            The source of random numbers.
+
+        Returns
+        -------
+        array (count, d)
+            The points.
+        """
         return np.asarray(self.centre + _in_ball(2.0, self.dimension, count, rng) @ self.factor.T)
 
     @shaped
@@ -174,12 +230,37 @@ class Ellipsoid(ConvexSet):
 
 @dataclass(frozen=True, eq=False, init=False)
 class NormBall(ConvexSet):
-    """``{x : |x - centre|_p <= radius}`` for ``1 <= p <= inf``; give ``centre (d,)``, or ``dimension`` for a ball about
-    the origin.
+    """A ball ``{x : |x - centre|_p <= radius}`` of the ``p``-norm.
 
-    Flat for ``p = 1`` (up to ten dimensions) and ``p = inf``. Support function ``c'centre + radius |c|_q``,
-    ``1/p + 1/q = 1``. A ball of radius 0 is a point whatever ``p``, and is kept as that of ``p = inf``: of a point
-    there is no gauge by which directions could be scaled.
+    Parameters
+    ----------
+    p : float
+        The exponent, from 1 to infinity.
+    radius : float
+        The radius, at least 0 and finite.
+    centre : array (d,), optional
+        The centre. It may be left out where ``dimension`` is given.
+    dimension : int, optional
+        The dimension ``d`` of a ball about the origin.
+
+    Raises
+    ------
+    InputError
+        If the exponent or the radius is unsuitable, a number of the centre is not finite, or neither a centre nor a
+        dimension is given.
+
+    Notes
+    -----
+    The support function is ``c'centre + radius |c|_q`` with ``1/p + 1/q = 1``. The set is flat for ``p = 1`` in up to
+    ten dimensions, and for ``p = inf``. A ball of radius 0 is a point, and is kept with ``p = inf``. A point has no
+    gauge by which directions could be scaled.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sparserob_core as sr
+    >>> sr.NormBall(1, 0.5, dimension=2).support(np.array([3.0, -4.0])).item()
+    2.0
     """
 
     p: float
@@ -227,7 +308,7 @@ class NormBall(ConvexSet):
         if self.p == 1.0:
             axes = self.radius * np.eye(self.dimension)
             return continued_by_corners(self.centre + np.vstack([axes, -axes]), centre, spread)
-        root = self.radius * _continued_root(centre, spread, self.dual) if self.radius > 0.0 else 0.0  # of a point
+        root = self.radius * _continued_root(centre, spread, self.dual) if self.radius > 0.0 else 0.0  # a point
         return np.asarray((np.abs(centre) + spread) @ np.abs(self.centre) + root)
 
     @shaped
@@ -285,8 +366,22 @@ class NormBall(ConvexSet):
 
     @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """Distance to the ball outside; inside, ``(|x - centre|_p - radius) / max {|v|_p : |v|_2 = 1}``, at least minus
-        the depth."""
+        """Return how far points are outside (positive) or inside (negative) of the ball.
+
+        Outside, the value is the Euclidean distance. Inside, it is
+        ``(|x - centre|_p - radius) / max {|v|_p : |v|_2 = 1}``, which is at least minus the depth. A flat ball has the
+        violation of its half-spaces.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            The points.
+
+        Returns
+        -------
+        array (...,)
+            The violation of each point.
+        """
         if self.halfspaces() is not None:
             return super().violation(points)
         z = np.abs(np.asarray(points, dtype=float) - self.centre)
@@ -303,8 +398,25 @@ class NormBall(ConvexSet):
 
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
-        """As for every set; the projection is sought only where the ``p``-norm, which is at most ``most`` times the
-        Euclidean distance and at least that by ``least``, leaves it open."""
+        """Return the points that violate the ball by at most a tolerance, as a mask.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            The points.
+        tolerance : float, default 1e-9
+            The absolute tolerance, a Euclidean distance.
+
+        Returns
+        -------
+        array (...,) of bool
+            True for points in the ball.
+
+        Notes
+        -----
+        The ``p``-norm is at most ``most`` times the Euclidean norm, and the Euclidean norm is at most ``least`` times
+        the ``p``-norm. The projection is computed only for points that these bounds leave undecided.
+        """
         if self.halfspaces() is not None:
             return super().contains(points, tolerance)
         rays = np.asarray(points, dtype=float) - self.centre
@@ -316,8 +428,10 @@ class NormBall(ConvexSet):
         return np.asarray(inside.reshape(rays.shape[:-1]))
 
     def _projected(self, z: Array) -> Array:
-        """Euclidean projection of ``z >= 0`` on the unit ball: ``y_i + multiplier y_i^(p-1) = z_i``, and the multiplier
-        gives norm 1."""
+        """Return the Euclidean projections of ``z >= 0`` onto the unit ball.
+
+        A projection ``y`` satisfies ``y_i + multiplier y_i^(p-1) = z_i`` with the multiplier for which its norm is 1.
+        """
         power = self.p - 1.0
         _, high = bisect(
             lambda logarithm: (
@@ -352,7 +466,20 @@ class NormBall(ConvexSet):
 
     @shaped
     def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """Uniform."""
+        """Return independent points of the ball, distributed uniformly.
+
+        Parameters
+        ----------
+        count : int
+            The number of points.
+        rng : numpy.random.Generator
+            The source of random numbers.
+
+        Returns
+        -------
+        array (count, d)
+            The points.
+        """
         unit = (
             rng.uniform(-1.0, 1.0, size=(count, self.dimension))
             if self.p == np.inf
@@ -380,8 +507,10 @@ class NormBall(ConvexSet):
 
 
 def _indefinite(shape: Array) -> str | None:
-    """What keeps a square matrix from being symmetric and positive definite, in words; ``None`` where it is both.
-    Judged with its diagonal scaled to 1, whatever the units are."""
+    """Return in words why a square matrix is not symmetric and positive definite; ``None`` where it is both.
+
+    The matrix is judged with its diagonal scaled to 1, so that units change no answer.
+    """
     apart = np.abs(shape - shape.T) > 1e-12 * np.abs(shape.T)
     if apart.any():
         i, j = np.argwhere(apart)[0]
@@ -401,8 +530,18 @@ def _indefinite(shape: Array) -> str | None:
 
 @shaped
 def _round_excess(centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
-    """The largest ``|y| - g'y`` over ``y = centre + sum_j s_j spread_j``, ``g`` the unit vector of the centre:
-    ``sqrt(a^2 + b^2) - a``, which decreases in ``a <= g'y`` and increases in ``b >= |y - g g'y|``."""
+    """Return an upper bound ``(...,)`` of ``|y| - g'y`` over ``y = centre + sum_j s_j spread_j`` with ``|s_j| <= 1``.
+
+    Here ``g`` is the unit vector of the centre. The bound is ``sqrt(a^2 + b^2) - a``, which decreases in ``a <= g'y``
+    and increases in ``b >= |y - g g'y|``.
+
+    Parameters
+    ----------
+    centre : array (..., d)
+        The middle of the vectors ``y``.
+    spread : array (..., J, d)
+        The deviations of the vectors ``y``.
+    """
     length = np.linalg.norm(centre, axis=-1)
     unit = centre / np.where(length > 0.0, length, 1.0)[..., None]
     along = (spread * unit[..., None, :]).sum(axis=-1)
@@ -413,10 +552,12 @@ def _round_excess(centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) 
 
 
 def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
-    """The root ``0 <= y <= z`` of ``y + multiplier y^power = z``.
+    """Return the root ``0 <= y <= z`` of ``y + multiplier y^power = z``, entry by entry.
 
-    Of its two parts one, ``a``, has the other as a convex function ``(a / unit)^q``, ``q >= 1``; Newton's method comes
-    down to it from where either part alone would be ``z``."""
+    One of the two summands, ``a``, is chosen such that the other is a convex function ``(a / unit)^q`` of it,
+    ``q >= 1``. Newton's method then decreases to the root from the smaller of the two values at which one summand alone
+    equals ``z``.
+    """
     q = max(power, 1.0 / power)
     unit = multiplier if power < 1.0 else multiplier ** (-1.0 / q)
     a = np.minimum(z, unit * z ** (1.0 / q))
@@ -430,13 +571,17 @@ def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
 
 
 def _in_ball(p: float, dimension: int, count: int, rng: np.random.Generator) -> Array:
-    """Uniform in the unit ball of the ``p``-norm (Barthe, Guedon, Mendelson and Naor 2005, Theorem 1)."""
+    """Return ``count`` uniform points in the unit ball of the ``p``-norm.
+
+    The method is that of Barthe, Guedon, Mendelson and Naor 2005, Theorem 1.
+    """
     sizes = rng.gamma(1.0 / p, size=(count, dimension)) ** (1.0 / p)
     norms = ((sizes**p).sum(axis=1, keepdims=True) + rng.exponential(size=(count, 1))) ** (1.0 / p)
     return np.asarray(np.where(rng.integers(0, 2, size=(count, dimension), dtype=np.int8) > 0, sizes, -sizes) / norms)
 
 
 def _finite(name: str, value: object, size: int | None) -> Array:
+    """Return a list of finite numbers as an array, of a given size where one is given; raise `InputError`."""
     numbers = as_bound(name, value, size)
     if not np.isfinite(numbers).all():
         raise InputError(path=name, expected="finite numbers", got=f"{numbers.tolist()}")
@@ -445,15 +590,34 @@ def _finite(name: str, value: object, size: int | None) -> Array:
 
 @shaped
 def norm_curvature(centre: Float[Array, " b"], spread: Float[Array, "J b"]) -> Float[Array, "J J"]:
-    """``H (J, J)`` with ``|a + B's| >= |a| + a'B's / |a| + s'H s / 2`` for ``|s_j| <= 1``; ``centre`` is ``a (b,)``,
-    ``spread`` is ``B (J, b)``.
+    """Return ``H (J, J)`` with ``|a + B's| >= |a| + a'B's / |a| + s'H s / 2`` for all ``|s_j| <= 1``.
 
-    With ``u`` the part of ``a + B's`` along ``a``, at most ``U``, and ``v`` the length of the part across:
-    ``sqrt(u^2 + v^2) - u`` decreases in ``u``, so it is at least ``g(v^2) = sqrt(U^2 + v^2) - U``, which is concave. Of
-    ``v^2 = sum_k t_k``, ``t_k = (c_k's)^2`` from 0 to ``m_k``, ``g`` is above ``sum_k a_k t_k`` with the ``a_k`` of the
-    greedy algorithm, ``a_k m_k = g(m_1 + ... + m_k) - g(m_1 + ... + m_{k-1})``, for ``g`` of a sum of numbers is
-    submodular (Edmonds 1970). The narrowest come first: what is wide leaves what is narrow as curved as it is. The
-    ``c_k`` are columns of a pivoted Cholesky factor, which begins with what is widest.
+    Parameters
+    ----------
+    centre : array (b,)
+        The vector ``a``.
+    spread : array (J, b)
+        The matrix ``B``.
+
+    Returns
+    -------
+    array (J, J)
+        The positive semidefinite matrix ``H``; 0 where ``a`` is 0.
+
+    Notes
+    -----
+    Let ``u`` be the component of ``a + B's`` along ``a``, at most ``U``, and ``v`` the length of the component across.
+    ``sqrt(u^2 + v^2) - u`` decreases in ``u``. It is therefore at least ``g(v^2) = sqrt(U^2 + v^2) - U``, and ``g`` is
+    concave.
+
+    Write ``v^2 = sum_k t_k`` with ``t_k = (c_k's)^2`` from 0 to ``m_k``. Then ``g`` is at least ``sum_k a_k t_k`` with
+    the coefficients of the greedy algorithm, ``a_k m_k = g(m_1 + ... + m_k) - g(m_1 + ... + m_{k-1})``, because ``g``
+    of a sum is submodular (Edmonds 1970). The narrowest ``t_k`` come first, so that wide ones do not reduce their
+    curvature. The ``c_k`` are columns of a pivoted Cholesky factor, which begins with the widest.
+
+    References
+    ----------
+    J. Edmonds (1970), Submodular functions, matroids, and certain polyhedra.
     """
     size = float(np.linalg.norm(centre))
     if size == 0.0:
@@ -462,7 +626,7 @@ def norm_curvature(centre: Float[Array, " b"], spread: Float[Array, "J b"]) -> F
     across = spread - np.outer(along, centre / size)
     columns = _pivoted(across @ across.T)
     widths = np.abs(columns).sum(axis=1) ** 2
-    # Those that are as wide but for a factor of 2 have the mean of their slopes, which is as good as any order of them.
+    # Terms whose widths agree up to a factor of 2 share the mean of their slopes, which is as good as any order.
     _, group = np.unique(np.frexp(widths)[1], return_inverse=True)
     most, totals = size + float(np.abs(along).sum()), np.cumsum(np.bincount(group, widths))
     slopes = np.diff(totals / (most + np.sqrt(most**2 + totals)), prepend=0.0) / np.diff(totals, prepend=0.0)
@@ -470,8 +634,10 @@ def norm_curvature(centre: Float[Array, " b"], spread: Float[Array, "J b"]) -> F
 
 
 def _pivoted(matrix: Array) -> Array:
-    """Rows ``c_k (b, J)`` with ``sum_k c_k c_k'`` the positive semidefinite ``matrix (J, J)`` but for rounding, the
-    widest first."""
+    """Return rows ``c_k (b, J)``, the widest first, for which ``sum_k c_k c_k'`` is a matrix up to rounding.
+
+    The ``matrix (J, J)`` is positive semidefinite.
+    """
     rest, least, columns = matrix, matrix.shape[0] * np.finfo(float).eps * matrix.diagonal().max(initial=0.0), []
     for _ in range(matrix.shape[0]):
         pivot = int(rest.diagonal().argmax())
@@ -483,11 +649,25 @@ def _pivoted(matrix: Array) -> Array:
 
 
 def _continued_root(a: Array, b: Array, q: float) -> Array:
-    """How large ``(sum_i z_i^q)^(1/q)`` is at most where every ``z_i`` is within ``b_i`` of ``|a_i|``; ``inf`` where
-    the sum may leave the right half-plane, or for ``q`` other than 2 an entry may be 0 without being 0 everywhere.
+    """Return an upper bound of ``|(sum_i z_i^q)^(1/q)|`` for complex ``z_i`` within ``b_i`` of ``|a_i|``.
 
-    ``z^q`` is off by at most ``q b (|a| + b)^(q - 1)``, the integral of its slope, or less where one entry is larger
-    than the others (`_beside_largest`); ``a, b (k, d)``; returns ``(k,)``.
+    Parameters
+    ----------
+    a, b : arrays (k, d)
+        The real numbers, and the radii of the discs about their absolute values.
+    q : float
+        The exponent.
+
+    Returns
+    -------
+    array (k,)
+        The bound. It is ``inf`` where the sum may leave the right half-plane, or, for ``q`` other than 2, where an
+        entry may be 0 without being 0 in the whole disc.
+
+    Notes
+    -----
+    The deviation of ``z^q`` is at most ``q b (|a| + b)^(q - 1)``, the integral of its derivative. Where one entry is
+    larger than the others, `_beside_largest` may give a smaller bound.
     """
     largest = (np.abs(a) + b).max(axis=1, keepdims=True)
     unit = np.where(largest > 0.0, largest, 1.0)
@@ -502,9 +682,24 @@ def _continued_root(a: Array, b: Array, q: float) -> Array:
 
 
 def _beside_largest(a: Array, b: Array, q: float) -> Array:
-    """The same of entries ``a >= 0`` that are not 0 within ``b``, as ``z (1 + sum (z_i / z)^q)^(1/q)``, ``z`` the
-    largest: where the others are smaller by more than ``1 / q`` of it that says something of intervals of any length,
-    and the sum of powers itself of those that are shorter than ``1 / q`` alone."""
+    """Return the bound of `_continued_root` for entries ``a >= 0`` whose discs of radius ``b`` do not contain 0.
+
+    The root is written as ``z (1 + sum (z_i / z)^q)^(1/q)`` with the largest entry ``z``. Where the other entries are
+    smaller by more than the share ``1 / q`` of it, this form gives a bound for discs of any size. The sum of powers
+    gives a bound for discs that are smaller than the share ``1 / q`` only.
+
+    Parameters
+    ----------
+    a, b : arrays (k, d)
+        The entries, and the radii of the discs.
+    q : float
+        The exponent.
+
+    Returns
+    -------
+    array (k,)
+        The bound, or ``inf`` where none is found.
+    """
     first = np.arange(a.shape[1]) == a.argmax(axis=1)[:, None]
     least, most = (np.where(first, end, 0.0).sum(axis=1) for end in (a - b, a + b))
     shares = (a + b) / np.where(least > 0.0, least, 1.0)[:, None] * (1.0 + 8.0 * np.finfo(float).eps)
@@ -513,8 +708,10 @@ def _beside_largest(a: Array, b: Array, q: float) -> Array:
 
 
 def _norm(vectors: Array, q: float) -> Array:
-    """The ``q``-norms of ``(..., d)``, in units of their largest entries: a power of those themselves is 0 or infinite
-    where ``q`` is large and they are not near 1."""
+    """Return the ``q``-norms ``(...,)`` of vectors ``(..., d)``.
+
+    Vectors are divided by their largest entries first. A large power of an entry that is not near 1 is 0 or infinite.
+    """
     if q in (1.0, 2.0, np.inf):
         return np.asarray(np.linalg.norm(vectors, ord=q, axis=-1))
     unit = np.abs(vectors).max(axis=-1, keepdims=True)
@@ -523,10 +720,21 @@ def _norm(vectors: Array, q: float) -> Array:
 
 @shaped
 def _power_excess(a: Float[Array, "*k d"], b: Float[Array, "*k d"], q: float) -> Float[Array, " *k"]:
-    """A bound of ``|a + s|_q - |a|_q - gradient's`` for ``|s_i| <= b_i``: the root is concave in ``sum |a_i + s_i|^q``,
-    whose terms are convex.
+    """Return an upper bound of ``|a + s|_q - |a|_q - gradient's`` for all ``|s_i| <= b_i``.
 
-    ``a, b (..., d)``; returns ``(...,)``, infinite where ``a`` vanishes.
+    The root is concave in ``sum |a_i + s_i|^q``, and each term of this sum is convex.
+
+    Parameters
+    ----------
+    a, b : arrays (..., d)
+        The vectors, and the bounds of the deviations of their entries.
+    q : float
+        The exponent.
+
+    Returns
+    -------
+    array (...,)
+        The bound; infinite where ``a`` is 0.
     """
     unit = np.abs(a).max(axis=-1, keepdims=True)
     a, b, unit = *(one / np.where(unit > 0.0, unit, 1.0) for one in (a, b)), unit[..., 0]

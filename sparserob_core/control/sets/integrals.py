@@ -1,10 +1,10 @@
-"""Integrals of the support function of a curved set along polynomials, enclosed.
+"""Enclosures of integrals of the support function of a set along polynomials.
 
-Where the support function is analytic in all directions that the polynomial has on an ellipse about an interval, Gauss'
-rule is off by no more than ``64 / 15 M r^-2q / (1 - r^-2)``, with ``q + 1`` nodes, ``r`` the sum of the half-axes of
-the ellipse, and ``M`` the largest absolute value on it (Trefethen 2013, theorem 19.3). Intervals beside a direction in
-which it is not, as where the polynomial goes through 0, are halved: what they add is of the order of the square of
-their length.
+Consider an interval for which the support function is analytic in all directions that the polynomial has on an ellipse
+about the interval. Gauss's rule with ``q + 1`` nodes then has an error of at most ``64 / 15 M r^-2q / (1 - r^-2)``.
+Here ``r`` is the sum of the half-axes of the ellipse and ``M`` the largest absolute value on it (Trefethen 2013,
+theorem 19.3). Other intervals, such as those in which the polynomial is close to 0, are halved. Their contribution is
+of the order of the square of their length.
 """
 
 from __future__ import annotations
@@ -17,28 +17,46 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 EPSILON = float(np.finfo(float).eps)
-HALVINGS = 48  # of an interval: what is left of it is below rounding
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(17)  # with 9 of them intervals would be halved four times more
-RADIUS = 3.0  # of the ellipse: with 2 the rule is off by 1e-9, with 4 every interval is halved once more
-MISSED = 64.0 / 15.0 * RADIUS ** (2.0 - 2.0 * NODES.size) / (1.0 - RADIUS**-2.0)  # 3e-15 of the largest value
-CUTS = 3  # at changes of a sign, before an interval is halved: a polynomial across a piece changes it once or twice
-SECANTS = 10  # steps to where a sign changes; with half of them what is left of a part is halved some times
-NEAR_END = 1e-9  # of an interval, from its ends: where a sign changes nearer to one, it is halved
+HALVINGS = 48  # halvings of an interval, after which its contribution is below rounding
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(17)  # with 9 nodes intervals would be halved four times more
+RADIUS = 3.0  # sum of the half-axes of the ellipse: with 2 the error is 1e-9, with 4 each interval is halved once more
+MISSED = 64.0 / 15.0 * RADIUS ** (2.0 - 2.0 * NODES.size) / (1.0 - RADIUS**-2.0)  # error bound, relative to M: 3e-15
+CUTS = 3  # divisions at sign changes before an interval is halved: a polynomial has one or two of them on a piece
+SECANTS = 10  # steps of the secant method; with half of them a part near a sign change is halved a few times more
+NEAR_END = 1e-9  # share of an interval next to its ends: an interval with a sign change there is halved
 
 
 def enclosed(bound: ConvexSet) -> bool:
-    """Whether integrals of its support function are enclosed: it is flat, or known to be analytic somewhere."""
+    """Return True where integrals of the support function of a set can be enclosed.
+
+    The set has to be flat, or its analytic continuation known.
+    """
     nowhere = np.zeros((1, bound.dimension))
     return bound.halfspaces() is not None or bound.continued(nowhere, nowhere) is not None
 
 
 def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) -> Array:
-    """Lower and upper bounds ``(l, 2)`` of the integrals of the support function of ``bound`` over intervals of
-    ``lengths (l,)``, on which its argument is a polynomial with ``terms (l, p + 1, w)`` in the share of the interval
-    that has passed, halved until their bounds are within ``accuracy (l,)``."""
+    """Return lower and upper bounds of the integrals of the support function of a curved set along polynomials.
+
+    Parameters
+    ----------
+    bound : ConvexSet
+        The set, with a known analytic continuation of its support function (`ConvexSet.continued`).
+    terms : array (l, p + 1, w)
+        The coefficients of the polynomial on each interval, in the share of the interval that has passed.
+    lengths : array (l,)
+        The lengths of the intervals.
+    accuracy : array (l,)
+        The distance of the bounds at which an interval is not halved any more.
+
+    Returns
+    -------
+    array (l, 2)
+        The bounds for each interval.
+    """
     total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
     orders = np.arange(terms.shape[1])
-    # in powers of the place from -1 to 1 across the interval
+    # from here on in powers of a variable that runs from -1 to 1 over the interval
     terms = _moved(terms.shape[1], 0.5, 0.5) @ terms
     far = bound.reach(np.eye(bound.dimension))
     each, first = 2.0 * orders.size * EPSILON, np.abs(terms).sum(axis=1) @ far
@@ -53,12 +71,12 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
         sizes = np.abs(terms).sum(axis=1) @ far
         middle = bound.support(powers @ terms) @ WEIGHTS / 2.0
         off = np.where(np.isfinite(most), MISSED * most, np.inf)
-        # within its reach the support function changes by no more than that of the change
+        # the support function changes by at most the reach of the set along the change of its argument
         plain, apart = bound.support(terms[:, 0]), np.abs(terms[:, 1:]).sum(axis=1) @ far
         better = apart < off
         middle, off = np.where(better, plain, middle), np.minimum(off, apart)
         open_ = (2.0 * off * lengths > accuracy[owner]) & (off > lost * sizes) & (turn < HALVINGS)
-        off = off + lost * sizes + each * turn * first[owner]  # every halving rounds all coefficients
+        off = off + lost * sizes + each * turn * first[owner]  # every halving rounds all coefficients again
         found = np.stack([middle - off, middle + off], axis=1) * lengths[:, None]
         np.add.at(total, owner[~open_], found[~open_])
         terms, owner, lengths = terms[open_], np.tile(owner[open_], 2), np.tile(lengths[open_] / 2.0, 2)
@@ -70,7 +88,7 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
 
 @cache
 def _series(count: int) -> Array:
-    """From the coefficients of powers to those of Chebyshev's polynomials, ``(count, count)``."""
+    """Return the matrix ``(count, count)`` from coefficients of powers to those of Chebyshev polynomials."""
     found = np.zeros((count, count))
     for k, power in enumerate(np.eye(count)):
         found[: k + 1, k] = np.polynomial.chebyshev.poly2cheb(power[: k + 1])
@@ -79,7 +97,10 @@ def _series(count: int) -> Array:
 
 @cache
 def _moved(count: int, share: float, begin: float) -> Array:
-    """From the coefficients of powers of ``x`` to those of ``y``, ``x = begin + share y``, ``(count, count)``."""
+    """Return the matrix from coefficients of powers of ``x`` to those of ``y``, ``x = begin + share y``.
+
+    Its shape is ``(count, count)``.
+    """
     found = np.zeros((count, count))
     power = np.ones(1)
     for j in range(count):
@@ -89,9 +110,24 @@ def _moved(count: int, share: float, begin: float) -> Array:
 
 
 def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) -> Array:
-    """Lower and upper bounds ``(l, 2)`` of the integrals of the support function of ``bound`` over intervals of
-    ``lengths (l,)``, on which its argument is a polynomial with ``terms (l, p + 1, w)`` in the share of the
-    interval that has passed; intervals across a kink are halved until their bounds are within ``accuracy (l,)``."""
+    """Return lower and upper bounds of the integrals of the support function of a set along polynomials.
+
+    Parameters
+    ----------
+    bound : ConvexSet
+        The set.
+    terms : array (l, p + 1, w)
+        The coefficients of the polynomial on each interval, in the share of the interval that has passed.
+    lengths : array (l,)
+        The lengths of the intervals.
+    accuracy : array (l,)
+        The distance of the bounds at which an interval is not halved any more.
+
+    Returns
+    -------
+    array (l, 2)
+        The bounds for each interval.
+    """
     if bound.halfspaces() is None:
         return curved_integral(bound, terms, lengths, accuracy)
     total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
@@ -111,9 +147,23 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
 
 
 def absolute(terms: Array, accuracy: Array) -> Array:
-    """Lower and upper bounds ``(l, 2)`` of the integrals over ``[0, 1]`` of absolute values of polynomials with ``terms
-    (l, p + 1)``, as those of `integrated`, but cut where they change their signs: what is left of both parts is settled
-    at once, where halves would be cut some twenty times. Wherever they are cut, the bounds hold."""
+    """Return lower and upper bounds of the integrals over ``[0, 1]`` of the absolute values of polynomials.
+
+    Intervals are divided where a polynomial changes its sign: both parts are then enclosed at once, where halves would
+    be divided some twenty times. The bounds hold for every choice of the points of division.
+
+    Parameters
+    ----------
+    terms : array (l, p + 1)
+        The coefficients of each polynomial, in powers of the variable.
+    accuracy : array (l,)
+        The distance of the bounds at which an interval is not divided any more.
+
+    Returns
+    -------
+    array (l, 2)
+        The bounds for each polynomial.
+    """
     total, owner = np.zeros((len(terms), 2)), np.arange(len(terms))
     order = terms.shape[1] - 1
     points, lengths = terms @ bezier(order).T, np.ones(len(terms))
@@ -130,8 +180,17 @@ def absolute(terms: Array, accuracy: Array) -> Array:
 
 
 def _sign_changes(points: Array) -> Array:
-    """About where polynomials with Bernstein's coefficients ``points (l, p + 1)`` change their signs, ``(l,)``, by
-    secants of which the older end counts half (Illinois); the middle where both ends have one sign."""
+    """Return approximate points ``(l,)`` at which polynomials change their signs.
+
+    They are computed by the Illinois variant of the secant method.
+
+    The value is the middle where both ends have the same sign.
+
+    Parameters
+    ----------
+    points : array (l, p + 1)
+        The Bernstein coefficients of the polynomials on ``[0, 1]``.
+    """
     order = points.shape[1] - 1
     weights, powers = np.array([comb(order, k) for k in range(order + 1)]) * points, np.arange(order + 1)
     a, b, fa, fb = np.zeros(len(points)), np.ones(len(points)), points[:, 0], points[:, -1]
@@ -148,7 +207,20 @@ def _sign_changes(points: Array) -> Array:
 
 
 def _cut(points: Array, at: Array) -> Array:
-    """Bernstein's coefficients ``(l, p + 1)`` on both sides of ``at (l,)``, the first parts first (de Casteljau)."""
+    """Return Bernstein coefficients on both sides of the points ``at (l,)``, all left parts first (de Casteljau).
+
+    Parameters
+    ----------
+    points : array (l, p + 1)
+        The Bernstein coefficients on ``[0, 1]``.
+    at : array (l,)
+        The point of division of each polynomial.
+
+    Returns
+    -------
+    array (2 l, p + 1)
+        The coefficients on the left parts, followed by those on the right parts.
+    """
     left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
     share, rest = at[:, None], 1.0 - at[:, None]
     for order in range(last + 1):
@@ -159,13 +231,23 @@ def _cut(points: Array, at: Array) -> Array:
 
 @cache
 def bezier(order: int) -> Array:
-    """From powers on ``[0, 1]`` to the coefficients of Bernstein's form, ``(order + 1, order + 1)``."""
+    """Return the matrix ``(order + 1, order + 1)`` from powers on ``[0, 1]`` to Bernstein coefficients."""
     return np.array([[comb(k, j) / comb(order, j) for j in range(order + 1)] for k in range(order + 1)])
 
 
 def _halved(points: Array) -> Array:
-    """Bernstein's coefficients ``(l, p + 1, w)`` on both halves of an interval, the first halves first: averages of
-    neighbours (de Casteljau)."""
+    """Return Bernstein coefficients on both halves of an interval, all left halves first (de Casteljau).
+
+    Parameters
+    ----------
+    points : array (l, p + 1, w)
+        The Bernstein coefficients on the interval.
+
+    Returns
+    -------
+    array (2 l, p + 1, w)
+        The coefficients on the left halves, followed by those on the right halves.
+    """
     left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
     for order in range(last + 1):
         left[:, order], right[:, last - order] = row[:, 0], row[:, -1]

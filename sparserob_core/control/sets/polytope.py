@@ -1,4 +1,4 @@
-"""Polytopes: finitely many half-spaces, bounded or not."""
+"""Polytopes: intersections of finitely many half-spaces, bounded or not."""
 
 from __future__ import annotations
 
@@ -20,27 +20,45 @@ from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, continued_
 
 _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
-_MEETINGS = 20_000  # of rows, in which corners of a set without interior are looked for: a second or two
-_REGULAR = 1e-12  # a determinant of rows of length 1 from which on where they meet is known to a thousandth
-_BESIDE = 1e-9  # of a row's numbers, by which a meeting must miss it to be no corner without a look at fractions
+_MEETINGS = 20_000  # meetings of rows that are tried as vertices of a set without an interior: a second or two
+_REGULAR = 1e-12  # determinant of unit rows from which on their meeting is known to a thousandth
+_BESIDE = 1e-9  # relative violation of a row by a meeting, above which fractions are not needed to exclude it
 _SWEEPS = 12
-_ORDINARY = 10  # binary orders of magnitude between which rows and columns are left as they are
+_ORDINARY = 10  # binary orders of magnitude of the scale factors within which rows and columns are not scaled
 _TOGETHER = 64  # linear programs that are solved as one
-_CLEAR, _NOTHING = 1e-6, 1e-14  # shares of the largest that are no rounding, and that are
+_CLEAR, _NOTHING = 1e-6, 1e-14  # relative sizes above which a number is clearly not 0, and below which it is rounding
 _PROGRAMS = 96  # extreme points that are computed where the vertices are not known, one linear program each
 
 
 @dataclass(frozen=True, eq=False)
 class Polytope(ConvexSet):
-    """``{x : H x <= h}`` with ``H (r, d)`` and ``h (r,)``; a single number ``h`` serves every row.
+    """A polytope ``{x : H x <= h}``, bounded or not.
 
-    Raises `InputError` when shapes disagree, an entry is not finite, or the set is empty (Chebyshev's linear program).
+    Parameters
+    ----------
+    H : array (r, d)
+        The normals of the half-spaces, one row each.
+    h : float or array (r,)
+        The right-hand sides; a number holds for every row. A row with an infinite side is left out.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, an entry of ``H`` is not finite, or the set is empty. Emptiness is decided by the linear
+        program of the Chebyshev centre.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> triangle = sr.Polytope([[-1, 0], [0, -1], [1, 1]], [0, 0, 1])
+    >>> triangle.dimension
+    2
     """
 
     H: Array
     h: Array
 
-    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+    if TYPE_CHECKING:  # users may give a list; the field is an array
 
         def __init__(self, H: npt.ArrayLike, h: npt.ArrayLike) -> None: ...
 
@@ -81,20 +99,25 @@ class Polytope(ConvexSet):
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> Polytope:
-        """The set of all ``x / units``, every row divided by a power of two so that its largest entry is about 1."""
+        """Return the set of all ``x / units`` for ``x`` in the polytope and ``units (d,)``.
+
+        Every row is divided by a power of two, so that its largest entry is about 1.
+        """
         H = self.H * units
         sizes = np.abs(H).max(axis=1, initial=0.0)
         factors = np.ldexp(1.0, -np.frexp(np.where(sizes > 0.0, sizes, 1.0))[1])
-        made = object.__new__(Polytope)  # it holds a point since this one does: no program is solved again
+        made = object.__new__(Polytope)  # without the check for emptiness, which this set has passed
         object.__setattr__(made, "H", H * factors[:, None])
         object.__setattr__(made, "h", self.h * factors)
         return made
 
     @cached_property
     def _balanced(self) -> tuple[Array, Array, Array]:
-        """``(H', h', units)`` with ``{x : H x <= h} = {units * y : H' y <= h'}``: rows and columns of very different
-        sizes are divided by powers of two, the means of their entries' logarithms (Curtis and Reid 1972), so that a
-        linear program over them means the same whatever their units."""
+        """The arrays ``H'``, ``h'`` and ``units`` with ``{x : H x <= h} = {units * y : H' y <= h'}``.
+
+        Rows and columns of very different sizes are divided by powers of two, the means of the logarithms of their
+        entries (Curtis and Reid 1972). A linear program over the set then gives the same answer in all units.
+        """
         with np.errstate(divide="ignore"):
             entries = np.log2(np.abs(np.column_stack([self.H, self.h])))
         there = np.isfinite(entries)
@@ -111,8 +134,12 @@ class Polytope(ConvexSet):
 
     @cached_property
     def chebyshev(self) -> tuple[Array, float]:
-        """Centre ``(d,)`` and radius of a largest ball in the set (in balanced coordinates, where the sizes of its rows
-        or columns are far apart); the radius is capped, negative when the set is empty."""
+        """The centre ``(d,)`` and the radius of a largest ball in the set.
+
+        The radius is capped, and is negative for an empty set.
+
+        The ball is one in balanced coordinates where rows or columns differ much in size.
+        """
         from scipy.optimize import linprog
 
         (rows, d), (H, h, units) = self.H.shape, self._balanced
@@ -136,7 +163,10 @@ class Polytope(ConvexSet):
 
     @shaped
     def amid(self) -> Float[Array, " d"]:
-        """The mean of the vertices, where they are known; the centre of the largest ball depends on units."""
+        """Return the mean ``(d,)`` of the vertices; the Chebyshev centre where these are not known.
+
+        The Chebyshev centre depends on the units.
+        """
         return self.interior_point() if self.vertices is None else np.asarray(self.vertices.mean(axis=0))
 
     @cached_property
@@ -148,7 +178,7 @@ class Polytope(ConvexSet):
 
     @cached_property
     def vertices(self) -> Array | None:
-        """All vertices ``(v, d)`` of a bounded polytope, or ``None`` when they are too many."""
+        """All vertices ``(v, d)``; ``None`` where there may be too many of them or the set is unbounded."""
         rows, d = self.H.shape
         if d > _VERTEX_DIMENSIONS or rows > _VERTEX_ROWS or not self.is_bounded:
             return None
@@ -168,8 +198,11 @@ class Polytope(ConvexSet):
         return self._polished(found.intersections, found.dual_facets) * units
 
     def _corners(self) -> Array | None:
-        """The vertices of a set without interior: every point where ``d`` rows meet and that no row excludes, in
-        fractions. ``None`` where there are too many meetings, or where the set is empty but for rounding."""
+        """Return the vertices ``(v, d)`` of a set without an interior, computed in fractions.
+
+        A vertex is a point at which ``d`` rows meet and which no row excludes. The value is ``None`` where there are
+        too many meetings, or where the set is empty up to rounding.
+        """
         (rows, d), norms = self.H.shape, np.linalg.norm(self.H, axis=1)
         if comb(rows, d) > _MEETINGS:
             return None
@@ -191,7 +224,10 @@ class Polytope(ConvexSet):
 
     @shaped
     def _polished(self, points: Float[Array, "v d"], facets: list[list[int]]) -> Float[Array, "u d"]:
-        """Vertices solved for from their active rows: what qhull returns has passed through a dual space."""
+        """Return vertices ``(u, d)`` without repetitions, solved for from their active rows ``facets``.
+
+        The points ``(v, d)`` of qhull are less accurate, because qhull computes in a dual space.
+        """
         H, h, _ = self._balanced
         vertices = [np.linalg.lstsq(H[rows], h[rows], rcond=None)[0] for rows in facets]
         exact = np.where(np.isfinite(vertices), vertices, points)
@@ -216,7 +252,22 @@ class Polytope(ConvexSet):
 
     @shaped
     def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """Each vertex equally likely, as far as they are known."""
+        """Return random vertices, each known vertex with the same probability.
+
+        Where the vertices are not known, support points of random directions stand for them.
+
+        Parameters
+        ----------
+        count : int
+            The number of points.
+        rng : numpy.random.Generator
+            The source of random numbers.
+
+        Returns
+        -------
+        array (count, d)
+            The points.
+        """
         known = self.vertices
         if known is None:
             known = self.support_point(rng.normal(size=(min(count, _PROGRAMS), self.dimension)))
@@ -238,8 +289,11 @@ class Polytope(ConvexSet):
 
     @shaped
     def _maximise_all(self, directions: Float[Array, "k d"]) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
-        """`_maximise` for directions ``(k, d)``: several linear programs side by side in one, since calling the solver
-        costs far more than a small program does; one by one where that fails."""
+        """Return the support function ``(k,)`` and maximisers ``(k, d)`` of directions ``(k, d)``.
+
+        Several linear programs are solved together as one, because a call of the solver costs far more than a small
+        program. Where this fails, they are solved one by one.
+        """
         _, h, units = self._balanced
         values, points = np.zeros(len(directions)), np.tile(self.interior_point(), (len(directions), 1))
         endless = self._endless(directions * units)
@@ -263,8 +317,11 @@ class Polytope(ConvexSet):
         return values, points
 
     def _side_by_side(self, directions: Array) -> tuple[Array, Array] | None:
-        """Maximisers ``(k, d)`` and multipliers ``(k, r)`` of directions ``(k, d)`` in balanced coordinates, by one
-        linear program; ``None`` where that has no answer, as of an unbounded direction."""
+        """Return maximisers ``(k, d)`` and multipliers ``(k, r)`` of directions ``(k, d)``, by one linear program.
+
+        All are in balanced coordinates. The value is ``None`` where the program has no solution, as for an unbounded
+        direction.
+        """
         from scipy.optimize import linprog
         from scipy.sparse import block_diag, csc_array
 
@@ -277,14 +334,19 @@ class Polytope(ConvexSet):
         return np.asarray(answer.x).reshape(directions.shape), multipliers
 
     def _endless(self, directions: Array) -> npt.NDArray[np.bool_]:
-        """Which directions ``(k, d)`` in balanced coordinates have a part along a line that no row bounds, clearly."""
+        """Return a mask ``(k,)`` of the directions ``(k, d)`` with a clear part along a line that is in the set.
+
+        Directions are in balanced coordinates.
+        """
         along = np.linalg.norm(directions @ self._lines.T, axis=1)
         return np.asarray(along > _CLEAR * np.linalg.norm(directions, axis=1))
 
     @cached_property
     def _lines(self) -> Array:
-        """The lines that the set contains, ``(l, d)`` orthonormal in balanced coordinates; none where rounding leaves
-        any doubt."""
+        """The lines in the set as orthonormal rows ``(l, d)``, in balanced coordinates.
+
+        There are no rows where rounding leaves a doubt.
+        """
         _, sizes, turned = np.linalg.svd(self._balanced[0])
         sizes = np.concatenate([sizes, np.zeros(self.dimension - sizes.size)]) / max(
             float(sizes.max(initial=0.0)), 1e-300
@@ -295,7 +357,10 @@ class Polytope(ConvexSet):
 
     @shaped
     def _maximise(self, direction: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:
-        """Support function and a maximiser by a linear program; ``(inf, some point)`` when unbounded."""
+        """Return the support function and a maximiser ``(d,)`` of one direction ``(d,)`` by a linear program.
+
+        The value is infinite where the set is unbounded; the point is then any point of the set.
+        """
         from scipy.optimize import linprog
 
         H, h, units = self._balanced
@@ -312,10 +377,12 @@ class Polytope(ConvexSet):
         return max(float(scaled @ answer.x), float(proven)), np.asarray(answer.x) * units
 
     def _dual_bound(self, directions: Array, multipliers: Array) -> Array:
-        """Proven upper bounds ``(k,)`` of the support function in balanced coordinates, of ``directions (k, d)``.
+        """Return proven upper bounds ``(k,)`` of the support function of directions ``(k, d)``.
 
-        Weak duality: ``c'x = (c - H'y)'x + y'H x <= |c - H'y|_1 R + y'h`` for ``y >= 0`` and ``|x_i| <= R``, so that
-        the accuracy of the linear program is no part of the claim, but for the rounding of these sums; ``-inf`` where
+        All are in balanced coordinates.
+
+        Weak duality: ``c'x = (c - H'y)'x + y'H x <= |c - H'y|_1 R + y'h`` for ``y >= 0`` and ``|x_i| <= R``. The bound
+        does not rest on the accuracy of the linear program, except for the rounding of these sums. It is ``-inf`` where
         no ``R`` is known.
         """
         H, h, _ = self._balanced
@@ -329,8 +396,8 @@ class Polytope(ConvexSet):
     def _reach(self) -> float:
         """A proven bound of every coordinate of every point, in balanced coordinates; ``inf`` where none is found.
 
-        With multipliers ``y`` of each axis ``M = max |x_i|`` is at most ``y'h + |e_i - H'y|_1 M``, which bounds ``M``
-        where the second factor is below 1.
+        With multipliers ``y`` of each axis, ``M = max |x_i|`` is at most ``y'h + |e_i - H'y|_1 M``. This bounds ``M``
+        where the factor of ``M`` is below 1.
         """
         H, h, _ = self._balanced
         axes = np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
@@ -348,8 +415,15 @@ class Polytope(ConvexSet):
 
 
 def _meeting(rows: Sequence[Sequence[Fraction]], ends: Sequence[Fraction]) -> tuple[Fraction, ...] | None:
-    """Where as many hyperplanes as there are coordinates meet, ``None`` where that is no single point (Gauss and
-    Jordan)."""
+    """Return the point at which ``d`` hyperplanes meet, by Gauss-Jordan elimination; ``None`` where it is not unique.
+
+    Parameters
+    ----------
+    rows : d sequences of d fractions
+        The normals of the hyperplanes.
+    ends : sequence of d fractions
+        The right-hand sides.
+    """
     left = [[*row, end] for row, end in zip(rows, ends, strict=True)]
     for i in range(len(left)):
         pivot = next((k for k in range(i, len(left)) if left[k][i]), None)

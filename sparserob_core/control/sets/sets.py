@@ -1,4 +1,4 @@
-"""The sets that controls, disturbances, parameters, states and terminal states live in."""
+"""The sets of controls, disturbances, parameters, states and final states, and what can be made of several sets."""
 
 from __future__ import annotations
 
@@ -36,36 +36,67 @@ __all__ = [
 
 
 class SetFactory(ABC):
-    """A set that a config can name: its options are its fields.
+    """A set that a config can name; its options are the fields of the class.
 
-    ``shorthand``: the option that a bare number or list stands for, as in ``box: 0.5``; ``None`` where a mapping is
-    expected.
+    Attributes
+    ----------
+    shorthand : str or None
+        The option that a bare number or list stands for, as in ``box: 0.5``; ``None`` where a mapping is expected.
     """
 
     shorthand: ClassVar[str | None] = None
 
     @abstractmethod
     def build(self, dimension: int) -> ConvexSet:
-        """The set in ``dimension`` coordinates; raises `InputError` when the options do not describe one."""
+        """Return the set in ``dimension`` coordinates; raise `InputError` where the options do not describe one."""
 
     @staticmethod
     def options_of(convex: ConvexSet) -> Mapping[str, Any] | None:
-        """The options that build this set, as a config writes them; ``None`` for a set of another kind, and unless a
-        kind says otherwise: then a problem with such a set is solved from Python, and cannot be saved."""
+        """Return the options that build a set, as a config writes them.
+
+        Parameters
+        ----------
+        convex : ConvexSet
+            The set.
+
+        Returns
+        -------
+        mapping or None
+            The options; ``None`` for a set of another kind, and here, where a kind does not override this method. A
+            problem with such a set can be solved from Python and cannot be saved.
+        """
         return None
 
 
 @dataclass(frozen=True, eq=False)
 class Equality:
-    """``x_i = values_i`` wherever ``values (d,)`` is a number; NaN leaves that coordinate free.
+    """The condition ``x_i = values_i`` on every coordinate for which a value is given.
 
-    Not a `ConvexSet`: a set without interior would destroy every Slater point, so equalities stay equalities of the
-    finite programs.
+    Parameters
+    ----------
+    values : array (d,)
+        The values, in the units of the coordinates; NaN leaves a coordinate free.
+
+    Raises
+    ------
+    InputError
+        If the values are no list of finite numbers and NaN.
+
+    Notes
+    -----
+    An equality is no `ConvexSet`. A set without an interior would destroy every Slater point, and therefore equalities
+    remain equalities of the finite programs.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> sr.Equality([0.0, float("nan")]).fixed.tolist()
+    [0]
     """
 
     values: Array
 
-    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+    if TYPE_CHECKING:  # users may give a list; the field is an array
 
         def __init__(self, values: npt.ArrayLike) -> None: ...
 
@@ -85,18 +116,28 @@ class Equality:
 
     @property
     def dimension(self) -> int:
-        """Dimension of the space."""
+        """The dimension ``d`` of the space."""
         return int(self.values.size)
 
     @property
     def fixed(self) -> npt.NDArray[np.intp]:
-        """Indices of the coordinates that are fixed."""
+        """The indices of the coordinates that are fixed."""
         return np.flatnonzero(~np.isnan(self.values))
 
     @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """Largest absolute deviation ``(...,)`` of points ``(..., d)`` from the fixed values; 0 when nothing is
-        fixed."""
+        """Return the largest absolute deviation from the fixed values.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            The points.
+
+        Returns
+        -------
+        array (...,)
+            The largest deviation of each point; 0 where nothing is fixed.
+        """
         deviation: Array = np.abs(np.asarray(points)[..., self.fixed] - self.values[self.fixed]).max(
             axis=-1, initial=0.0
         )
@@ -104,31 +145,63 @@ class Equality:
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> Equality:
-        """The same values as ``values / units``, ``(d,)`` each."""
+        """Return the equality for points that are divided by ``units (d,)``."""
         return Equality(self.values / units)
 
     @property
     def box(self) -> Box:
-        """All points at which it holds."""
+        """The box of all points that satisfy the equality, with infinite sides along free coordinates."""
         free = np.isnan(self.values)
         return Box(np.where(free, -np.inf, self.values), np.where(free, np.inf, self.values))
 
     @property
     def bounds(self) -> ConvexSet:
-        """None that a factor enlarges: raises `InputError`."""
+        """The set that a factor enlarges: an equality has none, and `InputError` is raised."""
         raise InputError("fixes final values, which no factor enlarges; expected a set")
 
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
-        """Whether points ``(..., d)`` deviate by at most the absolute ``tolerance``."""
+        """Return the points that satisfy the equality up to a tolerance, as a mask.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            The points.
+        tolerance : float, default 1e-9
+            The absolute deviation that is allowed in every fixed coordinate.
+
+        Returns
+        -------
+        array (...,) of bool
+            True for points that deviate by no more.
+        """
         inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
         return inside
 
 
 def intersection(sets: Sequence[ConvexSet]) -> ConvexSet | tuple[ConvexSet, ...]:
-    """The intersection as one set where that is a box or a polytope, else the members as they are.
+    """Return the intersection of sets as one set, where it is a box or a polytope.
 
-    Raises `InputError` when there is no member, dimensions differ, or a flat intersection is empty.
+    Parameters
+    ----------
+    sets : sequence of ConvexSet
+        The sets, all of the same dimension; at least one.
+
+    Returns
+    -------
+    ConvexSet or tuple of ConvexSet
+        The box or the polytope. Where a set is curved, the sets as they are.
+
+    Raises
+    ------
+    InputError
+        If there is no set, if dimensions differ, or if a box or a polytope is empty.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> sr.intersection([sr.Box([-1, -1], [1, 1]), sr.Box([0, -2], [2, 2])]).lower.tolist()
+    [0.0, -1.0]
     """
     if not sets:
         raise InputError("expected at least one set", path="intersection")
@@ -145,15 +218,26 @@ def intersection(sets: Sequence[ConvexSet]) -> ConvexSet | tuple[ConvexSet, ...]
     return Polytope(np.vstack([H for H, _ in flats]), np.concatenate([h for _, h in flats]))
 
 
-# Of a direction, by which it may be off the span of an oblique cylinder by rounding: a hundredth would call what matrix
-# products make of one unbounded, a hundred times as much would not be rounding.
+# The relative part of a direction that may lie outside of the span of an oblique cylinder. With a hundredth of it, the
+# rounding of matrix products would make the support function infinite; a hundred times as much would be no rounding.
 ROUNDED = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Cylinder(ConvexSet):
-    """``{x in R^size : x[:b] + slopes x[b:] in base}`` for a curved ``base`` in ``R^b`` and ``slopes (b, size - b)``;
-    ``None``: the other coordinates are free. Made by `cylinder` and `oblique`."""
+    """The set ``{x in R^size : x[:b] + slopes x[b:] in base}`` for a curved ``base`` in ``R^b``.
+
+    It is made by `cylinder` and `oblique`.
+
+    Parameters
+    ----------
+    base : ConvexSet
+        The set in ``b`` coordinates.
+    size : int
+        The number of coordinates of the cylinder.
+    slopes : array (b, size - b), optional
+        The factors of the additional coordinates; these are free where no slopes are given.
+    """
 
     base: ConvexSet
     size: int
@@ -217,20 +301,28 @@ class Cylinder(ConvexSet):
         return np.concatenate([self.base.interior_point(), np.zeros(self.size - self.base.dimension)])
 
     def _lifted(self, directions: Array) -> Array:
-        """Directions of the base ``(k, b)`` as directions of the set."""
+        """Return directions ``(k, b)`` of the base as directions ``(k, size)`` of the cylinder."""
         free = np.zeros((*directions.shape[:-1], self.size - self.base.dimension))
         beside = free if self.slopes is None else directions @ self.slopes
         return np.concatenate([directions, beside], axis=-1)
 
     def _seen(self, points: Array) -> Array:
-        """The point of the base's space that each point is looked at as."""
+        """Return points ``(..., size)`` projected into the space of the base: ``x[:b] + slopes x[b:]``."""
         given = np.asarray(points, dtype=float)
         own, others = given[..., : self.base.dimension], given[..., self.base.dimension :]
         return own if self.slopes is None else own + others @ self.slopes.T
 
 
 def oblique(base: ConvexSet, slopes: Array) -> Cylinder:
-    """``{x : x[:d] + slopes x[d:] in base}`` for a curved ``base`` in ``R^d`` and ``slopes (d, more)``."""
+    """Return the cylinder ``{x : x[:d] + slopes x[d:] in base}``.
+
+    Parameters
+    ----------
+    base : ConvexSet
+        A curved set in ``d`` coordinates.
+    slopes : array (d, more)
+        The factors of the additional coordinates.
+    """
     size = base.dimension + slopes.shape[1]
     if isinstance(base, Cylinder):
         free, kept = base.size - base.base.dimension, base.base.dimension
@@ -244,8 +336,31 @@ def cylinder(base: ConvexSet, size: int) -> ConvexSet: ...
 @overload
 def cylinder(base: Equality, size: int) -> Equality: ...
 def cylinder(base: ConvexSet | Equality, size: int) -> ConvexSet | Equality:
-    """``{x in R^size : x[:b] in base}``, as a box or a polytope where it is one, or an equality. Raises `InputError`
-    when ``size`` is below ``b``."""
+    """Return the cylinder ``{x in R^size : x[:b] in base}``, in which the additional coordinates are free.
+
+    Parameters
+    ----------
+    base : ConvexSet or Equality
+        The set in ``b`` coordinates.
+    size : int
+        The number of coordinates of the cylinder.
+
+    Returns
+    -------
+    ConvexSet or Equality
+        A box, a polytope or an equality where the base is one; otherwise a `Cylinder`.
+
+    Raises
+    ------
+    InputError
+        If ``size`` is below ``b``.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> sr.cylinder(sr.Box([-1], [1]), 2).upper.tolist()
+    [1.0, inf]
+    """
     free = size - base.dimension
     if free < 0:
         raise InputError(
@@ -266,8 +381,15 @@ def cylinder(base: ConvexSet | Equality, size: int) -> ConvexSet | Equality:
 
 @dataclass(frozen=True, eq=False)
 class Product(ConvexSet):
-    """``{(x_1, ..., x_q) : x_i in parts_i}``, the coordinates of one part after those of another. Its support function
-    is the sum of theirs (Rockafellar 1970, section 13). Made by `product`."""
+    """The set ``{(x_1, ..., x_q) : x_i in parts_i}``, with the coordinates of one part after those of another.
+
+    Its support function is the sum of those of the parts (Rockafellar 1970, section 13). It is made by `product`.
+
+    Parameters
+    ----------
+    parts : tuple of ConvexSet
+        The sets.
+    """
 
     parts: tuple[ConvexSet, ...]
 
@@ -298,7 +420,7 @@ class Product(ConvexSet):
         return all(part.is_bounded for part in self.parts)
 
     def split(self, points: npt.ArrayLike) -> list[tuple[ConvexSet, Array]]:
-        """Every part with its coordinates of points or directions ``(..., d)``."""
+        """Return each part of the product with its coordinates of points or directions ``(..., d)``."""
         ends = np.cumsum([part.dimension for part in self.parts])[:-1]
         return list(zip(self.parts, np.split(np.asarray(points, dtype=float), ends, axis=-1), strict=True))
 
@@ -319,7 +441,21 @@ class Product(ConvexSet):
 
     @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """Outside, the distances to the parts as one vector; inside, that of the part whose boundary is nearest."""
+        """Return how far points are outside (positive) or inside (negative) of the product.
+
+        Outside, the value is the Euclidean norm of the positive violations of the parts. Inside, it is the violation of
+        the part whose boundary is nearest.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            The points.
+
+        Returns
+        -------
+        array (...,)
+            The violation of each point.
+        """
         each = np.stack([part.violation(own) for part, own in self.split(points)])
         outside = np.linalg.norm(np.maximum(each, 0.0), axis=0)
         return np.asarray(np.where(outside > 0.0, outside, each.max(axis=0)))
@@ -330,7 +466,7 @@ class Product(ConvexSet):
 
     @shaped
     def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-        """That of the part that reaches its boundary first, 0 along the others."""
+        """Return an outward normal ``(..., d)``: that of the part with the largest gauge, and 0 along the others."""
         pairs = self.split(points)
         first = np.stack([part.gauge(own) for part, own in pairs]).argmax(axis=0)[..., None]
         return np.concatenate([np.where(first == i, part.normal(own), 0.0) for i, (part, own) in enumerate(pairs)], -1)
@@ -382,7 +518,18 @@ class Product(ConvexSet):
 
 
 def product(parts: Sequence[ConvexSet]) -> ConvexSet:
-    """``{(x_1, ..., x_q) : x_i in parts_i}`` of bounded sets, as a box or a polytope where it is one."""
+    """Return the product ``{(x_1, ..., x_q) : x_i in parts_i}`` of bounded sets.
+
+    Parameters
+    ----------
+    parts : sequence of ConvexSet
+        The sets; at least one.
+
+    Returns
+    -------
+    ConvexSet
+        The part itself where there is one; a box or a polytope where all parts are one; otherwise a `Product`.
+    """
     if len(parts) == 1:
         return parts[0]
     if all(part.is_box for part in parts):

@@ -1,5 +1,8 @@
-"""Sets of kinds that others have written: they are known by what they say of themselves, which is looked at before it
-is believed, and named where a claim rests on it."""
+"""Checks of sets of plugins, whose support functions are used in proofs.
+
+A set of a plugin is known by its methods alone. These are compared with one another before the set is used, and claims
+that rest on such a set name it.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +14,16 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
-# Of the extent of the set, as in the contract of sets. Ten times less, and a support function that is computed by
-# iterations is refused; ten times more, and one that is none by so much passes, though a proof asks for 1e-9.
+# The tolerance relative to the extent of the set, as in the contract of sets. Ten times less would refuse a support
+# function that is computed by iterations. Ten times more would accept larger errors, although a proof asks for 1e-9.
 CLOSE = 1e-7
-# Where the own kinds of sets stand; those of a plugin that is a file stand below sparserob_core.experiment.
+# The modules of the sets of this package; a plugin that is a single file has a module below sparserob_core.experiment.
 OWN = ("sparserob_core.control.", "sparserob_core.sip.")
-DIRECTIONS = 16  # random ones, beside the axes and the sums of neighbours
+DIRECTIONS = 16  # random directions, which are tried with the axes and with the sums of neighbouring directions
 
 
 def strangers(record: Any) -> Iterator[ConvexSet]:
-    """The sets of kinds of others that a record holds, or is: its fields, and the members of its tuples."""
+    """Yield the sets of plugins in a record: the record itself, its fields, and the members of its tuples."""
     if isinstance(record, ConvexSet) and not type(record).__module__.startswith(OWN):
         yield record
     elif isinstance(record, tuple):
@@ -32,11 +35,23 @@ def strangers(record: Any) -> Iterator[ConvexSet]:
 
 
 def require_consistent(path: str, convex: ConvexSet | None) -> None:
-    """Raise `InputError` where a set, or one of its parts, is of a kind of others and contradicts itself.
+    """Raise `InputError` where a set of a plugin, or such a part of a set, contradicts itself.
 
-    In some directions ``c`` the support function has to be positively homogeneous, to be attained at the support point,
-    and to bound ``c'x`` for the support points of all of these directions; on those it is then sublinear. So have the
-    half-spaces, if there are any. What passes is believed, and said to be.
+    In some directions ``c`` the support function has to be positively homogeneous and to be attained at the support
+    point. It has to bound ``c'x`` for the support points of all of these directions, and is then sublinear on them.
+    Half-spaces, if there are any, have to agree with it. A set that passes is used in proofs, which name it.
+
+    Parameters
+    ----------
+    path : str
+        The key of a config at which the set stands, for messages.
+    convex : ConvexSet or None
+        The set.
+
+    Raises
+    ------
+    InputError
+        The error names the contradiction and a direction.
     """
     for one in strangers(convex):
         said = _contradiction(one)
@@ -47,6 +62,7 @@ def require_consistent(path: str, convex: ConvexSet | None) -> None:
 
 
 def _contradiction(convex: ConvexSet) -> str:
+    """Return the first contradiction of a set in words; empty where none is found."""
     axes = np.eye(convex.dimension)
     drawn = np.random.default_rng(5).normal(size=(DIRECTIONS, convex.dimension))
     c = np.vstack([axes, -axes, drawn, drawn + np.roll(drawn, 1, axis=0), np.zeros((1, convex.dimension))])
@@ -59,7 +75,7 @@ def _contradiction(convex: ConvexSet) -> str:
         return "a support point is no point"
     lengths = np.linalg.norm(c, axis=1)
     close = CLOSE * lengths * max(float(np.abs(heights).max()), float(np.abs(points).max()))
-    values = points @ c.T  # of every point in every direction
+    values = points @ c.T  # c'x for every support point x and every direction c
     return _first(
         (np.abs(np.diag(values) - heights) > close, c, "it is not attained at its support point"),
         (values.max(axis=0) > heights + close, c, "it does not bound its own support points: it is not sublinear"),
@@ -69,6 +85,7 @@ def _contradiction(convex: ConvexSet) -> str:
 
 
 def _sides(convex: ConvexSet, points: Array, close: Array) -> Iterator[tuple[Array, Array, str]]:
+    """Yield the checks of the half-spaces of a set, each as a mask of failures, the normals, and words."""
     flat = convex.halfspaces()
     if flat is not None and flat[1].size:
         H, h = flat
@@ -78,7 +95,7 @@ def _sides(convex: ConvexSet, points: Array, close: Array) -> Iterator[tuple[Arr
 
 
 def _first(*looks: tuple[Array, Array, str]) -> str:
-    """The first of some looks that has found something, with the direction."""
+    """Return the words of the first check that fails, with the direction; empty where none fails."""
     for wrong, directions, words in looks:
         if wrong.any():
             return f"{words}, in the direction {directions[int(np.argmax(wrong))].tolist()}"

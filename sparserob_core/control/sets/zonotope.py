@@ -14,18 +14,34 @@ from sparserob_core.brief import noun
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import CLOSED, Array, ConvexSet, chords, continued_by_signs
 
-MOST_SIDES = 500  # pairs of half-spaces that are listed; beyond, the set is left to its support function
-ROUNDED = 1e-14  # of what is added up along a generator
-PARALLEL = 1e-10  # of its generators' size, a normal that is none
+MOST_SIDES = 500  # pairs of half-spaces that are listed; a set with more is described by its support function alone
+ROUNDED = 1e-14  # relative rounding error of the sums along a generator
+PARALLEL = 1e-10  # singular value, relative to generators of length 1, below which these do not span a facet
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Zonotope(ConvexSet):
-    """``{centre + sum_j s_j generators_j : |s_j| <= 1}``, ``centre (d,)``, ``generators (q, d)``.
+    """A zonotope ``{centre + sum_j s_j generators_j : |s_j| <= 1}``.
 
-    Support function ``c'centre + sum_j |c'generators_j|``. Without an interior where the generators do not span the
-    space: it then has two opposite sides across every direction in which it does not reach.
+    Parameters
+    ----------
+    centre : array (d,)
+        The centre.
+    generators : array (q, d)
+        The half-segments that are added up, one row each.
+
+    Notes
+    -----
+    The support function is ``c'centre + sum_j |c'generators_j|``. The set has no interior where the generators do not
+    span the space. Then two opposite half-spaces bound it in every direction in which its width is 0.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sparserob_core as sr
+    >>> sr.Zonotope(np.zeros(2), np.array([[1.0, 0.0], [0.5, 0.5]])).support(np.array([1.0, 0.0])).item()
+    1.5
     """
 
     centre: Array
@@ -46,7 +62,15 @@ class Zonotope(ConvexSet):
         return height
 
     def continued(self, centre: Array, spread: Array) -> Array:
-        """Where no ``c'g_j`` may be 0, as rounding leaves it."""
+        """Return a bound ``(k,)`` of the absolute value of the support function at complex directions near real ones.
+
+        The bound is infinite where some product ``c'g_j`` may be 0 up to rounding.
+
+        Parameters
+        ----------
+        centre, spread : arrays (k, d)
+            The real directions, and the distances by which each entry may differ from them.
+        """
         each = np.abs(self.generators).T
         along = continued_by_signs(
             np.zeros(len(self.generators)),
@@ -68,8 +92,23 @@ class Zonotope(ConvexSet):
         return self.centre.copy()
 
     def linearisation_excess(self, centre: Array, spread: Array) -> Array:
-        """``|a + b| - sign(a) (a + b) <= 2 max(|b| - |a|, 0)`` for every generator; ``|a + b|`` itself where ``a`` is
-        0."""
+        """Return how much the support function can exceed its linearisation at ``centre``.
+
+        For every generator ``|a + b| - sign(a) (a + b) <= 2 max(|b| - |a|, 0)`` holds, and the excess is ``|a + b|``
+        where ``a`` is 0.
+
+        Parameters
+        ----------
+        centre : array (..., d)
+            The direction of the linearisation.
+        spread : array (..., J, d)
+            The deviations of the direction, ``centre + sum_j s_j spread_j`` with ``|s_j| <= 1``.
+
+        Returns
+        -------
+        array (...,)
+            Upper bounds of the excess.
+        """
         along = np.abs(np.asarray(centre) @ self.generators.T)
         moved = np.abs(np.asarray(spread) @ self.generators.T).sum(axis=-2)
         excess: Array = np.where(along > 0, 2.0 * np.maximum(moved - along, 0.0), moved).sum(axis=-1)
@@ -86,9 +125,11 @@ class Zonotope(ConvexSet):
 
     @cached_property
     def _sides(self) -> tuple[Array, Array] | None:
-        """Every facet is spanned by as many generators as their span has dimensions, less one; ``None`` where these are
-        too many. Of a set without an interior the sides across its span are apart by rounding, so that its points are
-        within them."""
+        """The half-spaces ``H (r, d)`` and ``h (r,)`` of the set; ``None`` where there are too many of them.
+
+        As many generators as the dimension of their span, less one, span a facet. For a set without an interior the
+        opposite half-spaces across its span are moved apart by rounding, so that its points satisfy them.
+        """
         d, sizes = self.dimension, np.linalg.norm(self.generators, axis=1)
         generators = self.generators[sizes > 0] / sizes[sizes > 0, None]
         _, values, turned = np.linalg.svd(generators, full_matrices=True)
@@ -108,7 +149,10 @@ class Zonotope(ConvexSet):
 
     @staticmethod
     def _across(generators: Array, d: int) -> list[Array]:
-        """A normal of every pair of facets, of generators of length 1 that span all ``d`` dimensions."""
+        """Return a normal for every pair of opposite facets, from generators that span all ``d`` dimensions.
+
+        The generators have length 1.
+        """
         normals = []
         for chosen in combinations(generators, d - 1):
             _, values, rows = np.linalg.svd(np.array(chosen).reshape(d - 1, d))

@@ -1,1 +1,2 @@
-"""Terms of a problem that constrain its state and its control: during windows, added up, and as a period ends."""
+"""Terms of a problem that constrain state and control: during windows of time, in integrals, and at the end of a
+period."""

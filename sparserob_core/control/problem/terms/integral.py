@@ -25,12 +25,41 @@ from sparserob_core.sip.convex_set import Array, Box, as_bound
 
 @dataclass(frozen=True, eq=False)
 class IntegralConstraint(Window):
-    """``lower <= int_start^stop (H x(t) + G u(t)) dt <= upper``, row by row: fuel of a channel, energy of a battery, a
-    mean temperature. ``H (r, d)``, ``G (r, m)``, either of them absent: 0; ``lower``, ``upper (r,)``, a number for all
-    rows alike, infinite or ``None`` where there is no bound; ``stop`` is the horizon when ``None``.
+    """A constraint ``lower <= int_start^stop (H x(t) + G u(t)) dt <= upper`` on integrals of state and control, row by
+    row.
 
-    ``u(t)`` is the commanded control, delay or not. The running integral from ``start`` on is one more state for each
-    row, which nothing measures.
+    Examples of such integrals are the fuel of a channel, the energy of a battery, and a mean temperature.
+
+    Parameters
+    ----------
+    H : array (r, d), optional
+        The coefficients of the state; 0 unless given.
+    G : array (r, m), optional
+        The coefficients of the control; 0 unless given. At least one of ``H`` and ``G`` is given.
+    lower, upper : float or array (r,), optional
+        The bounds; a number holds for all rows. There is no bound where one is infinite or ``None``.
+    start : float, default 0.0
+        The time at which the window begins, in the time unit of the system.
+    stop : float, optional
+        The time at which the window ends; the horizon unless given.
+    name : str, optional
+        The name in messages, tables and figures.
+
+    Raises
+    ------
+    InputError
+        When a problem is made with a constraint that does not fit it.
+
+    Notes
+    -----
+    ``u(t)`` is the commanded control, even where the system has a delay. The integral from ``start`` on is one more
+    state for each row, which is not measured.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> sr.IntegralConstraint(G=[[1]], upper=0.5, stop=4.0, name="fuel").name
+    'fuel'
     """
 
     H: npt.ArrayLike | None = field(default=None, metadata=measured(lambda of: 1.0 / (of.states * of.time)))
@@ -85,8 +114,13 @@ class IntegralConstraint(Window):
         return Box(np.asarray(self.lower), np.asarray(self.upper))
 
     def everywhere(self, corners: Sequence[Array]) -> Self:
-        """Itself of a larger state ``z``, of the states that are a matrix ``(d, size)`` times ``z``, at all of these
-        ``corners``."""
+        """Return the constraint on a larger state ``z`` that holds for all states ``x = corner z``.
+
+        Parameters
+        ----------
+        corners : sequence of arrays (d, size)
+            The matrices that give the states of the user at each corner of the parameters.
+        """
         ends = np.column_stack([np.asarray(side, dtype=float) for side in (self.lower, self.upper)])
         H, G, sides = at_corners(corners, np.asarray(self.H), np.asarray(self.G), ends)
         return replace(self, H=H, G=G, lower=sides[:, 0], upper=sides[:, 1])
@@ -99,13 +133,13 @@ class IntegralConstraint(Window):
 @final
 @dataclass(frozen=True, eq=False)
 class Accumulated(PathConstraint):
-    """An `IntegralConstraint` where its integral is a state: a window of one time."""
+    """An `IntegralConstraint` in a problem where the integral is a state: a constraint on this state at one time."""
 
     stated = False
 
 
 def _limits(where: str, entry: IntegralConstraint, count: int) -> tuple[Array, Array]:
-    """The bounds ``(r,)`` of an integral, infinite where there is none."""
+    """Return the lower and upper bounds ``(r,)`` of an integral, infinite where there is none; raise `InputError`."""
     sides = []
     for name, given, none in (("lower", entry.lower, -np.inf), ("upper", entry.upper, np.inf)):
         filled = [none if v is None else v for v in given] if isinstance(given, list | tuple) else given

@@ -1,4 +1,4 @@
-"""The return of a plan that repeats: every final state is one of the initial ones."""
+"""The constraint of a plan that repeats: every final state is one of the initial states."""
 
 from __future__ import annotations
 
@@ -13,32 +13,56 @@ from sparserob_core.control.sets.sets import Equality
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
-SAME = 1e-12  # of the size of a set, what is rounding
-RETURN = "return"  # what the constraint that a plan which repeats ends where it may begin is called
-# The share of the set of initial states by which final ones stay inside it, ten times the tolerance of a proof, so that
-# no violation is handed on: a tenth of it would let one, ten times as much is seen in the cost.
+SAME = 1e-12  # relative to the size of a set, the rounding error of its numbers
+RETURN = "return"  # the name of the constraint `Return` in messages, tables and figures
+# The share of the set of initial states by which final states stay inside of it. It is ten times the tolerance of a
+# proof, so that no period hands a violation on to the next: a tenth of it would, and ten times as much shows in the
+# cost.
 WITHIN = 1e-8
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Return(PathConstraint):
-    """The state comes back to where a period may begin, of a plan that repeats: a window of one time, the horizon, and
-    the set of initial deviations about their centre. Made by `OptimalControlProblem`."""
+    """A constraint that brings the state of a repeating plan back into the set of initial states at the horizon.
+
+    It is a path constraint with a window of one time. `OptimalControlProblem` makes it.
+    """
 
     stated = False
 
 
 class Repeating(Enum):
-    """What `repeat` of a problem is whose constraints have the return among them."""
+    """The value of ``repeat`` of a problem whose constraints contain the `Return`."""
 
     IMPOSED = "imposed"
 
 
 def ending(bound: ConvexSet | None, centre: Array, horizon: float) -> tuple[list[Return], list[Equality]]:
-    """What a plan whose initial states are a ``centre (d,)`` and the deviations of ``bound`` ends in, so that it can
-    begin again: within their set by `WITHIN`, and where there is one value of a coordinate, in that. Raises
-    `InputError` for a set that is flat and no box."""
+    """Return the constraints by which a repeating plan ends where it can begin again.
+
+    Parameters
+    ----------
+    bound : ConvexSet or None
+        The set of deviations of the initial state, or ``None`` where the initial state is known.
+    centre : array (d,)
+        The centre of the initial states.
+    horizon : float
+        The time at which the plan begins again.
+
+    Returns
+    -------
+    returns : list of Return
+        The constraint that final states are in the set of initial states, which is reduced by the share `WITHIN`. The
+        list is empty without a set.
+    equalities : list of Equality
+        The final values of the coordinates that have a single initial value. The list is empty where there are none.
+
+    Raises
+    ------
+    InputError
+        If the set has no interior and is no box.
+    """
     fixed = np.where(widths(bound, centre.size) > 0.0, np.nan, centre)
     ends = [] if np.isnan(fixed).all() else [Equality(fixed)]
     if bound is None:
@@ -48,7 +72,20 @@ def ending(bound: ConvexSet | None, centre: Array, horizon: float) -> tuple[list
 
 
 def widths(bound: ConvexSet | None, states: int) -> Array:
-    """How long a set of deviations is along every axis, ``(d,)``; 0 without one."""
+    """Return the width of a set of deviations along every axis.
+
+    Parameters
+    ----------
+    bound : ConvexSet or None
+        The set; ``None`` stands for 0 alone.
+    states : int
+        The number ``d`` of axes.
+
+    Returns
+    -------
+    array (d,)
+        The widths, 0 without a set.
+    """
     if bound is None:
         return np.zeros(states)
     axes = np.eye(states)
@@ -56,8 +93,10 @@ def widths(bound: ConvexSet | None, states: int) -> Array:
 
 
 def _free_where_flat(bound: ConvexSet) -> ConvexSet:
-    """The set of initial deviations with its flat coordinates free; raises `InputError` for one that is flat and no
-    box."""
+    """Return a set of initial deviations with the coordinates free in which it has no width.
+
+    Raises `InputError` for a set that has no interior and is no box.
+    """
     axes = np.eye(bound.dimension)
     free = widths(bound, bound.dimension) == 0.0
     if bound.is_box and free.any():

@@ -24,7 +24,7 @@ W = TypeVar("W", bound="Window")
 
 
 def _moved(rows: npt.ArrayLike, begin: float, horizon: float) -> Array:
-    """Rows of a time and a point ``(q, 1 + d)``, from ``begin`` on."""
+    """Return rows ``(q, 1 + d)`` of a time and a point from the time ``begin`` on, with times counted from there."""
     given = np.asarray(rows, dtype=float)
     shifted = given - np.eye(1, given.shape[1])[0] * begin
     later: Array = shifted[shifted[:, 0] > 0.0]
@@ -37,8 +37,17 @@ def _moved(rows: npt.ArrayLike, begin: float, horizon: float) -> Array:
 @final
 @dataclass(frozen=True)
 class Setting:
-    """What a constraint must fit: how many ``states`` and ``controls`` there are, by how much later these act, and the
-    horizon."""
+    """The properties of a problem that a constraint must fit.
+
+    Parameters
+    ----------
+    states, controls : int
+        The numbers ``d`` of states and ``m`` of controls.
+    delay : float
+        The time by which the control acts later than it is commanded.
+    horizon : float
+        The horizon.
+    """
 
     states: int
     controls: int
@@ -47,9 +56,23 @@ class Setting:
 
 
 class Window(Term, ABC):
-    """A constraint that holds from a ``start`` to a ``stop``, wherever it moves: ``relative_to``, under its ``name``
-    where it has one. One that is ``lasting`` needs a window of positive length; one that is not ``stated`` is made of
-    what is."""
+    """A constraint that holds from a time ``start`` to a time ``stop``.
+
+    Attributes
+    ----------
+    start : float
+        The time at which the window begins.
+    stop : float or None
+        The time at which the window ends; the horizon where it is ``None``.
+    name : str or None
+        The name in messages, tables and figures, where the user gave one.
+    relative_to : array (q, 1 + d) or None
+        The rows of a time and a point, relative to which the constraint holds.
+    lasting : bool
+        True for a kind of constraint that needs a window of positive length.
+    stated : bool
+        True for a kind of constraint that users give. Other kinds are made from these.
+    """
 
     start: float
     stop: float | None
@@ -58,19 +81,44 @@ class Window(Term, ABC):
     lasting: ClassVar[bool] = False
     stated: ClassVar[bool] = True
     among: ClassVar[str] = ""
-    """The list of a problem whose rows are its own; none of one that says its `rows` by others."""
+    """The list of a problem that holds the rows of the constraint; empty for a kind whose `rows` are of other kinds."""
 
     @classmethod
     def of(cls, where: str, entry: object) -> Window:
-        """What an entry of a list of such constraints stands for; raises `InputError`."""
+        """Return the constraint for an entry of a list of such constraints.
+
+        Parameters
+        ----------
+        where : str
+            The key of a config at which the entry stands, for messages.
+        entry : object
+            The entry.
+
+        Raises
+        ------
+        InputError
+            If the entry is no such constraint.
+        """
         if not isinstance(entry, cls):
             raise InputError(path=where, expected=f"{cls.__name__}(...)", got=type(entry).__name__)
         return entry
 
     @abstractmethod
     def checked(self, where: str, setting: Setting) -> Self:
-        """Itself with arrays of the right shapes, and with its ``stop``; raises `InputError` that begins with
-        ``where``."""
+        """Return the constraint with arrays of the right shapes and with its ``stop``.
+
+        Parameters
+        ----------
+        where : str
+            The key of a config at which the constraint stands, with which errors begin.
+        setting : Setting
+            The properties of the problem.
+
+        Raises
+        ------
+        InputError
+            If the constraint does not fit the problem.
+        """
 
     @property
     @abstractmethod
@@ -79,19 +127,38 @@ class Window(Term, ABC):
 
     @abstractmethod
     def scaled(self, factor: float) -> Self:
-        """Itself with its `bounds` larger by that factor about their middle."""
+        """Return the constraint whose `bounds` are enlarged by a factor about their middle."""
 
     @property
     def restricts(self) -> bool:
-        """Whether it excludes anything."""
+        """True where the constraint excludes any point."""
         return True
 
     def rows(self, called: str) -> Sequence[Window]:
-        """Which bounds of state and control at times (`PathConstraint`, `MixedConstraint`), and of integrals of them
-        (`IntegralConstraint`), it is; messages, tables and figures say ``called``."""
+        """Return the equivalent constraints of the kinds that a problem consists of.
+
+        These kinds are `PathConstraint` and `MixedConstraint`, which bound state and control at times, and
+        `IntegralConstraint`. The name ``called`` is used in messages, tables and figures.
+        """
         return [replace(cast("Any", self), name=called)]
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
+        """Return the constraint that remains from one time on, with times counted from there.
+
+        Parameters
+        ----------
+        begin : float
+            The time from which the constraint remains.
+        horizon : float
+            The duration of the problem that remains.
+        given
+            Values of fields that replace those of the constraint.
+
+        Returns
+        -------
+        Window or None
+            The constraint, or ``None`` where nothing of it remains.
+        """
         end = begin + horizon
         late = over(end, self.start) if self.lasting else not over(self.start, end)
         if late or (self.stop is not None and over(self.stop, begin, horizon)):
@@ -101,10 +168,33 @@ class Window(Term, ABC):
 
 @dataclass(frozen=True, eq=False)
 class PathConstraint(Window):
-    """The state stays in ``set`` for all times in ``[start, stop]``; ``stop`` is the horizon when ``None``.
+    """A constraint that keeps the state in a set at all times of a window.
 
-    ``relative_to (q, 1 + d)``: rows of a time and a point, times increasing: then ``x(t) - r(t)`` stays in the set,
-    where ``r`` runs from point to point along straight lines. The times cover the window.
+    Parameters
+    ----------
+    set : ConvexSet
+        The set of the state ``x(t)``, or of ``x(t) - r(t)`` where ``relative_to`` is given; ``d`` coordinates.
+    start : float, default 0.0
+        The time at which the window begins, in the time unit of the system.
+    stop : float, optional
+        The time at which the window ends; the horizon unless given.
+    name : str, optional
+        The name in messages, tables and figures.
+    relative_to : array (q, 1 + d), optional
+        Rows of a time and a point, with increasing times that cover the window. The reference ``r(t)`` is linear
+        between the points. The set does not move unless rows are given.
+
+    Raises
+    ------
+    InputError
+        When a problem is made with a constraint that does not fit it.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> corridor = sr.PathConstraint(sr.Box([-0.7, -10.0], [0.7, 10.0]), start=0.6, name="corridor")
+    >>> corridor.restricts
+    True
     """
 
     set: ConvexSet = field(metadata=STATES)
@@ -119,9 +209,18 @@ class PathConstraint(Window):
 
     @classmethod
     def of(cls, where: str, entry: object) -> Window:
+        """Return the constraint for an entry of a path, in which a bare set holds at all times.
+
+        Parameters
+        ----------
+        where : str
+            The key of a config at which the entry stands.
+        entry : object
+            A constraint, or a set. Any other entry fails when the constraint is checked.
+        """
         if isinstance(entry, PathConstraint | MixedConstraint):
             return entry
-        return PathConstraint(cast("ConvexSet", entry))  # as which it is checked
+        return PathConstraint(cast("ConvexSet", entry))  # an entry that is no set fails when it is checked
 
     def checked(self, where: str, setting: Setting) -> Self:
         checked_set(where, self.set, setting.states, "states")
@@ -137,19 +236,30 @@ class PathConstraint(Window):
 
     @property
     def flat(self) -> Flat | None:
-        """``H``, ``None``, ``h`` of ``H (x(t) - r(t)) <= h``; ``None`` where its set is curved."""
+        """The arrays ``H``, ``None`` and ``h`` of ``H (x(t) - r(t)) <= h``; ``None`` where the set is curved."""
         sides = self.set.halfspaces()
         return None if sides is None else (sides[0], None, sides[1])
 
     def widened(self, size: int) -> Self:
-        """Itself of a state with ``size`` coordinates, of which those beyond its own are free."""
+        """Return the constraint for a state of ``size`` coordinates, in which the additional coordinates are free."""
         moved = None if self.relative_to is None else columns(self.relative_to, 1 + size)
         return replace(self, set=cylinder(self.set, size), relative_to=moved)
 
     def everywhere(self, corners: Sequence[Array], called: str) -> list[Self]:
-        """Itself of a larger state ``z``, of the states that are a matrix ``(d, size)`` times ``z``, at all of these
-        ``corners``: one constraint, or where its set is curved one for each of them, under the name that it is
-        ``called`` by."""
+        """Return the constraint on a larger state ``z`` that holds for all states ``x = corner z``.
+
+        Parameters
+        ----------
+        corners : sequence of arrays (d, size)
+            The matrices that give the states of the user at each corner of the parameters.
+        called : str
+            The name of the constraint.
+
+        Returns
+        -------
+        list of PathConstraint
+            A single constraint where the set is flat; for a curved set, one constraint for each different corner.
+        """
         moved = None if self.relative_to is None else columns(self.relative_to, 1 + corners[0].shape[1])
         found = everywhere(self.set, corners)
         names = [called] if len(found) == 1 else [f"{called} at corner {i}" for i in range(1, len(found) + 1)]
@@ -161,11 +271,39 @@ class PathConstraint(Window):
 
 @dataclass(frozen=True, eq=False)
 class MixedConstraint(Window):
-    """``H x(t) + G u(t) <= h`` for all times in ``[start, stop]``; ``H (r, d)``, ``G (r, m)``, ``h (r,)``, a number for
-    all rows alike; ``stop`` is the horizon when ``None``.
+    """A constraint ``H x(t) + G u(t) <= h`` on state and control together at all times of a window.
 
-    It holds on every piece of the control that meets the window in positive length, its ends included, with the control
-    of that piece: where the control jumps, with both of its values. ``u(t)`` is the commanded control, delay or not.
+    Parameters
+    ----------
+    H : array (r, d)
+        The coefficients of the state.
+    G : array (r, m)
+        The coefficients of the control.
+    h : float or array (r,)
+        The upper bounds; a number holds for all rows.
+    start : float, default 0.0
+        The time at which the window begins, in the time unit of the system.
+    stop : float, optional
+        The time at which the window ends; the horizon unless given.
+    name : str, optional
+        The name in messages, tables and figures.
+
+    Raises
+    ------
+    InputError
+        When a problem is made with a constraint that does not fit it.
+
+    Notes
+    -----
+    The constraint holds on every interval of the control that meets the window in positive length, both ends included,
+    with the control of that interval. Where the control jumps, it holds with both values. ``u(t)`` is the commanded
+    control, even where the system has a delay.
+
+    Examples
+    --------
+    >>> import sparserob_core as sr
+    >>> sr.MixedConstraint(H=[[0, 1], [0, -1]], G=[[0.5], [-0.5]], h=0.9).set.dimension
+    3
     """
 
     H: npt.ArrayLike = field(metadata=measured(lambda of: 1.0 / of.states))
@@ -174,14 +312,14 @@ class MixedConstraint(Window):
     start: float = field(default=0.0, metadata=TIME)
     stop: float | None = field(default=None, metadata=TIME)
     name: str | None = field(default=None, metadata=UNITLESS)
-    lasting = True  # a control lasts
+    lasting = True  # a control is constant on intervals of positive length
     among = "path"
 
     __repr__ = noun
 
     @cached_property
     def set(self) -> Polytope:
-        """The set of all ``(x, u)`` that are allowed, ``d + m`` coordinates."""
+        """The set of all ``(x, u)`` that are allowed, in ``d + m`` coordinates."""
         return Polytope(np.hstack([np.asarray(self.H), np.asarray(self.G)]), np.asarray(self.h))
 
     def checked(self, where: str, setting: Setting) -> Self:
@@ -205,17 +343,29 @@ class MixedConstraint(Window):
 
     @property
     def flat(self) -> Flat:
-        """``H``, ``G``, ``h`` of ``H x(t) + G u(t) <= h``."""
+        """The arrays ``H``, ``G`` and ``h`` of ``H x(t) + G u(t) <= h``."""
         (rows, h), d = self.set.halfspaces(), np.asarray(self.H).shape[1]
         return rows[:, :d], rows[:, d:], h
 
     def widened(self, size: int) -> Self:
-        """Itself of a state with ``size`` coordinates, of which those beyond its own are free."""
+        """Return the constraint for a state of ``size`` coordinates, in which the additional coordinates are free."""
         return replace(self, H=columns(self.H, size))
 
     def everywhere(self, corners: Sequence[Array], called: str) -> list[Self]:
-        """Itself of a larger state ``z``, of the states that are a matrix ``(d, size)`` times ``z``, at all of these
-        ``corners``, under the name that it is ``called`` by."""
+        """Return the constraint on a larger state ``z`` that holds for all states ``x = corner z``.
+
+        Parameters
+        ----------
+        corners : sequence of arrays (d, size)
+            The matrices that give the states of the user at each corner of the parameters.
+        called : str
+            The name of the constraint.
+
+        Returns
+        -------
+        list of MixedConstraint
+            A single constraint.
+        """
         limits = np.broadcast_to(np.asarray(self.h), len(np.asarray(self.H)))
         H, G, h = at_corners(corners, self.H, self.G, limits)
         return [replace(self, name=called, H=H, G=G, h=h[:, 0])]
@@ -231,8 +381,22 @@ class MixedConstraint(Window):
 
 
 def placed(term: W, where: str, setting: Setting) -> W:
-    """The constraint with its ``stop`` and its reference as numbers; raises `InputError` that begins with ``where``
-    for a window that is none."""
+    """Return a constraint with its ``stop`` and its reference as arrays.
+
+    Parameters
+    ----------
+    term : Window
+        The constraint.
+    where : str
+        The key of a config at which the constraint stands, with which errors begin.
+    setting : Setting
+        The properties of the problem.
+
+    Raises
+    ------
+    InputError
+        If the window is not within the horizon, is too short, or is not covered by the times of the reference.
+    """
     horizon = setting.horizon
     start, stop = float(term.start), end_of(term.stop, horizon)
     if not 0.0 <= start <= stop <= horizon:
@@ -257,25 +421,66 @@ def placed(term: W, where: str, setting: Setting) -> W:
 
 
 class UntilHorizon(float):
-    """The horizon as the end of a window that was given none: where the horizon is another one, so is the end."""
+    """The horizon as the end of a window for which none was given; for another horizon the end is that horizon."""
 
     __slots__ = ()
 
 
 def end_of(stop: float | None, horizon: float) -> float:
-    """The end of a window: its ``stop``, and the horizon unless that was given."""
+    """Return the end of a window as a number.
+
+    Parameters
+    ----------
+    stop : float or None
+        The end that the user gave, or an `UntilHorizon`, or ``None`` where there is none.
+    horizon : float
+        The horizon.
+
+    Returns
+    -------
+    float
+        The given end, else the horizon as an `UntilHorizon`.
+    """
     return UntilHorizon(horizon) if stop is None or isinstance(stop, UntilHorizon) else float(stop)
 
 
 def columns(rows: Any, count: int) -> Array:
-    """Rows of numbers with so many columns, zeros after their own."""
+    """Return rows of numbers with additional columns of zeros.
+
+    Parameters
+    ----------
+    rows : array (q, n)
+        The rows.
+    count : int
+        The number of columns that is required, at least ``n``.
+
+    Returns
+    -------
+    array (q, count)
+        The rows, followed by zeros.
+    """
     given = np.asarray(rows)
     return np.pad(given, ((0, 0), (0, count - given.shape[1])))
 
 
 def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *beside: npt.ArrayLike) -> list[Array]:
-    """Rows ``H (r, d)`` on the states that are each of these matrices ``(d, size)`` times a larger one, as rows on that
-    one, with what stands ``beside`` them, ``(r,)`` or ``(r, q)``; without those that repeat an earlier one."""
+    """Return rows on the states of the user as rows on a larger state ``z``, for all states ``x = corner z``.
+
+    Parameters
+    ----------
+    corners : sequence of arrays (d, size)
+        The matrices that give the states of the user at each corner of the parameters.
+    H : array (r, d)
+        The coefficients of the states of the user.
+    beside : arrays (r,) or (r, q)
+        Further columns of the rows, which are repeated for each corner.
+
+    Returns
+    -------
+    list of arrays
+        The coefficients ``(k, size)`` of ``z``, and the further columns ``(k, 1)`` or ``(k, q)``. A row that repeats an
+        earlier one is left out.
+    """
     parts = [np.asarray(one) for one in beside]
     rows = np.vstack([np.column_stack([np.asarray(H) @ one, *parts]) for one in corners])
     _, first = np.unique(rows, axis=0, return_index=True)
@@ -284,8 +489,20 @@ def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *beside: npt.ArrayLik
 
 
 def everywhere(bound: ConvexSet, corners: Sequence[Array]) -> list[ConvexSet]:
-    """The points ``z`` of which every matrix ``(d, size)`` of the ``corners``, the identity and what stands beside it,
-    makes one of a set: one polytope, or where the set is curved as many as there are corners."""
+    """Return the sets of all points ``z`` for which ``corner z`` is in a set, for every corner.
+
+    Parameters
+    ----------
+    bound : ConvexSet
+        The set in ``d`` coordinates.
+    corners : sequence of arrays (d, size)
+        The matrices, whose first ``d`` columns are the identity.
+
+    Returns
+    -------
+    list of ConvexSet
+        A single polytope where the set is flat; for a curved set, one set for each different corner.
+    """
     flat, d = bound.halfspaces(), bound.dimension
     if flat is None:
         found = [oblique(bound, one[:, d:]) for one in corners]
@@ -295,7 +512,26 @@ def everywhere(bound: ConvexSet, corners: Sequence[Array]) -> list[ConvexSet]:
 
 
 def checked_set(name: str, value: object, dimension: int, of: str, bounded: bool = False) -> ConvexSet:
-    """The value, where it is a set in so many coordinates; raises `InputError`."""
+    """Return the value where it is a set in so many coordinates.
+
+    Parameters
+    ----------
+    name : str
+        The key of a config at which the set stands, for messages.
+    value : object
+        The value.
+    dimension : int
+        The number of coordinates that is required.
+    of : str
+        A word for the coordinates, such as ``states``.
+    bounded : bool, default False
+        True where the set must be bounded.
+
+    Raises
+    ------
+    InputError
+        If the value is no such set, or is a set of a plugin that contradicts itself.
+    """
     if isinstance(value, Equality):
         raise InputError("an equality is allowed in terminal only", path=name)
     if not isinstance(value, ConvexSet):
@@ -315,14 +551,26 @@ def checked_set(name: str, value: object, dimension: int, of: str, bounded: bool
 
 
 def restricts_nothing(value: ConvexSet) -> bool:
-    """Whether a set is the whole space."""
+    """Return True where a set is the whole space."""
     flat = value.halfspaces()
     return flat is not None and flat[1].size == 0
 
 
 def coefficients(where: str, **given: tuple[object, int, str]) -> list[Array]:
-    """Each of some rows, of which it is told how many columns they have and one for each of what, as finite numbers;
-    raises `InputError`."""
+    """Return several matrices of coefficients as arrays of finite numbers.
+
+    Parameters
+    ----------
+    where : str
+        The key of a config at which the matrices stand, for messages.
+    given : tuples (rows, columns, word)
+        For the name of each matrix its rows, the number of columns that is required, and a word for a column.
+
+    Raises
+    ------
+    InputError
+        If a matrix is not of this form.
+    """
     return [
         _matrix(f"{where}.{name}", rows, f"rows of {width} finite numbers, one per {of}", width)
         for name, (rows, width, of) in given.items()
@@ -330,6 +578,7 @@ def coefficients(where: str, **given: tuple[object, int, str]) -> list[Array]:
 
 
 def _matrix(where: str, rows: object, expected: str, columns: int) -> Array:
+    """Return a matrix of finite numbers with so many columns; raise `InputError`."""
     try:
         matrix = np.array(dense(rows), dtype=float)
     except (TypeError, ValueError):
@@ -340,7 +589,7 @@ def _matrix(where: str, rows: object, expected: str, columns: int) -> Array:
 
 
 def _reference(where: str, rows: object, states: int) -> Array:
-    """Rows of a time and a point, ``(q, 1 + d)``."""
+    """Return rows ``(q, 1 + d)`` of a time and a point; raise `InputError` where the times do not increase."""
     moved = _matrix(where, rows, f"rows of {1 + states} finite numbers, a time and a point each", 1 + states)
     if (np.diff(moved[:, 0]) <= 0.0).any():
         raise InputError(path=where, expected="rows whose times increase", got=f"times {moved[:, 0].tolist()}")
