@@ -494,6 +494,14 @@ def as_bound(name: str, value: object, size: int | None = None) -> Array:
     return array
 
 
+def finite(name: str, value: object, size: int | None) -> Array:
+    """Return a list of finite numbers as an array, of a given size where one is given; raise `InputError`."""
+    numbers = as_bound(name, value, size)
+    if not np.isfinite(numbers).all():
+        raise InputError(path=name, expected="finite numbers", got=f"{numbers.tolist()}")
+    return numbers
+
+
 @dataclass(frozen=True, eq=False)
 class Box(ConvexSet):
     """``{x : lower <= x <= upper}``; an infinite bound leaves that side free.

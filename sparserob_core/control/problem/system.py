@@ -72,6 +72,8 @@ class System:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "delay", _duration(self.delay))
+        if not self.phases:
+            raise InputError(path="system.pieces", expected="at least one", got="none")
         first, *others = self.phases
         for i, phase in enumerate(others, 1):
             for what in ("states", "controls", "disturbances"):
@@ -580,8 +582,9 @@ class VaryingSystem(System):
             raise InputError(path="system", expected=expected, got="another")
         times = [0.0, *(begin for begin, _ in later), horizon]
         for i, (begin, until) in enumerate(pairwise(times)):
-            if later and not begin < until:
-                raise InputError(path=f"system.pieces.{i}.until", expected=f"a time after {begin:g}", got=f"{until:g}")
+            if not begin < until:
+                where = f"system.pieces.{i}.until" if later else "system.until"
+                raise InputError(path=where, expected=f"a time after {begin:g}", got=f"{until:g}")
         phases = tuple(
             replace(one.phases[0], begin=begin, until=until, timed=True)
             for one, (begin, until) in zip(every, pairwise(times), strict=True)

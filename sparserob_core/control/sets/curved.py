@@ -18,11 +18,11 @@ from sparserob_core.sip.convex_set import (
     Array,
     Box,
     ConvexSet,
-    as_bound,
     bisect,
     continued_by_corners,
     continued_by_signs,
     few_digits,
+    finite,
     ratios,
     vertex_excess,
 )
@@ -81,7 +81,7 @@ class Ellipsoid(ConvexSet):
             )
         if (wrong := _indefinite(shape)) is not None:
             raise InputError(f"shape must be symmetric positive definite, got {wrong}", path="ellipsoid")
-        object.__setattr__(self, "centre", _finite("ellipsoid.centre", self.centre, shape.shape[0]))
+        object.__setattr__(self, "centre", finite("ellipsoid.centre", self.centre, shape.shape[0]))
         object.__setattr__(self, "shape", (shape + shape.T) / 2)
         sealed(self)
 
@@ -280,7 +280,7 @@ class NormBall(ConvexSet):
             raise InputError(path="norm", expected="a centre, or a dimension for a ball about the origin")
         if dimension is not None and dimension < 1:
             raise InputError(path="norm.dimension", expected="at least 1", got=str(dimension))
-        middle = np.zeros(dimension or 0) if centre is None else _finite("norm.centre", centre, dimension)
+        middle = np.zeros(dimension or 0) if centre is None else finite("norm.centre", centre, dimension)
         object.__setattr__(self, "p", float(p) if float(radius) > 0.0 else np.inf)
         object.__setattr__(self, "radius", float(radius))
         object.__setattr__(self, "centre", middle)
@@ -578,14 +578,6 @@ def _in_ball(p: float, dimension: int, count: int, rng: np.random.Generator) -> 
     sizes = rng.gamma(1.0 / p, size=(count, dimension)) ** (1.0 / p)
     norms = ((sizes**p).sum(axis=1, keepdims=True) + rng.exponential(size=(count, 1))) ** (1.0 / p)
     return np.asarray(np.where(rng.integers(0, 2, size=(count, dimension), dtype=np.int8) > 0, sizes, -sizes) / norms)
-
-
-def _finite(name: str, value: object, size: int | None) -> Array:
-    """Return a list of finite numbers as an array, of a given size where one is given; raise `InputError`."""
-    numbers = as_bound(name, value, size)
-    if not np.isfinite(numbers).all():
-        raise InputError(path=name, expected="finite numbers", got=f"{numbers.tolist()}")
-    return numbers
 
 
 @shaped

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from math import comb
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.brief import noun
-from sparserob_core.shapes import sealed
-from sparserob_core.sip.convex_set import CLOSED, Array, ConvexSet, chords, continued_by_signs
+from sparserob_core.errors import InputError
+from sparserob_core.shapes import dense, sealed
+from sparserob_core.sip.convex_set import CLOSED, Array, ConvexSet, chords, continued_by_signs, finite
 
 MOST_SIDES = 500  # pairs of half-spaces that are listed; a set with more is described by its support function alone
 ROUNDED = 1e-14  # relative rounding error of the sums along a generator
@@ -47,9 +49,24 @@ class Zonotope(ConvexSet):
     centre: Array
     generators: Array
 
+    if TYPE_CHECKING:  # users may give lists; the fields are arrays
+
+        def __init__(self, centre: npt.ArrayLike, generators: npt.ArrayLike) -> None: ...
+
     __repr__ = noun
 
     def __post_init__(self) -> None:
+        try:
+            generators = np.array(dense(self.generators), dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError("generators must be rows of numbers, one for each", path="zonotope") from error
+        if generators.ndim != 2 or not generators.shape[1] or not np.isfinite(generators).all():
+            raise InputError(
+                f"generators must be rows of finite numbers, one for each, got shape {generators.shape}",
+                path="zonotope",
+            )
+        object.__setattr__(self, "centre", finite("zonotope.centre", self.centre, generators.shape[1]))
+        object.__setattr__(self, "generators", generators)
         sealed(self)
 
     @property

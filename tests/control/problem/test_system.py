@@ -654,6 +654,8 @@ PIECES = [
         "system.pieces.1.until: expected a time after 3, got 2",
     ),
     (lambda: VaryingSystem.of([["t"]], [[1.0]], 0.0), "system.until: expected a time after 0, got 0"),
+    (lambda: VaryingSystem(laws()[0], -1.0), "system.until: expected a time after 0, got -1"),
+    (lambda: VaryingSystem.taking_turns([]), "system.pieces: expected at least one, got none"),
     (lambda: VaryingSystem.of([["t"]], [[1.0]], np.inf), "system.until: expected a time after 0, got inf"),
     (
         lambda: VaryingSystem.taking_turns([(1.0, ([["t"]], [[1.0]], None, None))] * 2),

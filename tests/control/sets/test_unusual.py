@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Polytope
+from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Polytope, Zonotope
 from sparserob_core.errors import InputError
 
 SQUARE = np.vstack([np.eye(2), -np.eye(2)]), np.ones(4)
@@ -72,6 +72,10 @@ def test_extreme_samples_lie_on_the_boundary(bound):
         (lambda: Polytope([[1.0]], [-np.inf]), "h must not be -inf"),
         (lambda: Polytope([[1.0], [0.0]], [1.0, -1.0]), "empty, row 1 of H is zero"),
         (lambda: Polytope([[1.0], [-1.0]], [1.0, -2.0]), "empty, no point satisfies"),
+        (lambda: Zonotope([0.0], "wide"), "generators must be rows of numbers"),
+        (lambda: Zonotope([0.0], [1.0]), r"rows of finite numbers, one for each, got shape \(1,\)"),
+        (lambda: Zonotope([0.0], [[np.nan]]), "rows of finite numbers"),
+        (lambda: Zonotope([0.0, 0.0, 0.0], [[1.0, 0.0]]), "zonotope.centre: expected 2 numbers, got 3"),
         (lambda: Equality("x"), "a list of numbers, null where free"),
         (lambda: Equality([np.inf]), "a list of finite numbers"),
         (lambda: Equality([]), "a list of finite numbers"),
@@ -80,6 +84,11 @@ def test_extreme_samples_lie_on_the_boundary(bound):
 def test_numbers_that_describe_no_set_are_refused_by_what_was_expected(build, sentence):
     with pytest.raises(InputError, match=sentence):
         build()
+
+
+def test_a_zonotope_is_made_of_lists_as_of_arrays():
+    made = Zonotope([0.5, 0.0], [[1.0, 0.0], [0.5, 0.5]])
+    assert made.dimension == 2 and made.support(np.array([1.0, 1.0])) == 0.5 + 1.0 + 1.0
 
 
 def test_what_is_fixed_has_the_dimension_of_the_state():
