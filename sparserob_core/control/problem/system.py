@@ -261,7 +261,7 @@ class System:
 
     def check_horizon(self, horizon: float) -> None:
         """Raise `InputError` where the last phase does not end at the horizon, or a phase is shorter than rounding."""
-        if self.varies or self.horizon < np.inf:
+        if self.horizon < np.inf:
             _check_ends([phase.until for phase in self.phases], horizon, self.varies and len(self.phases) == 1)
 
     def check_period(self) -> None:
@@ -582,7 +582,7 @@ class VaryingSystem(System):
             raise InputError(path="system", expected=expected, got="another")
         times = [0.0, *(begin for begin, _ in later), horizon]
         for i, (begin, until) in enumerate(pairwise(times)):
-            if not begin < until:
+            if not begin < until < np.inf:
                 where = f"system.pieces.{i}.until" if later else "system.until"
                 raise InputError(path=where, expected=f"a time after {begin:g}", got=f"{until:g}")
         phases = tuple(

@@ -696,11 +696,10 @@ def test_a_plant_at_fault_is_one_sentence_that_begins_with_its_key(build, said):
 
 @pytest.mark.parametrize("horizon", [np.inf, np.nan])
 def test_laws_end_at_a_time_that_is_a_number(horizon):
-    endless = VaryingSystem(laws()[0], horizon)
-    with pytest.raises(InputError, match=f"^system: expected a law up to 2, the horizon, got up to {horizon}$"):
-        endless.check_horizon(2.0)
-    with pytest.raises(InputError, match=r"^system.pieces.0: expected a LinearSystem without delay, got "):
-        SwitchedSystem([(1.0, endless)])
+    with pytest.raises(InputError, match=f"^system.until: expected a time after 0, got {horizon}$"):
+        VaryingSystem(laws()[0], horizon)
+    with pytest.raises(InputError, match=f"^system.pieces.1.until: expected a time after 1, got {horizon}$"):
+        VaryingSystem(laws()[0], horizon, later=((1.0, laws()[1]),))
 
 
 def test_what_is_no_piece_is_called_by_what_made_it():
