@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import final
 
@@ -99,7 +99,7 @@ class FollowedRows:
             np.asarray(problem.initial_state, dtype=float),
             problem.initial_set,
             np.array(self.timing.grid),
-            replace(table, rad=np.where(table.rad > 1e-290, table.rad, 0.0)),
+            table.with_exact_zeros,
             problem.disturbance,
             None if jumps is None else np.append(jumps, problem.horizon),
         )

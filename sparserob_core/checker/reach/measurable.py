@@ -340,9 +340,8 @@ class MeasurableDeviations(Deviations):
         from flint import arb
 
         d, blocks = self.flow.states, self.blocks
-        table = Enclosed.of(stacked(every))
+        table = Enclosed.of(stacked(every)).with_exact_zeros
         mid, rad = (part[:, : blocks * d].reshape(len(every), blocks, d) for part in (table.mid, table.rad))
-        rad = np.where(rad > 1e-290, rad, 0.0)  # the radius of an exact 0 is `TINY`
         alike: dict[int, tuple[VerifiedKernel, list[int]]] = {}
         for piece in range(blocks):
             kernel = self.kernel(piece)

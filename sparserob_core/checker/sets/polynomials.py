@@ -52,6 +52,11 @@ class Enclosed:
             raise Unchecked("the response grows beyond what numbers can hold")
         return Enclosed(mid, (rad + HALF_ULP * np.abs(mid)) * OUTWARD + TINY)
 
+    @property
+    def with_exact_zeros(self) -> Enclosed:
+        """The numbers of a ball matrix, of which an exact 0 has the radius 0 in place of `TINY`."""
+        return Enclosed(self.mid, np.where(self.rad > TINY, self.rad, 0.0))
+
 
 def product(left: Enclosed, right: Enclosed) -> Enclosed:
     """Return matrices ``(..., a, d)`` times matrices ``(..., d, n)``, with error bounds."""

@@ -195,3 +195,12 @@ def test_rounding_of_a_sum_is_what_higham_bounds_it_by():
     for terms in (1, 2, 8, 1000):
         assert rounding(terms) >= terms * unit / (1.0 - terms * unit)
         assert rounding(terms) <= 1.2 * (terms + 5) * unit
+
+
+def test_an_exact_0_has_no_radius_and_the_smallest_ball_has_one() -> None:
+    entries = [arb(0), arb(0, 1e-299), arb(3)]
+    found = Enclosed.of(arb_mat(1, 3, entries))
+    exact = found.with_exact_zeros
+    np.testing.assert_array_equal(exact.mid, found.mid)
+    assert exact.rad[0, 0] == 0.0 < found.rad[0, 0]
+    assert (exact.rad[0, 1:] == found.rad[0, 1:]).all() and exact.rad[0, 1] >= 1e-299
