@@ -99,7 +99,7 @@ class Simulation:
     times : int
         The number of times at which every trajectory was checked.
     inside : int
-        The least number of these times within each piece.
+        The least number of these times within each piece, where there are fewer than 10 000 pieces.
     constraints : sequence of ConstraintShare
         The violations of each constraint, in the order of the program's families.
     any_violated : ConstraintShare or None
