@@ -152,7 +152,7 @@ def _policy(
     """Return the policy of a config; ``None`` where it answers no measurement.
 
     Where its component is not registered, the policy is that which the certificate describes, for that is the policy of
-    its claims.
+    its claims. It is ``None`` where the certificate describes none.
     """
     from sparserob_core.checker.claims.case import written_policy
     from sparserob_core.checker.outcome import Broken

@@ -24,7 +24,8 @@ def round_arrays(history: Sequence[RoundFinished]) -> dict[str, Array]:
 
     They are the ``decisions (r, n)`` of all rounds and their ``costs (r,)``. For every imposed constraint ``rounds
     (c,)`` has its round, counted from 0; ``families``, ``formulations``, ``indices`` (padded with NaN), ``rows`` and
-    ``multipliers`` describe it. The mapping is empty where a decision is unknown, or all of them are too large.
+    ``multipliers`` describe it. The mapping is empty where a decision is unknown, or the total size of all exceeds
+    `NUMBERS`.
     """
     decisions = [entry.decision for entry in history if entry.decision is not None]
     if not decisions or len(decisions) < len(history) or sum(decision.size for decision in decisions) > NUMBERS:

@@ -1,4 +1,4 @@
-"""The result of a study in closed loop, and the words for it."""
+"""The result of a simulation in closed loop, and the words for it."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class ClosedLoops:
 
     @property
     def paid(self) -> Mapping[str, Array]:
-        """The ``costs`` of every law."""
+        """The ``costs`` of every law, by its name."""
         ends = np.cumsum(list(self.laws.values()))[:-1]
         return dict(zip(self.laws, np.split(self.costs, ends), strict=True))
 

@@ -40,7 +40,7 @@ logger = logging.getLogger("sparserob")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunStarted(Event):
-    """The first event of a run.
+    """The first event of a run, with its title, its directory and its problem.
 
     Parameters
     ----------

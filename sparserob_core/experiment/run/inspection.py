@@ -84,10 +84,9 @@ class RelaxedValue:
 
 @final
 class Inspection:
-    """Questions about an experiment.
+    """Answers to questions about an experiment, each from a program that was built anew.
 
-    Every answer comes from a program that was built anew, so that a question cannot change the method. Nothing is built
-    before the first question.
+    A question therefore cannot change the method. Nothing is built before the first question.
     """
 
     def __init__(self, loaded: Loaded, experiment: Experiment | None = None) -> None:

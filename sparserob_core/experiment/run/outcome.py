@@ -129,8 +129,8 @@ class SolvedProblem(ControlResult):
     def save(self, directory: str | Path, *, figures: bool = True) -> Outcome:
         """Write a run directory like that of `run`.
 
-        A run adds some bounds to the result of its method, and they are added here too: a lower bound without rounding
-        errors, bounds of the time of action, and under feedback a bound for every causal policy.
+        The bounds that a run adds to the result of its method are added here too. They are a lower bound without
+        rounding errors, bounds of the time of action, and under feedback a bound for every causal policy.
 
         Parameters
         ----------

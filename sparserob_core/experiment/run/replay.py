@@ -239,7 +239,10 @@ def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int,
 
 
 def _standing(notes: Mapping[str, np.ndarray], done: int) -> int:
-    """Return the evaluation at which the search stood after ``done`` evaluations (`Batch`): the last accepted one."""
+    """Return the evaluation at which the search stood after ``done`` evaluations (`Batch`).
+
+    It is the last one that was accepted or, where none was, the last one of all.
+    """
     accepted = notes.get("accepted")
     taken = np.zeros(0, dtype=int) if accepted is None else np.flatnonzero(accepted[:done] > 0.0)
     return int(taken[-1]) if taken.size else done - 1

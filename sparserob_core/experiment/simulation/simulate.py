@@ -72,7 +72,7 @@ def simulate(
     trajectories : int, optional
         The number of trajectories; 10 000 unless given. The law ``adversary`` takes no number.
     law : str, default "iid"
-        The law of the disturbance: ``iid``, ``vertices``, ``slow`` or ``neighbours``; or ``adversary``, which replays
+        The law of the uncertainty: ``iid``, ``vertices``, ``slow`` or ``neighbours``; or ``adversary``, which replays
         the worst case of every constraint.
     seed : int, default 0
         The seed of random numbers.

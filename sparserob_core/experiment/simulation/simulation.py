@@ -93,7 +93,7 @@ class Simulation:
     status : str
         Its status.
     law : str
-        The law of the disturbance.
+        The law of the uncertainty.
     trajectories, seed : int
         The number of trajectories, and the seed.
     times : int

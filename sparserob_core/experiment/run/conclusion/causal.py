@@ -30,7 +30,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     """Return a result with a lower bound of the cost of every causal policy.
 
     The bound is searched where the result has a policy and its cost is that of absolute values. Otherwise the result is
-    returned as it is; so is that of a run that was stopped or failed.
+    returned as it is. So is that of a run that failed, was stopped, or has no time left.
     """
     model = result.model
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
@@ -68,7 +68,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
 
 
 def _from(rest: Array, signal: Array) -> Array:
-    """Return the deviations ``(mw, blocks)`` of a disturbance ``signal`` from its rest.
+    """Return the deviations of a disturbance ``signal (mw, blocks)`` from its rest, as one vector.
 
     ``rest`` holds the values at rest of the disturbance, followed by those of the initial state.
     """
@@ -92,8 +92,8 @@ def searched(
     """Return the search for a bound, which begins with a policy's ``decision`` and the constraints ``rests`` of its
     bound.
 
-    For measurable disturbances the search takes those that are constant on the pieces of the grid. A cost that no
-    policy can avoid under these, none can avoid under all.
+    For measurable disturbances the search takes those that are constant on the pieces of the grid, and begins without
+    the decision. A cost that no policy can avoid under these, none can avoid under all.
     """
     from sparserob_core.control.studies.causal import CausalSearch
 
@@ -114,7 +114,7 @@ def proven(
     model : Transcription
         The problem on its dictionaries.
     problem : OptimalControlProblem
-        The problem of the check.
+        The problem for which the bound is derived.
     stated : CausalBound
         The bound, with its signals and multipliers.
     deadline : Deadline, optional
