@@ -378,10 +378,28 @@ def careful(name: str, listener: Callable[..., object]) -> Callable[..., object]
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
-    """Return the component of a ``kind``, wrapped in the checks of its kind.
+    """Return a component, wrapped in the checks of its kind.
 
-    ``choice`` is its name, a mapping with its name and options, or the component itself, of the type ``expected``.
-    Raises `InputError` for anything else.
+    Parameters
+    ----------
+    registry : Registry
+        The registered components.
+    kind : str
+        The kind of the component.
+    choice : str, mapping or object
+        Its name, a mapping with its name and options, or the component itself.
+    expected : type
+        The class of components of the kind.
+
+    Returns
+    -------
+    object
+        The component.
+
+    Raises
+    ------
+    InputError
+        If ``choice`` is anything else.
     """
     if isinstance(choice, expected):
         return guarded(choice, origin_of(kind, choice))

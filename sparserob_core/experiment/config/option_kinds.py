@@ -78,9 +78,28 @@ def free_bound(name: str, value: float | Sequence[float | None] | None, dimensio
 
 
 def broadcast(name: str, value: float | Sequence[float | None], dimension: int, free: float = np.nan) -> Array:
-    """Return a vector ``(dimension,)`` from a number or a list, with ``free`` in place of nulls.
+    """Return a vector from a number or a list.
 
-    Raises `InputError` where the list has another length.
+    Parameters
+    ----------
+    name : str
+        The key of the value, for errors.
+    value : float or sequence
+        A number for all coordinates, or a list with null where a coordinate is free.
+    dimension : int
+        The number of coordinates.
+    free : float, default nan
+        The number in place of null.
+
+    Returns
+    -------
+    array (dimension,)
+        The vector.
+
+    Raises
+    ------
+    InputError
+        If the list has another length.
     """
     if not isinstance(value, Sequence):
         return np.full(dimension, float(value))

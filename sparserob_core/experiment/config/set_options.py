@@ -215,7 +215,27 @@ class PathOptions(SetOptions, populate_by_name=True):
         return super()._given() + ["mixed"] * (self.mixed is not None)
 
     def entries(self, where: str, states: int, horizon: float) -> list[PathConstraint | MixedConstraint]:
-        """Return one constraint per key; raises `InputError` that begins with the key below ``where``."""
+        """Return one constraint per key.
+
+        Parameters
+        ----------
+        where : str
+            The key of the entry in the config, for errors.
+        states : int
+            The number of states.
+        horizon : float
+            The final time.
+
+        Returns
+        -------
+        list of PathConstraint or MixedConstraint
+            The constraints.
+
+        Raises
+        ------
+        InputError
+            If a key is at fault; the error begins with the key.
+        """
         stop = horizon if self.stop is None else self.stop
         if not self.start <= stop <= horizon:
             raise InputError(
@@ -289,9 +309,27 @@ class InitialStateOptions(SetOptions):
     that of the states themselves, and its middle is the centre."""
 
     def around(self, where: str, dimension: int) -> tuple[Array, ConvexSet]:
-        """Return the centre ``(d,)`` and the set of deviations from it.
+        """Return the centre of the initial states, and the set of deviations from it.
 
-        Raises `InputError` that begins with the key below ``where``.
+        Parameters
+        ----------
+        where : str
+            The key of the set in the config, for errors.
+        dimension : int
+            The number of states.
+
+        Returns
+        -------
+        centre : array (d,)
+            The centre.
+        deviations : ConvexSet
+            The set of deviations.
+
+        Raises
+        ------
+        InputError
+            If the set is not bounded, has two centres, or does not contain the deviation 0; the error begins with the
+            key.
         """
         convex = self.build(where, dimension)
         if not convex.is_bounded:

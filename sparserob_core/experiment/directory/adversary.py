@@ -60,9 +60,23 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
 
 
 def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Return the times ``(T,)`` and the state trajectories ``(f, d, T)`` that stored adversaries cause at a decision.
+    """Return the state trajectories that stored adversaries cause at a decision.
 
-    ``theta`` is the decision ``(m N,)``. The times include those of the adversaries.
+    Parameters
+    ----------
+    model : Transcription
+        The problem on its dictionaries.
+    theta : array (m N,)
+        The decision.
+    arrays : mapping
+        The arrays of `adversaries`.
+
+    Returns
+    -------
+    times : array (T,)
+        The times, with those of the adversaries among them.
+    states : array (f, d, T)
+        The trajectories.
     """
     response = model.response
     breakpoints = arrays["breakpoints"]

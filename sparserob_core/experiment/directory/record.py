@@ -169,14 +169,28 @@ def arrays_of(
 ) -> dict[str, Any]:
     """Return the arrays of ``solution.npz``.
 
-    For every problem the ``decision``; for a control problem also ``breakpoints``, ``control`` and ``theta``. For each
-    imposed index one row of ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``,
-    ``families``, ``formulations`` (the meaning of the index) and ``multipliers``. ``worst_disturbance (mw, pieces)``
-    where the worst constraint has one.
+    Parameters
+    ----------
+    result : Result
+        The result of a run.
+    program : SemiInfiniteProgram
+        Its program.
+    dictionary : Dictionary or None
+        The dictionary of the control, for a control problem.
+    control : array (m, K) or None
+        The control on its pieces.
+    answers : mapping
+        Under feedback ``gains (K, K, m, p)`` and, for outputs, the ``observer (K, d, p)``.
 
-    The constraints that prove the lower bound are ``bound_indices``, ``bound_rows``, and so on; ``bound_equalities``
-    are the multipliers of the equalities. Under feedback there are the ``answers``: ``gains (K, K, m, p)`` and, for
-    outputs, the ``observer (K, d, p)``. The index of each constraint of the bound is then followed by its deviation.
+    Returns
+    -------
+    dict of arrays
+        The ``decision``; for a control problem also ``breakpoints``, ``control`` and ``theta``; and the ``answers``.
+        For each imposed index one row of ``times``, ``indices`` (padded with NaN where families differ in dimension),
+        ``rows``, ``families``, ``formulations`` (the meaning of the index) and ``multipliers``. ``worst_disturbance
+        (mw, pieces)`` where the worst constraint has one. The constraints that prove the lower bound are
+        ``bound_indices``, ``bound_rows``, and so on; ``bound_equalities`` are the multipliers of the equalities. Under
+        feedback the index of each constraint of the bound is followed by its deviation.
     """
     told = _told(result.indices)
     count, width = told["indices"].shape

@@ -232,7 +232,35 @@ def horizon_search(
     tolerance: float,
     notify: Notify,
 ) -> HorizonSearch:
-    """Return the search for a margin of the horizon; raises `InputError` where nothing could be proven."""
+    """Return the search for a margin of the horizon.
+
+    Parameters
+    ----------
+    title : str
+        The title of the experiment.
+    problem : OptimalControlProblem
+        The problem, with the longest horizon.
+    dictionaries : tuple of two Dictionary
+        The dictionaries of control and disturbance.
+    method : Exchange
+        The method of the runs.
+    tools : Tools
+        The solver and the deadline.
+    tolerance : float
+        The distance of the two ends that is asked for, relative to the longest horizon.
+    notify : callable
+        A function that receives the events of the search.
+
+    Returns
+    -------
+    HorizonSearch
+        The search.
+
+    Raises
+    ------
+    InputError
+        If the plan repeats or has integral constraints, or if nothing could be proven of the problem.
+    """
     width = tolerance * problem.horizon
     if problem.repeat:
         raise InputError(

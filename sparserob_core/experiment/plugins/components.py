@@ -88,7 +88,20 @@ class Registry:
         known[record.name] = record
 
     def names(self, kind: str, of: type | None = None) -> list[str]:
-        """Return the registered names of a kind, sorted; with a class, only those that may be ``of`` it."""
+        """Return the registered names of a kind, sorted.
+
+        Parameters
+        ----------
+        kind : str
+            The kind.
+        of : type, optional
+            A class. Only components that may be instances of it are named.
+
+        Returns
+        -------
+        list of str
+            The names.
+        """
         known = self._records[record_type(kind).kind]
         return sorted(name for name, record in known.items() if of is None or record.may_be(of))
 
@@ -99,9 +112,24 @@ class Registry:
                 yield self._records[kind][name]
 
     def get(self, kind: str, name: str, of: type | None = None) -> Plugin:
-        """Return the record of that name; with a class, only one that may be ``of`` it.
+        """Return the record of a name.
 
-        Raises `UnknownPluginError` with the most similar names and every plugin that failed.
+        Parameters
+        ----------
+        kind, name : str
+            The component.
+        of : type, optional
+            A class. The component must be one that may be an instance of it.
+
+        Returns
+        -------
+        Plugin
+            The record.
+
+        Raises
+        ------
+        UnknownPluginError
+            If there is none; the message has the most similar names and every plugin that failed.
         """
         found = self._records[record_type(kind).kind].get(name)
         if found is not None and (of is None or found.may_be(of)):
@@ -166,7 +194,25 @@ class Registry:
         return (entry if checked is None else {"name": name, **checked.model_dump(mode="json", by_alias=True)}), wrong
 
     def build(self, kind: str, name: str, options: Mapping[str, object] | None = None) -> Any:
-        """Return the component, built from its options; raises `InputError` that names every option at fault."""
+        """Return a component, built from its options.
+
+        Parameters
+        ----------
+        kind, name : str
+            The component.
+        options : mapping, optional
+            The options as they stand in a config.
+
+        Returns
+        -------
+        object
+            The component.
+
+        Raises
+        ------
+        InputError
+            If options are at fault; the message names each of them.
+        """
         checked, wrong = self.check(kind, name, options or {})
         if checked is None:
             raise InputError("\n".join(f"{kind} {name}: {complaint}" for complaint in wrong))

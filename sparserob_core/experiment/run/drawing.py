@@ -200,8 +200,25 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
 def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
     """Return a figure of a result, for matplotlib.
 
-    ``name`` is one of `pictures`. Unless given it is the states, or the irreducible infeasible subsystem of an
-    infeasible problem. Raises `InputError` for another name, and where matplotlib is missing.
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    result : Result
+        Its result.
+    name : str or None
+        One of the names of `pictures`. Where it is ``None``, the figure is that of the states, or of the irreducible
+        infeasible subsystem of an infeasible problem.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The figure.
+
+    Raises
+    ------
+    InputError
+        If there is no figure of that name, nothing in it can move, or matplotlib is missing.
     """
     from sparserob_core.experiment.figures.style import require_matplotlib, style
 
@@ -385,9 +402,27 @@ def _curve(g: RelaxedValue, anchor: Array, c: int) -> tuple[Array, Array]:
 def drawn(
     experiment: Experiment, result: Result, directory: Path, worst: Mapping[str, Array], notify: Notify = ignore
 ) -> tuple[str, ...]:
-    """Draw the figures of a run that is over, and return warnings about those that could not be drawn.
+    """Draw the figures of a run that is over.
 
     Figures are an extra: any error in one of them becomes a warning.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    result : Result
+        Its result.
+    directory : Path
+        The run directory.
+    worst : mapping
+        The arrays of `adversaries`.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+
+    Returns
+    -------
+    tuple of str
+        Warnings about figures that could not be drawn.
     """
     remarks = []
     for draw in drawings(experiment, result, directory, worst, notify) if result.status != "failed" else ():

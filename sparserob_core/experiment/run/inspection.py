@@ -168,7 +168,20 @@ class Inspection:
         return clash_strips(self.program, result) if infeasible else []
 
     def tolerance(self, family: str, row: int = 0) -> float:
-        """Return the largest violation of a row that counts as none, in the user's units (decision 16)."""
+        """Return the largest violation of a row that counts as none, in the user's units (decision 16).
+
+        Parameters
+        ----------
+        family : str
+            The name of the constraint family.
+        row : int, default 0
+            The row of the family.
+
+        Returns
+        -------
+        float
+            The violation.
+        """
         own = self.program.own_units
         program = self.program if own is None else own.program
         return TOLERANCE * program.family(family).row_unit(row)

@@ -351,15 +351,38 @@ class LandscapeAxes:
             reach[rank, c] = line.reach
 
     def places(self, pair: tuple[int, int], anchor: Array) -> tuple[Place, Place]:
-        """Return the places of the axes in a tuple ``(D, width)`` of which the indices ``pair`` decide most."""
+        """Return the places of the axes in a tuple.
+
+        Parameters
+        ----------
+        pair : tuple of int
+            The two indices that decide most.
+        anchor : array (D, width)
+            The tuple.
+
+        Returns
+        -------
+        tuple of two places
+            The places of the axis to the right and of the axis upwards. Where both are the same coordinate, the index
+            with the smaller value is to the right.
+        """
         one, other = ((pair[rank], c) for rank, c in zip(self.ranks, self.coordinates, strict=True))
         return (other, one) if self.orders and anchor[other] < anchor[one] else (one, other)
 
     def of(self, told: tuple[int, ...], places: Array) -> Array | None:
-        """Return the points ``(n, 2)`` of the map at the places ``(n, 2, c)`` of two indices.
+        """Return the points of the map at the places of two indices.
 
-        ``told (c,)`` are the coordinates that the places contain. Returns ``None`` where those of the axes are not
-        among them.
+        Parameters
+        ----------
+        told : tuple of int
+            The coordinates ``(c,)`` that the places contain.
+        places : array (n, 2, c)
+            The places of the two indices.
+
+        Returns
+        -------
+        array (n, 2) or None
+            The points; ``None`` where the coordinates of the axes are not among those that the places contain.
         """
         if not set(self.coordinates) <= set(told):
             return None
@@ -400,7 +423,20 @@ def coordinate(name: str, g: RelaxedValue) -> tuple[int, int]:
 
 
 def deciding_pair(g: RelaxedValue, anchor: Array) -> tuple[int, int]:
-    """Return the two indices that decide most at the tuple ``(D, width)`` at which g was evaluated last."""
+    """Return the two indices that decide most at the tuple at which g was evaluated last.
+
+    Parameters
+    ----------
+    g : RelaxedValue
+        The function.
+    anchor : array (D, width)
+        The tuple.
+
+    Returns
+    -------
+    tuple of int
+        The two indices; the same one twice where there is only one.
+    """
     plain = list(g.coordinates)
     widths = g.slot.upper[plain] - g.slot.lower[plain]
     return two_of(g.deciding(), anchor[:, plain], widths, (0, min(1, len(anchor) - 1)))
@@ -432,10 +468,23 @@ def two_of(ranked: Sequence[int] | np.ndarray, slots: Array, widths: Array, othe
 
 
 def deciding_slots(deciding: np.ndarray, tuples: Array, widths: Array, pair: tuple[int, int]) -> np.ndarray:
-    """Return the two indices ``(n, 2)`` that decide most in each of the tuples ``(n, D, c)`` of a search.
+    """Return the two indices that decide most in each of the tuples of a search.
 
-    ``deciding (n, 4)`` ranks the indices of every tuple, with -1 for none. Where fewer than two decide, the pair of the
-    tuple before is used, at first ``pair``.
+    Parameters
+    ----------
+    deciding : array of int (n, 4)
+        The indices of every tuple by their multipliers, the largest first; -1 for none.
+    tuples : array (n, D, c)
+        The tuples.
+    widths : array (c,)
+        The widths of the box.
+    pair : tuple of int
+        The two indices before the first tuple.
+
+    Returns
+    -------
+    array of int (n, 2)
+        The two indices of every tuple. Where fewer than two decide, the others are those of the tuple before.
     """
     rows, first = np.arange(len(tuples)), deciding[:, 0]
     heads = tuples[rows, first]  # of a row in which nothing decides it is any index, and not used

@@ -99,7 +99,22 @@ class SolvedProblem(ControlResult):
 
     @staticmethod
     def run(result: Result, experiment: ControlExperiment, causal: CausalBound | None = None) -> SolvedProblem:
-        """Return the result of a run, together with its experiment."""
+        """Return the result of a run, together with its experiment.
+
+        Parameters
+        ----------
+        result : Result
+            The result.
+        experiment : ControlExperiment
+            The experiment that was run.
+        causal : CausalBound, optional
+            The bound for every causal policy.
+
+        Returns
+        -------
+        SolvedProblem
+            The result.
+        """
         loaded = experiment.loaded
         stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
         made = SolvedProblem.asked(result, experiment.transcription, stated, causal)
@@ -110,7 +125,24 @@ class SolvedProblem(ControlResult):
     def asked(
         result: Result, model: Transcription, origin: Source | Asked, causal: CausalBound | None = None
     ) -> SolvedProblem:
-        """Return the result of a problem that was transcribed."""
+        """Return the result of a problem that was transcribed.
+
+        Parameters
+        ----------
+        result : Result
+            The result.
+        model : Transcription
+            The problem on its dictionaries.
+        origin : Source or Asked
+            The config of the result, or the arguments of `solve`.
+        causal : CausalBound, optional
+            The bound for every causal policy.
+
+        Returns
+        -------
+        SolvedProblem
+            The result.
+        """
         known = {one.name: getattr(result, one.name) for one in fields(Result)}
         return SolvedProblem(**known, model=model, causal=causal, origin=origin)
 

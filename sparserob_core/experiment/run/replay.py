@@ -97,7 +97,21 @@ def play(told: Iterator[Event], *, save: str | Path | None, serve: bool, connect
 def events(inspection: Inspection, title: str, directory: Path | None, result: Result) -> Iterator[Event]:
     """Yield the events that the observers of a run with this result received, as far as the result knows them.
 
-    Searches and rounds come in the order of their seconds.
+    Parameters
+    ----------
+    inspection : Inspection
+        The run.
+    title : str
+        Its title.
+    directory : Path or None
+        Its directory.
+    result : Result
+        Its result.
+
+    Yields
+    ------
+    Event
+        The events; searches and rounds come in the order of their rounds.
     """
     yield RunStarted(
         title=title,

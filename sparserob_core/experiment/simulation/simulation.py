@@ -235,10 +235,20 @@ class Simulation:
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the exact interval of a probability from ``successes`` in ``trials`` independent trials.
+    """Return the exact interval of a probability from independent trials (Clopper and Pearson 1934).
 
-    The ends are quantiles of beta distributions, such that each tail is at most ``(1 - confidence) / 2`` (Clopper and
-    Pearson 1934).
+    Parameters
+    ----------
+    successes, trials : int
+        The numbers of successes and of trials.
+    confidence : float
+        The confidence.
+
+    Returns
+    -------
+    lower, upper : float
+        The ends of the interval: quantiles of beta distributions, such that each tail is at most ``(1 - confidence) /
+        2``.
     """
     from scipy.special import betaincinv
 

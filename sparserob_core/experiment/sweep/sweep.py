@@ -211,7 +211,20 @@ def outline(
 ) -> Outline:
     """Return the points that `sweep` would run with the same arguments; nothing is written.
 
-    Raises `InputError` as `sweep` does.
+    Parameters
+    ----------
+    config, axes, points, number, executor, out, notify
+        As for `sweep`.
+
+    Returns
+    -------
+    Outline
+        The points, with those that are not finished in the directory ``out``.
+
+    Raises
+    ------
+    InputError
+        If an axis, a point's config or the directory is at fault.
     """
     stated, out = _found(config, out)
     plan = make_plan(as_config(stated), axes, points=points, number=_number(points, number))

@@ -96,9 +96,28 @@ def shape_of(given: object, where: str) -> tuple[int, int]:
 
 
 def spread(shape: tuple[int, int], values: Array, indices: Whole, pointers: Whole, where: str) -> Array:
-    """Return a compressed sparse matrix as a dense one; entries at the same place are added up.
+    """Return a compressed sparse matrix as a dense one.
 
-    Raises `InputError` for pointers and indices that do not fit; ``where`` is the key in the message.
+    Parameters
+    ----------
+    shape : tuple of int
+        The numbers of rows and columns.
+    values, indices : array
+        The entries and their columns. Entries at the same place are added up.
+    pointers : array (rows + 1,)
+        The row pointers.
+    where : str
+        The key of the matrix, for errors.
+
+    Returns
+    -------
+    array (rows, columns)
+        The matrix.
+
+    Raises
+    ------
+    InputError
+        If pointers and indices do not fit.
     """
     rows, columns = shape
     fits = pointers.shape == (rows + 1,) and values.ndim == 1 and values.shape == indices.shape
