@@ -1,1 +1,1 @@
-"""What a person runs: configs, plugins, run directories, figures and the command line."""
+"""Everything that a person runs: configs, plugins, run directories, figures and the command line."""

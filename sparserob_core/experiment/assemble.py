@@ -1,4 +1,4 @@
-"""From a checked config to the records that it describes: the problem, its dictionaries, the program, the tools."""
+"""Construction of the objects that a checked config describes: problem, dictionaries, program and tools."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Experiment(ABC):
-    """What a config describes, built: a control problem with its transcription, or a program that was stated as it
-    is."""
+    """An experiment that was built from a config: a transcribed control problem, or a semi-infinite program."""
 
     loaded: Loaded
 
@@ -43,33 +42,36 @@ class Experiment(ABC):
 
     @abstractmethod
     def of_control(self, expected: str) -> ControlExperiment:
-        """Itself, of a control problem; raises `InputError` that says what was ``expected`` where it is none."""
+        """Return the experiment itself where it is a control problem.
+
+        Raises `InputError` for any other program; ``expected`` is the beginning of its message.
+        """
 
     @property
     def model(self) -> Transcription | None:
-        """What became of a control problem; ``None`` for a program that is none."""
+        """The transcription of the control problem; ``None`` for a program of another kind."""
         return None
 
     @property
     def problem(self) -> OptimalControlProblem | None:
-        """The control problem; ``None`` for a program that is none."""
+        """The control problem; ``None`` for a program of another kind."""
         return None
 
     @property
     def gap_tolerance(self) -> float | None:
-        """The relative gap that the config's method is to close; ``None`` for a method that has no such option."""
+        """The relative gap that the config's method has to close; ``None`` for a method that has no such option."""
         return gap_tolerance(self.loaded)
 
     @property
     def title(self) -> str:
-        """The title, or else the name of the config."""
+        """The title of the config or, where it has none, its name."""
         return self.loaded.config.title or name_of(self.loaded)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class ControlExperiment(Experiment):
-    """A control problem and what became of it."""
+    """A control problem with its transcription."""
 
     transcription: Transcription
 
@@ -117,8 +119,10 @@ class PlainExperiment(Experiment):
 @final
 @dataclass(frozen=True, eq=False)
 class UntranscribedExperiment(Experiment):
-    """A control problem that was not transcribed in time. Its program demands nothing: all that is known is that no
-    term of its cost is negative."""
+    """A control problem that was not transcribed in time; ``reason`` says so.
+
+    Its program has no constraints. The only known fact is that no term of its cost is negative.
+    """
 
     stated: OptimalControlProblem
     reason: str
@@ -143,7 +147,7 @@ LATE = (
 
 @contextmanager
 def transcribed_by(deadline: Deadline) -> Iterator[None]:
-    """Raise `TimeLimitError` where what is transcribed inside is not done by the ``deadline``."""
+    """Raise `TimeLimitError` where the transcription inside the context is not finished at the ``deadline``."""
     try:
         with deadline.enforced():
             yield
@@ -152,8 +156,27 @@ def transcribed_by(deadline: Deadline) -> Iterator[None]:
 
 
 def assemble(loaded: Loaded, deadline: Deadline | None = None) -> Experiment:
-    """Build what a checked config describes, and its program; raises `ConfigError` with the place of the key at fault,
-    and `TimeLimitError` when that is not done by the ``deadline``."""
+    """Build the experiment that a checked config describes, with its program.
+
+    Parameters
+    ----------
+    loaded : Loaded
+        The checked config.
+    deadline : Deadline, optional
+        The time by which the transcription must be finished; none unless given.
+
+    Returns
+    -------
+    Experiment
+        A control problem with its transcription, or a semi-infinite program.
+
+    Raises
+    ------
+    ConfigError
+        If a key is at fault; the error names its place.
+    TimeLimitError
+        If the transcription is not finished at the ``deadline``.
+    """
     experiment = assemble_in_time(loaded, deadline or Deadline())
     if isinstance(experiment, UntranscribedExperiment):
         raise TimeLimitError(experiment.reason)
@@ -161,7 +184,11 @@ def assemble(loaded: Loaded, deadline: Deadline | None = None) -> Experiment:
 
 
 def assemble_in_time(loaded: Loaded, deadline: Deadline) -> Experiment:
-    """`assemble`, or an `UntranscribedExperiment` of a control problem that is not transcribed by the ``deadline``."""
+    """Build the experiment of a config, or an `UntranscribedExperiment` where the ``deadline`` comes first.
+
+    Raises `ConfigError` with the place of the key at fault. Raises `TimeLimitError` where the ``deadline`` comes before
+    the problem itself is built.
+    """
     with transcribed_by(deadline):
         problem = problem_of(loaded)
     if isinstance(problem, SemiInfiniteProgram):
@@ -185,8 +212,10 @@ def _transcribed(loaded: Loaded, problem: OptimalControlProblem) -> Experiment:
 
 
 def problem_of(loaded: Loaded) -> OptimalControlProblem | SemiInfiniteProgram:
-    """The problem, or the program, that a checked config states; raises `ConfigError` with the place of the key at
-    fault."""
+    """Return the control problem, or the semi-infinite program, that a checked config describes.
+
+    Raises `ConfigError` with the place of the key at fault.
+    """
     try:
         problem: OptimalControlProblem | SemiInfiniteProgram = build(loaded, "problem", loaded.config.problem).build()
     except InputError as error:
@@ -195,8 +224,10 @@ def problem_of(loaded: Loaded) -> OptimalControlProblem | SemiInfiniteProgram:
 
 
 def control_problem_of(loaded: Loaded, expected: str) -> OptimalControlProblem:
-    """The control problem that a checked config states; raises `InputError` that says what was ``expected`` where it
-    states another program."""
+    """Return the control problem that a checked config describes.
+
+    Raises `InputError` where the config describes another program; ``expected`` is the beginning of its message.
+    """
     problem = problem_of(loaded)
     if isinstance(problem, SemiInfiniteProgram):
         raise InputError(f"{expected}, got a semi-infinite program of another kind")
@@ -204,8 +235,11 @@ def control_problem_of(loaded: Loaded, expected: str) -> OptimalControlProblem:
 
 
 def dictionaries_of(loaded: Loaded, horizon: float) -> tuple[Dictionary, Dictionary]:
-    """The dictionaries of control and disturbance of a checked config; raises `ConfigError` with the place of the key
-    at fault."""
+    """Return the dictionaries of control and disturbance of a checked config, in this order.
+
+    The dictionary of the disturbance has one indicator function on each piece of the control where the config names
+    none. Raises `ConfigError` with the place of the key at fault.
+    """
     control = _dictionary(loaded, "control", loaded.config.dictionaries.control, horizon)
     entry = loaded.config.dictionaries.disturbance
     if entry is not None:
@@ -216,15 +250,24 @@ def dictionaries_of(loaded: Loaded, horizon: float) -> tuple[Dictionary, Diction
 
 
 def gap_tolerance(loaded: Loaded) -> float | None:
-    """The relative gap that the config's method is to close; ``None`` for a method that has no such option."""
+    """Return the relative gap that the config's method has to close; ``None`` for a method that has no such option."""
     entry = loaded.config.method
     tolerance = getattr(loaded.registry.build("method", entry.name, entry.options), "tolerance", None)
     return None if tolerance is None else float(tolerance)
 
 
 def counting(loaded: Loaded) -> tuple[bool, tuple[float, ...] | None]:
-    """Whether the cost of the config's method is the time that a control acts, and the only values that this may take,
-    where it is restricted to some. A method that is not known, where a directory of others is read, does neither."""
+    """Return how the config's method counts the cost, and which values it leaves to the control.
+
+    A method that is not registered gives ``(False, None)``. This happens where somebody else's run directory is read.
+
+    Returns
+    -------
+    counts : bool
+        Whether the cost is the time during which the control acts.
+    letters : tuple of float or None
+        The only values that the control may take; ``None`` where the method does not restrict them.
+    """
     entry = loaded.config.method
     if entry.name not in loaded.registry.names("method"):
         return False, None
@@ -234,12 +277,12 @@ def counting(loaded: Loaded) -> tuple[bool, tuple[float, ...] | None]:
 
 
 def name_of(loaded: Loaded) -> str:
-    """The name of an experiment: its file's, without the ending."""
+    """Return the name of an experiment: that of its file, without the ending."""
     return Path(loaded.source.name).stem
 
 
 def build(loaded: Loaded, kind: str, entry: Entry) -> Any:
-    """The component that an entry of the config names, behind the check of its kind."""
+    """Return the component of a ``kind`` that an ``entry`` of the config names, wrapped in the checks of its kind."""
     component = loaded.registry.build(kind, entry.name, entry.options)
     return guarded(component, loaded.registry.get(kind, entry.name).origin)
 
@@ -255,14 +298,16 @@ def _dictionary(loaded: Loaded, which: str, entry: Entry, horizon: float) -> Dic
 @final
 @dataclass(frozen=True)
 class Anew:
-    """The program of a resolved ``config`` (its JSON) in its own units, its solver and its regulariser, made anew
-    wherever it is called."""
+    """A function that builds the program of a resolved config once more, for workers.
+
+    It returns the program in its own units, its solver and its regulariser. ``config`` is the JSON text of the config.
+    """
 
     config: str
 
     @staticmethod
     def of(loaded: Loaded) -> Anew:
-        """What makes the program of a config."""
+        """Return the function that builds the program of a config."""
         plain = {**loaded.config.plain(), "executor": {"name": "serial"}, "observers": []}
         return Anew(json.dumps(plain))
 
@@ -274,7 +319,10 @@ class Anew:
 
 
 def solver_of(loaded: Loaded) -> Solver:
-    """The solver of a checked config: one that is named answers every program, and `Auto` where it does not."""
+    """Return the solver of a checked config.
+
+    A solver that is named is asked for every program; `Auto` answers those that it does not solve.
+    """
     name = loaded.config.solver.name
     try:
         solver: Solver = build(loaded, "solver", loaded.config.solver)
@@ -284,7 +332,7 @@ def solver_of(loaded: Loaded) -> Solver:
 
 
 def tools_of(loaded: Loaded) -> Tools:
-    """The components and numbers that a method works with."""
+    """Return the components and numbers that a method works with."""
     config = loaded.config
     return Tools(
         solver=solver_of(loaded),

@@ -1,5 +1,4 @@
-"""What a Python user does without a config and without a problem: maximise a function; and what stands for a
-component there."""
+"""Maximisation of a function without a config or a problem, and the lookup of components by name."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 Choice: TypeAlias = str | Mapping[str, Any]
 logger = logging.getLogger("sparserob")
 PIECES = {"name": "piecewise_constant", "pieces": 100}
-ASKED = {"integer", "logarithmic", "minimise", "state"}  # arguments of `ask_tell` alone
+ASKED = {"integer", "logarithmic", "minimise", "state"}  # arguments that `ask_tell` has and `maximise` has not
 
 
 def maximise(
@@ -51,21 +50,63 @@ def maximise(
     known: tuple[Array, Array] | None = None,
     **options: object,
 ) -> Report:
-    """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that
-    name.
+    """Search for the maximum of a function over a box.
 
-    The last share ``polish`` of the budget goes to a local method, from the best points: a fifth unless given, nothing
-    for ``lipo``, ``random_search`` and ``sobol`` (`Maximiser.polished`). ``gradient`` maps a point
-    ``(d,)`` to the gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. ``start (d,)`` or ``(k, d)``:
-    points that are evaluated first; maximisers that walk begin at the best of them. ``seconds``: no evaluation begins
-    after that time. ``callback(points, values)`` is called after every batch of evaluations, ``notify`` with
-    `EvaluationsFinished` at least after every twentieth of the budget; what one of them raises is told in a warning,
-    and it is not called again. The search ends, without a polish, where ``callback`` returns ``True``, at a value of at
-    least ``target``, and after ``patience`` evaluations in a row that gained nothing. ``known``: points ``(k, d)`` and
-    values ``(k,)`` from before; they are not evaluated again, and the search goes on from the best of them. Further
-    keywords are the maximiser's options.
-    Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails, returns
-    complex numbers, or nothing but NaN.
+    The search ends at the ``budget``, at a value of at least ``target``, at the ``patience``, after the ``seconds``, or
+    where the ``callback`` returns ``True``. There is no polish where the ``target``, the ``patience`` or the
+    ``callback`` ends it.
+
+    Parameters
+    ----------
+    f : callable
+        The function: it maps points ``(k, d)`` to values ``(k,)``.
+    box : Box
+        The box of dimension ``d`` that is searched.
+    name : str, mapping or Maximiser, default "direct"
+        The maximiser: its name, a mapping with its name and options, or the component itself.
+    budget : int, default 1000
+        The number of evaluations.
+    seed : int, default 0
+        The seed of random numbers.
+    polish : float, optional
+        The last share of the budget. A local method spends it, from the best points. Unless given it is the maximiser's
+        own share (`Maximiser.polished`): a fifth, and nothing for ``lipo``, ``random_search`` and ``sobol``.
+    gradient : callable, optional
+        The gradient ``(d,)`` of ``f`` at a point ``(d,)``, for maximisers and a polish that use it.
+    notify : callable, optional
+        A function that receives `EvaluationsFinished` at least after every twentieth of the budget.
+    start : array, optional
+        Points ``(d,)`` or ``(k, d)`` that are evaluated first. A maximiser that moves from point to point begins at the
+        best of them.
+    seconds : float, optional
+        The time after which no evaluation begins.
+    callback : callable, optional
+        A function ``callback(points, values)`` that is called after every batch of evaluations.
+    target : float, optional
+        A value that ends the search.
+    patience : int, optional
+        The number of consecutive evaluations without an improvement that ends the search.
+    known : tuple of arrays, optional
+        Points ``(k, d)`` and their values ``(k,)`` from before. They are not evaluated again, and the search goes on
+        from the best of them.
+    **options
+        Options of the maximiser, where it is given by its name.
+
+    Returns
+    -------
+    Report
+        The best point, its value, and the reason for which the search ended.
+
+    Raises
+    ------
+    InputError
+        If an argument is at fault.
+    EvaluationError
+        If ``f`` fails, or returns complex numbers or nothing but NaN.
+
+    Notes
+    -----
+    An exception in ``callback`` or ``notify`` becomes a warning, and that function is not called again.
     """
     from sparserob_core.sip.search.search import Rules, Target
     from sparserob_core.sip.search.search import maximise as search
@@ -115,16 +156,41 @@ def ask_tell(
     known: tuple[Array, Array] | None = None,
     **options: object,
 ) -> AskTell:
-    """A search for the maximum of a function that somebody else evaluates: a simulator, a queue, a laboratory.
+    """Return a search for the maximum of a function that is evaluated elsewhere: by a simulator, a queue, a laboratory.
 
-    The arguments are those of `maximise`, but for the function. ``minimise``: for its minimum. ``integer``: the
-    coordinates that are whole numbers; a point that has a value is then not asked for again. ``logarithmic``: those
-    that are searched by their logarithms. ``target``, with ``minimise`` a value of at most it, ``patience`` and
-    ``known`` are those of `maximise`. ``state``: what `AskTell.state` gave, with the same arguments, or with a
-    larger budget; what was told is told again, and the search goes on with the points that it would have asked for;
-    points that are out may be told there too.
-    With a larger budget it is the search that had this budget from its beginning: values that it does not ask for are
-    kept beside it. Raises `InputError` when an argument is at fault.
+    Parameters
+    ----------
+    box : Box
+        The box of dimension ``d`` that is searched.
+    name, budget, seed, polish, start, patience, known, **options
+        As for `maximise`.
+    state : mapping, optional
+        The answer of `AskTell.state` for the same arguments, or for these with a smaller budget. The values in it are
+        replayed, and the search goes on with the points that it would have asked for. A value that was still expected
+        may be given to the new search.
+    minimise : bool, default False
+        Whether to search for the minimum.
+    integer : sequence of int, default ()
+        The coordinates that are whole numbers. A point that has a value is then not asked for again.
+    logarithmic : sequence of int, default ()
+        The coordinates that are searched by their logarithms.
+    target : float, optional
+        The value that ends the search: at least this value, with ``minimise`` at most.
+
+    Returns
+    -------
+    AskTell
+        The search. `AskTell` says how to ask for points and how to give their values.
+
+    Raises
+    ------
+    InputError
+        If an argument is at fault.
+
+    Notes
+    -----
+    With a larger budget the search is the one that had this budget from its beginning. Values in ``state`` that it does
+    not ask for are kept with it.
     """
     from sparserob_core.sip.search.ask_tell import AskTell
     from sparserob_core.sip.search.ranges import Ranges
@@ -134,7 +200,7 @@ def ask_tell(
     chosen, share = _chosen(box, name, options, polish)
     first, earlier, ends = _placed(start, box), _known(known, box), _ends(target, patience)
     number, calls = whole("seed", seed, 0), whole("budget", budget, 1)
-    Target(lambda points: points, box)  # a box without bounds is refused here
+    Target(lambda points: points, box)  # raises InputError for a box without bounds
     if not isinstance(minimise, bool):
         raise InputError(f"minimise: expected true or false, got {minimise!r}")
     ranges, sign = Ranges(box, integer, logarithmic), -1.0 if minimise else 1.0
@@ -202,7 +268,7 @@ def ask_tell(
 def _chosen(
     box: object, name: Choice | Maximiser, options: Mapping[str, object], polish: float | None
 ) -> tuple[Maximiser, float]:
-    """The maximiser, and the share of its budget that goes to a polish."""
+    """Return the maximiser, and the share of its budget that goes to a polish."""
     if not isinstance(box, Box):
         raise InputError(f"box: expected a sparserob_core.Box, got {type(box).__name__}")
     if options and not isinstance(name, str):
@@ -213,7 +279,7 @@ def _chosen(
 
 
 def _placed(start: object, box: Box, name: str = "start") -> Array | None:
-    """Points ``(k, d)`` of the box to begin with; ``name``: what messages call them."""
+    """Return points ``(k, d)`` of the box to begin with; messages call them ``name``."""
     if start is None:
         return None
     try:
@@ -231,7 +297,7 @@ def _placed(start: object, box: Box, name: str = "start") -> Array | None:
 
 
 def _known(known: Any, box: Box) -> tuple[Array, Array] | None:
-    """Points ``(k, d)`` of the box and their values ``(k,)``, from before."""
+    """Return points ``(k, d)`` of the box and their values ``(k,)`` from before."""
     if known is None:
         return None
     try:
@@ -248,7 +314,7 @@ def _known(known: Any, box: Box) -> tuple[Array, Array] | None:
 
 
 def _ends(target: object, patience: object) -> dict[str, Any]:
-    """The rules that end a search before its budget."""
+    """Return the rules that end a search before its budget."""
     ends: dict[str, Any] = {}
     if target is not None:
         if isinstance(target, bool | str) or not hasattr(target, "__float__") or np.isnan(float(target)):
@@ -260,14 +326,14 @@ def _ends(target: object, patience: object) -> dict[str, Any]:
 
 
 class _Told:
-    """A function whose values a callback is told, which may ask for the end."""
+    """A function whose values a callback receives; the callback may ask for the end of the search."""
 
     def __init__(self, f: Callable[[Array], object], callback: Callable[[Array, Array], object] | None) -> None:
         self.f, self.callback = f, None if callback is None else careful("callback", callback)
         self.asked = False
 
     def __call__(self, points: Array) -> object:
-        """The values, which the callback is told."""
+        """Return the values at some points after the callback has received them."""
         values = self.f(points)
         if self.callback is not None:
             answer = self.callback(points.copy(), np.array(values, dtype=float))
@@ -275,7 +341,7 @@ class _Told:
         return values
 
     def halted(self) -> bool:
-        """Whether the callback has asked for the end."""
+        """Return whether the callback has asked for the end."""
         return self.asked
 
 
@@ -291,7 +357,10 @@ def _heard(notify: Notify) -> Notify:
 
 
 def careful(name: str, listener: Callable[..., object]) -> Callable[..., object]:
-    """The listener until it raises for the first time, which is told in a warning; a search outlives it."""
+    """Return a listener that is called until it raises for the first time.
+
+    The exception becomes a warning with the ``name`` of the listener, and the search goes on.
+    """
     deaf = False
 
     def heard(*arguments: object) -> object:
@@ -300,7 +369,7 @@ def careful(name: str, listener: Callable[..., object]) -> Callable[..., object]
             return None
         try:
             return listener(*arguments)
-        except Exception as error:  # noqa: BLE001  somebody else's function
+        except Exception as error:  # noqa: BLE001  a user's function may raise anything
             deaf = True
             warnings.warn(f"{name} raised {named(error)}; it is not called again", stacklevel=2)
             return None
@@ -309,8 +378,29 @@ def careful(name: str, listener: Callable[..., object]) -> Callable[..., object]
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
-    """The component that a name, a mapping with a name, or the component itself stands for, behind the check of its
-    kind."""
+    """Return a component, wrapped in the checks of its kind.
+
+    Parameters
+    ----------
+    registry : Registry
+        The registered components.
+    kind : str
+        The kind of the component.
+    choice : str, mapping or object
+        Its name, a mapping with its name and options, or the component itself.
+    expected : type
+        The class of components of the kind.
+
+    Returns
+    -------
+    object
+        The component.
+
+    Raises
+    ------
+    InputError
+        If ``choice`` is anything else.
+    """
     if isinstance(choice, expected):
         return guarded(choice, origin_of(kind, choice))
     entry = {"name": choice} if isinstance(choice, str) else choice
@@ -321,7 +411,7 @@ def component(registry: Registry, kind: str, choice: object, expected: type[Any]
 
 
 def dictionary(registry: Registry, choice: object, horizon: float) -> Dictionary:
-    """The dictionary that a choice stands for, on ``[0, horizon]``."""
+    """Return the dictionary on ``[0, horizon]`` that a choice names, describes or is."""
     if isinstance(choice, Dictionary):
         return choice
     factory: DictionaryFactory = component(registry, "dictionary", choice, DictionaryFactory)
@@ -329,5 +419,5 @@ def dictionary(registry: Registry, choice: object, horizon: float) -> Dictionary
 
 
 def indicators(on: Dictionary) -> Dictionary:
-    """One indicator function on each piece of another dictionary."""
+    """Return the dictionary with one indicator function on each piece of another dictionary."""
     return Dictionary.indicators(on.breakpoints)

@@ -1,1 +1,1 @@
-"""How bad each row of a problem can become, as a number between two bounds."""
+"""Worst cases of the rows of a problem, enclosed from both sides."""

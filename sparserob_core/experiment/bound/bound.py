@@ -1,4 +1,4 @@
-"""``sparserob bound``: the worst case of each row over all uncertainty, enclosed from both sides."""
+"""The worst case of each row over all uncertainty, enclosed from both sides: ``sparserob bound``."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sparserob_core.sip.limits.deadline import Deadline
 
 __all__ = ["Bound", "WorstCase", "bound", "summary_of_bound"]
 
-NARROWEST = 1e-7  # of a worst case: a tenth of it and rounding would have a part in it
+NARROWEST = 1e-7  # smallest tolerance, relative to a worst case: with a tenth of it rounding errors would matter
 
 
 def bound(
@@ -43,17 +43,39 @@ def bound(
     write: bool = False,
     notify: Notify = ignore,
 ) -> Bound:
-    """The worst case of each row of an experiment over all uncertainty: what ``sparserob bound CONFIG key=value ...``
-    does, of a config or a problem without any control, of a run (`as_run`) with its control.
+    """Enclose the worst case of each row over all uncertainty, as ``sparserob bound CONFIG key=value ...`` does.
 
-    Rows are those of path, mixed and terminal constraints with flat sides. Where a problem has no such constraint they
-    are the outputs that it measures, and without these its states, each way over the whole horizon. ``tolerance``: how
-    close the two sides are to be, relative to the worst case, or to a thousandth of the largest value of the row where
-    that is larger. ``seconds``: when to stop, ``limits.seconds`` of the config unless given; what is known then holds.
-    ``out``: a new or empty directory for the config, ``bound.json``, ``envelopes.npz`` and ``bound.png``, which `check`
-    verifies; with ``write`` and none given it is ``runs/NAME-bound/STAMP-HASH``. ``notify`` receives `StudyProgress`.
-    Raises `InputError` when an argument, the config or the run is at fault, among these a run whose control answers
-    what it measures.
+    Rows are those of path, mixed and terminal constraints with flat sides. A problem without such a constraint has as
+    rows the outputs that it measures, or else its states, in both directions and over the whole horizon.
+
+    Parameters
+    ----------
+    config : str, Path, mapping, OptimalControlProblem or finished run
+        A config or a problem, for worst cases without any control; or a run (`as_run`), for those with its control.
+    overrides : mapping or iterable of str, optional
+        Changes of the config.
+    tolerance : float, default 1e-6
+        The distance of the two sides that is asked for: relative to the worst case, or to a thousandth of the largest
+        value of the row where that is larger.
+    seconds : float, optional
+        The time limit; ``limits.seconds`` of the config unless given. The bounds that are known by then hold.
+    out : str or Path, optional
+        The directory for the config, ``bound.json``, ``envelopes.npz`` and ``bound.png``, new or empty. `check`
+        verifies it.
+    write : bool, default False
+        Whether to write ``runs/NAME-bound/STAMP-HASH`` where ``out`` is not given.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+
+    Returns
+    -------
+    Bound
+        The worst cases.
+
+    Raises
+    ------
+    InputError
+        If an argument, the config or the run is at fault. A run whose control answers measurements is refused too.
     """
     if not hasattr(tolerance, "__float__") or not NARROWEST <= float(tolerance) <= 0.1:
         raise InputError(f"tolerance: expected a number from {NARROWEST:g} to 0.1, got {tolerance!r}")
@@ -106,13 +128,13 @@ def bound(
 
 
 def _answers(loaded: Loaded, problem: OptimalControlProblem, control: Dictionary) -> bool:
-    """Whether the policy of a config answers anything that it measures."""
+    """Return whether the policy of a config answers any measurement."""
     policy = build(loaded, "policy", loaded.config.policy)
     return bool(answers_of(policy, control.breakpoints, problem.measurements).any())
 
 
 def _require_fitting(theta: Array, shape: tuple[int, int], loaded: Loaded, answering: bool) -> None:
-    """Raise `InputError` unless a run's control is one that can be bounded, and is of the config."""
+    """Raise `InputError` unless the control of a run belongs to the config, and answers no measurement."""
     if answering:
         expected = "open_loop, for worst cases with the control of a run"
         raise loaded.located((), InputError(path="policy.name", expected=expected, got=loaded.config.policy.name))
@@ -124,7 +146,7 @@ def _require_fitting(theta: Array, shape: tuple[int, int], loaded: Loaded, answe
 
 
 def _control(config: object) -> Array | None:
-    """The coefficients of the control of a run; ``None`` where no run was given."""
+    """Return the coefficients of the control of a run; ``None`` where no run was given."""
     if isinstance(config, Outcome | SolvedProblem):
         path = as_run(config)[0]
     elif isinstance(config, str | Path) and (Path(config) / "result.json").is_file():
@@ -138,7 +160,10 @@ def _control(config: object) -> Array | None:
 
 
 def _written(directory: RunDirectory, found: Bound, loaded: Loaded) -> Bound:
-    """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
+    """Write the files of worst cases, and return them with their directory.
+
+    The figure is an extra: where it cannot be drawn, the numbers are written all the same, and there is a warning.
+    """
     from sparserob_core.experiment.bound.figure import write_bound_figure
 
     directory.write_arrays(

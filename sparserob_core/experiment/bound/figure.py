@@ -1,4 +1,4 @@
-"""The picture of worst cases: between its two bounds the envelope of every quantity over time, with its walls."""
+"""The figure of worst cases: the envelope of every quantity over time, between its two bounds, and its walls."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
     from sparserob_core.experiment.bound.record import Bound, WorstCase
 
-MOST = 8  # panels: more are too small to be read on a page
-ROOM = 0.12  # of what is drawn, above and below it
+MOST = 8  # largest number of panels: more of them are too small to be read on a page
+ROOM = 0.12  # empty space above and below the curves, as a share of their height
 
 
 def write_bound_figure(file: Path, found: Bound) -> None:
-    """Draw worst cases into a file (.png, .pdf, .svg), which is complete or not there.
+    """Draw worst cases into a file (.png, .pdf, .svg), which is complete or does not exist.
 
-    Raises `InputError` when matplotlib is missing, and when the file cannot be written.
+    Raises `InputError` where matplotlib is missing, and where the file cannot be written.
     """
     look.require_matplotlib()
     with look.style():
@@ -31,8 +31,12 @@ def write_bound_figure(file: Path, found: Bound) -> None:
 
 
 def draw_bound(found: Bound) -> Figure:
-    """A panel for every quantity that has a window of some length, `MOST` at most: the largest and the smallest value
-    over all uncertainty, each as a band between the side that is reached and the one that is proven, and the walls."""
+    """Return the figure of worst cases: a panel for every quantity that has a window of positive length, `MOST` at
+    most.
+
+    Each panel has the largest and the smallest value over all uncertainty, as bands between the bound that is reached
+    and the one that is proven, and the walls.
+    """
     panels: dict[tuple[str, bool], list[WorstCase]] = {}
     for row in found.over_parameters:
         if row.edges.size:

@@ -1,4 +1,4 @@
-"""Worst cases as they are told: in the user's terms, with what is left to the wall."""
+"""The records of worst cases, in the user's terms, with their distance from the constraint."""
 
 from __future__ import annotations
 
@@ -19,20 +19,51 @@ from sparserob_core.sip.convex_set import Array
 @final
 @dataclass(frozen=True, eq=False)
 class WorstCase:
-    """The supremum or infimum of a ``quantity`` over every disturbance, initial state, parameter and time ``start`` to
-    ``stop``: from ``lower`` to ``upper``.
+    """The supremum or infimum of a quantity over every disturbance, initial state and parameter, and over a window of
+    time.
 
-    Of a supremum ``lower`` is reached, at ``time`` with ``parameter (nu,)``, from the centre of the initial states plus
-    ``deviation (d,)``, under ``disturbance (mw, M)``, which is constant between the times ``changes (M + 1,)``
-    (``None``: there is none); ``upper`` is proven over the continuum. Of an infimum it is the other way round.
-    ``wall``: where the ``constraint`` ends, whose normal ``direction`` points outwards; ``margin``: how far the proven
-    side is from it at least, negative where it is beyond; both are ``None`` where nothing bounds the quantity. A bound
-    that is not known is infinite.
+    It lies between ``lower`` and ``upper``. The lower bound of a supremum is reached by a witness, and its upper bound
+    is proven over the continuum. For an infimum it is the other way round. A bound that is not known is infinite.
 
-    ``edges (n + 1,)``: parts of the window, on each of which the worst case lies between ``low`` and ``high (n,)``.
-    ``cells``: how many were examined; ``reason``: what hindered the two sides from being as close as was asked for.
-    ``corner``: of parameters beside the time the one corner that this is about, such as ``gain = 0.1``, and ``stated``
-    the direction without what they add to the states: the worst of all corners is `Bound.over_parameters`.
+    Parameters
+    ----------
+    constraint, quantity, unit : str
+        The constraint of the row, the quantity, and its unit.
+    sense : {"sup", "inf"}
+        Supremum or infimum.
+    lower, upper : float
+        The two bounds.
+    time : float
+        The time of the witness.
+    wall : float or None
+        The bound of the ``constraint`` on the quantity; ``None`` where there is none.
+    margin : float or None
+        The least distance of the proven side from the wall, negative where it is beyond; ``None`` without a wall.
+    start, stop : float
+        The window of time.
+    direction : array
+        The normal of the row, which points outwards.
+    parameter : array (nu,)
+        The parameter of the witness.
+    deviation : array (d,)
+        The deviation of its initial state from the centre of the initial states.
+    changes : array (M + 1,)
+        The times between which its disturbance is constant.
+    disturbance : array (mw, M) or None
+        Its disturbance; ``None`` where there is none.
+    cells : int
+        The number of cells that were examined.
+    reason : str
+        The reason why the two bounds are not as close as the tolerance asks.
+    edges : array (n + 1,)
+        The ends of parts of the window.
+    low, high : array (n,)
+        The bounds of the worst case on each of these parts.
+    corner : str, default ""
+        For parameters of a system whose matrices depend on the time, the corner of this worst case, such as ``gain =
+        0.1``. `Bound.over_parameters` has the worst of all corners.
+    stated : array, optional
+        The direction without the coordinates that these parameters add to the states.
     """
 
     constraint: str
@@ -66,17 +97,17 @@ class WorstCase:
 
     @property
     def reached(self) -> float:
-        """The side that is reached."""
+        """The bound that a witness reaches."""
         return self.lower if self.sense == "sup" else self.upper
 
     @property
     def proven(self) -> float:
-        """The side that is proven."""
+        """The bound that is proven over the continuum."""
         return self.upper if self.sense == "sup" else self.lower
 
 
 def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
-    """A bounded row in the user's terms: of a row that bounds a quantity from below, its infimum."""
+    """Return a bounded row in the user's terms: for a row that bounds a quantity from below, its infimum."""
     row, sign, corners = found.row, found.row.sign, problem.names.corners
     sides = [sign * found.lower, sign * found.upper]
     bands = [sign * found.low, sign * found.high]
@@ -111,7 +142,8 @@ def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
 
 
 def _worst_of(rows: list[WorstCase]) -> WorstCase:
-    """The worst case of one quantity over all corners of the parameters: its witness is that of the worst of them."""
+    """Return the worst case of one quantity over all corners of the parameters, with the witness of the worst
+    corner."""
     largest = rows[0].sense == "sup"
     most, far = (max, np.maximum) if largest else (min, np.minimum)
     worst = most(rows, key=lambda row: row.reached)
@@ -130,13 +162,30 @@ def _worst_of(rows: list[WorstCase]) -> WorstCase:
 @final
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """The worst cases ``rows`` of a problem: without any control, or with that of a run, whose coefficients are
-    ``decision (m, N)``.
+    """The worst cases of a problem, without any control or with that of a run.
 
-    ``status``: ``certified`` (the two sides of every row are as close as the ``tolerance`` asks, relative to the worst
-    case, or to a thousandth of the largest value that is met where that is larger), ``undecided`` (some are farther
-    apart, and hold all the same). ``directory``: where it was written to, if it was; ``time_unit``: that of times,
-    where it is known.
+    Parameters
+    ----------
+    title : str
+        The title of the experiment.
+    status : {"certified", "undecided"}
+        ``certified``: the two bounds of every row are as close as the ``tolerance`` asks. ``undecided``: those of some
+        rows are further apart, and hold all the same.
+    rows : tuple of WorstCase
+        The worst cases.
+    tolerance : float
+        The distance of the bounds that was asked for. It is relative to the worst case, or to a thousandth of the
+        largest value of the row where that is larger.
+    decision : array (m, N) or None
+        The coefficients of the run's control; ``None`` without a control.
+    seconds : float
+        The seconds that it has taken.
+    directory : Path, optional
+        The directory that was written, if there is one.
+    remarks : tuple of str, default ()
+        Warnings.
+    time_unit : str, default ""
+        The unit of times, where it is known.
     """
 
     title: str
@@ -153,7 +202,8 @@ class Bound:
 
     @property
     def over_parameters(self) -> tuple[WorstCase, ...]:
-        """The ``rows`` over all corners of parameters beside the time, of which `rows` has each."""
+        """The worst cases of all quantities, each over all corners of the parameters; ``rows`` has every corner by
+        itself."""
         alike: dict[tuple[object, ...], list[WorstCase]] = {}
         for row in self.rows:
             stated = row.direction if row.stated is None else row.stated
@@ -165,7 +215,10 @@ ENVELOPE = ("edges", "low", "high")
 
 
 def summary_of_bound(found: Bound) -> dict[str, Any]:
-    """``bound.json``: every field but the directory and the envelopes; numbers that are not finite become null."""
+    """Return the contents of ``bound.json``: every field but the directory and the envelopes.
+
+    Numbers that are not finite become null.
+    """
     rows = [{name: _plain(value) for name, value in vars(row).items() if name not in ENVELOPE} for row in found.rows]
     summary: dict[str, Any] = finite(asdict(replace(found, directory=None, rows=())))
     decision = None if found.decision is None else found.decision.tolist()
@@ -178,15 +231,15 @@ def _plain(value: Any) -> Any:
 
 
 def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
-    """What a user wants to know of every worst case, as rows of a table; over all corners of parameters beside the
-    time, with the one at which it is reached."""
+    """Return every worst case as a row of a table, over all corners of the parameters, with the corner that
+    reaches it."""
     rows = found.over_parameters
     cornered = any(row.corner for row in rows)
 
     def number(value: float | None, towards: float = 0.0) -> str:
         if value is None or not np.isfinite(value):
             return "-"
-        if towards:  # so that what is shown holds too
+        if towards:  # rounded outwards, so that the number in the table is a bound too
             size = 10.0 ** (np.floor(np.log10(abs(value))) - 8.0) if value else 0.0
             value += 0.0 if (float(f"{value:.9g}") - value) * towards >= 0.0 else towards * 0.5 * size
         return f"{value:.9g}"
@@ -207,7 +260,7 @@ def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
 
 
 def columns_told(found: Bound) -> tuple[str, ...]:
-    """The names of the columns of `bound_rows_told`."""
+    """Return the names of the columns of `bound_rows_told`."""
     time = f"at t [{found.time_unit}]" if found.time_unit else "at t"
     at = ("at parameters",) if any(row.corner for row in found.rows) else ()
     return "constraint", "worst case", "at least", "at most", time, "wall", "margin", *at

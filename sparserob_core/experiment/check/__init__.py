@@ -1,1 +1,1 @@
-"""A finished run verified anew."""
+"""The check of a finished run: its certificate and its files are verified anew."""

@@ -1,4 +1,4 @@
-"""``sparserob check``: a finished run verified anew, from its config and its certificate alone."""
+"""The check of a finished run, from its config and its certificate alone: ``sparserob check``."""
 
 from __future__ import annotations
 
@@ -24,17 +24,27 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.config.load import Loaded
     from sparserob_core.experiment.run.given import GivenRun
 
-REPEATED = 16  # times that a number may be written, in characters: honest files need 7; what more allows takes memory
-SPARE = 2**20  # bytes of what is neither in certificate nor config, some kB; ten times as many are no matter either
+REPEATED = 16  # bytes of arrays for each character of the files: true runs need 7; a larger limit only costs memory
+SPARE = 2**20  # bytes for numbers that stand in neither certificate nor config, which are some kB
 STATUS = {"holds": 0, "not checked": 1, "fails": 2}
 
 
 @final
 @dataclass(frozen=True)
 class Check:
-    """The verdicts on a run, one per claim. ``status`` is ``verified`` when all hold, ``refuted`` when one fails, else
-    ``undecided``. ``not_compared``: what the files say besides that nothing was compared with, which changes no
-    verdict."""
+    """The verdicts on the claims of a run, and the conclusion from them.
+
+    Parameters
+    ----------
+    title : str
+        The title of the run.
+    claims : tuple of Finding
+        The verdict on each claim.
+    seconds : float
+        The seconds that the check has taken.
+    not_compared : tuple of str, default ()
+        The entries of the files with which nothing was compared; they change no verdict.
+    """
 
     title: str
     claims: tuple[Finding, ...]
@@ -42,7 +52,7 @@ class Check:
     not_compared: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """The verdict first, then the claims that do not hold; those that hold are counted."""
+        """Return the status, the number of claims that hold, and the claims that do not."""
         doubtful = [one for one in self.claims if one.verdict != "holds"]
         lines = [f"Check: {self.status}", f"  title: {self.title}", f"  {len(self.claims) - len(doubtful)} claims hold"]
         lines += [f"  {one.name} {one.verdict}: {one.text}" for one in doubtful]
@@ -55,13 +65,30 @@ class Check:
 
 
 def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: float = math.inf) -> Check:
-    """Verify a finished run (`as_run`): its certificate against its config in ball arithmetic, ``result.json`` and
-    ``solution.npz`` against both.
+    """Verify a finished run: its certificate in ball arithmetic, then its other files.
 
-    Nothing is solved, and nothing of what solved it is used. ``plugins``: files that offer the problem or a dictionary
-    where these are no part of this distribution; the directory itself is data, and no plugin that it names is loaded.
-    After ``seconds`` what was decided is returned, and the rest is ``not checked``. Raises `InputError` when the
-    directory is not that of a finished run with a certificate, or ``seconds`` are not positive.
+    The certificate is checked against the config, and ``result.json`` and ``solution.npz`` against both. Nothing is
+    solved, and nothing that solved the run is used.
+
+    Parameters
+    ----------
+    directory : str, Path, Outcome or SolvedProblem
+        The run (`as_run`), or the directory of a `bound`.
+    plugins : iterable of str or Path, default ()
+        Files of plugins with the problem or a dictionary, where these do not belong to this distribution. The directory
+        itself is data: no plugin that it names is loaded.
+    seconds : float, optional
+        The time after which the verdicts so far are returned; the remaining claims are ``not checked``.
+
+    Returns
+    -------
+    Check
+        The verdicts. The status is ``verified`` where all claims hold, ``refuted`` where one fails, else ``undecided``.
+
+    Raises
+    ------
+    InputError
+        If the directory is not that of a finished run with a certificate, or the ``seconds`` are not positive.
     """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import check as derive
@@ -92,12 +119,12 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
 
 
 def _of_no_case(title: str, gap: Unchecked, started: float) -> Check:
-    """Of a problem that the checker cannot state."""
+    """Return the check of a problem that the checker cannot describe."""
     return Check(title, (Finding("problem", "not checked", str(gap)),), time.perf_counter() - started)
 
 
 def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, started: float) -> Check:
-    """The verdicts on the directory that `bound` wrote."""
+    """Return the verdicts on a directory that `bound` wrote."""
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.suprema.suprema import check_suprema
     from sparserob_core.experiment.assemble import control_problem_of, dictionaries_of
@@ -107,7 +134,7 @@ def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, starte
     problem = control_problem_of(loaded, f"{path}: expected worst cases of a control problem")
     control, disturbance = dictionaries_of(loaded, problem.horizon)
     decision = data.get("decision")
-    if decision is None:  # without any control
+    if decision is None:  # the worst cases were bounded without a control
         data = {**data, "decision": [[0.0] * control.functions for _ in range(problem.system.controls)]}
     title = loaded.config.title or path.name
     try:
@@ -122,8 +149,11 @@ def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, starte
 def _policy(
     loaded: Loaded, data: Mapping[str, Any], control: Dictionary, measured: Measurements | None
 ) -> Policy | None:
-    """The policy of a config where it answers anything. Of one whose component is not at hand, what the certificate
-    says of it: what is claimed is claimed of such policies."""
+    """Return the policy of a config; ``None`` where it answers no measurement.
+
+    Where its component is not registered, the policy is that which the certificate describes, for that is the policy of
+    its claims. It is ``None`` where the certificate describes none.
+    """
     from sparserob_core.checker.claims.case import written_policy
     from sparserob_core.checker.outcome import Broken
     from sparserob_core.control.policies.policy import answers_of
@@ -136,13 +166,16 @@ def _policy(
     else:
         try:
             policy = written_policy(data, control.pieces)
-        except Broken:  # nothing is written, or the claim `policy` says what is wrong
+        except Broken:  # there is no policy in the certificate, or the claim `policy` fails with the reason
             return None
     return policy if answers_of(policy, control.breakpoints, measured).any() else None
 
 
 def _place(run: GivenRun) -> Path:
-    """The directory of a run; what knows runs is imported only where one was given, as a check is of a directory."""
+    """Return the directory of a run.
+
+    The module that knows runs is imported only where a run was given: a check is mostly of a directory.
+    """
     if isinstance(run, str | Path):
         return Path(run)
     from sparserob_core.experiment.run.given import as_run
@@ -151,14 +184,21 @@ def _place(run: GivenRun) -> Path:
 
 
 def _largest(directory: Path, case: Case) -> int:
-    """How many bytes the arrays of ``solution.npz`` may take: they hold what certificate and config say a few times
-    over (8 bytes for a number that has at least 3 characters), and the control on its pieces."""
+    """Return the largest number of bytes that the arrays of ``solution.npz`` may take.
+
+    They repeat the numbers of certificate and config a few times (8 bytes for a number of at least 3 characters), and
+    hold the control on its pieces.
+    """
     said = sum((directory / name).stat().st_size for name in ("certificate.json", "config.yaml"))
     return SPARE + REPEATED * (said + 8 * case.control.pieces * case.problem.system.controls)
 
 
 def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Finding:
-    """An earlier version had fewer keys: the digest is of the config as it is read today, or as it is written."""
+    """Return the verdict on the claim that certificate and config belong together.
+
+    An earlier version knew fewer keys, so that the digest may be that of the config as it is read today or as it is
+    written.
+    """
     found, written = loaded.config.digest(), digest(loaded.source.data)
     if data.get("config") not in (found, written) or summary.get("config") != data.get("config"):
         return Finding(

@@ -1,4 +1,4 @@
-"""What the other files of a run say, beside its certificate: compared where it can be, else named as not compared."""
+"""The comparison of the other files of a run with its certificate; entries that cannot be compared are named."""
 
 from __future__ import annotations
 
@@ -21,27 +21,44 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.config.load import Loaded
     from sparserob_core.sip.convex_set import Array
 
-FIGURES = 1e-12  # how closely figures that were computed anew must agree
-CLOSE = 1e-9  # the same for what was rounded on the way: the largest cost, points that were drawn into their sets
+FIGURES = 1e-12  # relative error that is allowed to numbers that are computed anew
+CLOSE = 1e-9  # the same for numbers with rounding errors: the largest cost, points that were moved into their sets
 READ = {"config.yaml", "certificate.json", "result.json", "solution.npz"}
 
 
 @final
 @dataclass
 class Compared:
-    """The verdicts on the files, and the names of what was not compared with anything, by file."""
+    """The verdicts on the files, and the names of the entries that were not compared, by file."""
 
     claims: list[Finding] = field(default_factory=list)
     left: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def not_compared(self) -> tuple[str, ...]:
-        """``file`` or ``file: names``."""
+        """The entries that were not compared, as ``file`` or ``file: names``."""
         return tuple(f"{file}: {', '.join(names)}" if names else file for file, names in self.left.items())
 
 
 def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Compared:
-    """``result.json`` and ``solution.npz`` against the certificate and the config; other files are not looked at."""
+    """Compare ``result.json`` and ``solution.npz`` with the certificate and the config.
+
+    Parameters
+    ----------
+    stored : StoredRun
+        The files of the run.
+    loaded : Loaded
+        Its config.
+    case : Case
+        Its problem and its certificate, as the checker has them.
+    summary : mapping
+        The contents of ``result.json``.
+
+    Returns
+    -------
+    Compared
+        The verdicts. Other files are not read, only named.
+    """
     from flint import ctx
 
     from sparserob_core.checker.claims.claims import precision_of
@@ -75,20 +92,20 @@ CERTIFICATE = {
     "refuted": FIGURED | {"witness"},
     "infeasible": ALWAYS | {"lower_bound", "tree"},
 }
-"""What is looked at of a certificate, by its status."""
+"""The keys of a certificate that are checked, by its status."""
 SOMETIMES = frozenset[str]().union(*CERTIFICATE.values())
 NOTHING: tuple[object, ...] = (None, {}, [])
 MULTIPLIER = {"constraint", "time", "parameter", "direction", "multiplier"}
 CELLS = {"tolerance", "lower", "upper"}
 WITNESS = {"constraint", "time", "parameter", "direction", "disturbance", "violation"}
 BEGUN = {"deviation"}
-"""Of a witness, and of a multiplier under feedback, where the initial states are a set."""
+"""Keys of a witness, and of a multiplier under feedback, where the initial states are a set."""
 NOISE = {"noise"}
-"""Of both, where a policy measures outputs with a noise."""
+"""Keys of both, where a policy measures outputs with a noise."""
 
 
 def _unread(case: Case) -> set[str]:
-    """The names ``key.key`` of what a certificate says besides what its claims rest on."""
+    """Return the names ``key.key`` of the entries of a certificate on which none of its claims rests."""
     data, measured = case.certificate, case.problem.measurements
     noisy = case.answering and measured is not None and measured.noise is not None
     read = CERTIFICATE.get(str(data.get("status")), FIGURED)
@@ -140,8 +157,10 @@ def _besides(name: str, data: object, read: set[str]) -> set[str]:
 
 
 def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
-    """Whether a multiplier is one of a control's own set or its steps', which no parameter changes, and yet has a
-    parameter."""
+    """Return whether a multiplier of the set of controls, or of their steps, has a parameter.
+
+    No parameter changes these sets, so that the entry means nothing.
+    """
     if not isinstance(entry, Mapping) or entry.get("constraint") not in (case.of_control, "control_step"):
         return False
     own = not any(window.name == entry["constraint"] for window in case.windows)
@@ -149,7 +168,7 @@ def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
 
 
 def _flat(shape: ConvexSet) -> bool:
-    """Whether the directions of a set are its own; a certificate's are not looked at then."""
+    """Return whether the directions of a set follow from the set itself; those of a certificate are then not read."""
     try:
         return known(shape).facets is not None
     except Unchecked:
@@ -157,11 +176,11 @@ def _flat(shape: ConvexSet) -> bool:
 
 
 Verdicts = tuple[list[str], str, list[str]]
-"""What is different, what to say when nothing is, and what was not compared."""
+"""The differences, the sentence where there are none, and the names of entries that were not compared."""
 
 
 def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
-    """``result.json``, key by key."""
+    """Compare ``result.json`` key by key."""
     from sparserob_core.checker.outcome import Unchecked
 
     status = case.certificate.get("status")
@@ -189,9 +208,9 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
     for name, compare in COMPARED.items():
         try:
             verdict = compare(case, summary)
-        except Unchecked:  # it rests on a set of a kind that the checker does not know
+        except Unchecked:  # the entry rests on a set of a kind that the checker does not know
             verdict = None
-        except Broken as error:  # the certificate does not say what the figure follows from
+        except Broken as error:  # the certificate lacks the numbers from which the entry follows
             verdict = [f"{name}: {error}"]
         if verdict is None:
             left += [name] if name in summary else []
@@ -208,18 +227,18 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
 
 
 def _causal(case: Case) -> dict[str, tuple[object, ...]]:
-    """What is to be said of every causal policy."""
+    """Return the values that ``result.json`` may have for causal policies."""
     if not case.answering:
         return {}
     claimed = case.certificate.get("causal")
     lower = claimed.get("lower_bound") if isinstance(claimed, Mapping) else None
     none = isinstance(claimed, Mapping) and lower is None
-    least = (lower,) if claimed is not None else (None, 0.0)  # nothing costs less than nothing, and needs no proof
+    least = (lower,) if claimed is not None else (None, 0.0)  # no cost is negative: the bound 0 needs no proof
     return {"causal_lower_bound": least, "causal_infeasible": (none, *(() if none else (None,)))}
 
 
 def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
-    """The gap as it is defined, or as earlier versions defined it."""
+    """Compare the gap with its definition, or with that of earlier versions."""
     from sparserob_core.checker.claims.claims import relative_gap
 
     if case.certificate.get("status") not in ("certified", "verified"):
@@ -233,7 +252,10 @@ def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 
 def _cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
-    """What is added up to the cost; earlier versions wrote the largest possible cost, or nothing."""
+    """Compare the size of the terms that are added up to the cost.
+
+    Earlier versions wrote the largest possible cost, or nothing.
+    """
     if "cost_scale" not in summary:
         return None
     from sparserob_core.checker.claims.claims import added_up, compared, largest_cost
@@ -247,7 +269,7 @@ def _cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 
 def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
-    """The share of the time at which the certificate's control acts, and how often it switches."""
+    """Compare the share of time for which the certificate's control acts, and the number of its switches."""
     said = summary.get("sparsity")
     if not isinstance(said, Mapping):
         return ["sparsity is no mapping"]
@@ -274,8 +296,11 @@ def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 
 def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
-    """Without a regulariser the value is the cost, to rounding of one that is not small; with one it is not computed
-    anew."""
+    """Compare the value of the regularised problem with the cost, where there is no regulariser.
+
+    A difference within the rounding errors of a cost that is not small is allowed. With a regulariser the value is not
+    computed anew.
+    """
     if summary.get("epsilon") != 0.0 or case.certificate.get("status") == "infeasible":
         return None
     if case.certificate.get("decision") is None:
@@ -289,7 +314,10 @@ def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 
 def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
-    """The worst constraint: that of the witness, or computed anew at its time and parameter where its set is flat."""
+    """Compare the worst constraint.
+
+    It must be that of the witness. Without one it is computed anew at its time and parameter, where its set is flat.
+    """
     said, status = summary.get("worst"), case.certificate.get("status")
     if not isinstance(said, Mapping):
         return ["worst is no mapping"]
@@ -315,8 +343,10 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 
 def _outside(bound: ConvexSet, begun: Array, centre: Array) -> float:
-    """How far an initial state that is written is outside of a set of deviations from a centre, in its own unit; not
-    what was rounded where the deviation was added to the centre."""
+    """Return how far an initial state lies outside a set of deviations from a centre, in the set's own unit.
+
+    The rounding error of the sum of deviation and centre is not counted.
+    """
     from sparserob_core.checker.arithmetic.balls import balls
 
     shape, deviation = known(bound), begun - centre
@@ -328,8 +358,10 @@ def _outside(bound: ConvexSet, begun: Array, centre: Array) -> float:
 
 
 def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
-    """Whether the worst violation is what the worst uncertainty causes, and is reached from the initial state that is
-    named where there are several."""
+    """Compare the worst violation with that of the worst uncertainty.
+
+    Where there are several initial states, the one that is named must attain it too.
+    """
     from sparserob_core.checker.claims.case import numbers
     from sparserob_core.checker.claims.replay import exceeded
 
@@ -351,7 +383,7 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
 
 
 def _begins(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> bool:
-    """Whether the worst initial state that is told is the one that the witness begins at."""
+    """Return whether the worst initial state in ``result.json`` is that of the witness."""
     if case.problem.initial_set is None or (case.answering and "initial_state" not in said):
         return "initial_state" not in said
     deviation = witness.get("deviation")
@@ -363,8 +395,10 @@ def _begins(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> 
 
 
 def _whole(case: Case, said: object) -> object:
-    """An initial state in its stated coordinates with those that integrals and parameters add, which are known; one
-    with all of them as it is."""
+    """Return an initial state of the user's coordinates together with those that integrals and parameters add.
+
+    The added ones are known. A state that has all coordinates is returned as it is.
+    """
     begun = np.asarray(case.problem.initial_state, dtype=float)
     if not isinstance(said, list) or len(said) != case.stated.system.states:
         return said
@@ -372,7 +406,7 @@ def _whole(case: Case, said: object) -> object:
 
 
 def _near(said: object, point: object) -> bool:
-    """Whether two points agree, one of which was drawn into its set by rounding."""
+    """Return whether two points agree, where one of them was moved into its set against rounding errors."""
     if not (isinstance(said, list) and isinstance(point, list) and len(said) == len(point)):
         return False
     return all(_same(a, b, CLOSE) for a, b in zip(said, point, strict=True))
@@ -383,14 +417,14 @@ SPARSITY = {"active_fraction", "switches", "channels", "fewest_active"}
 
 
 def _added_up(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
-    """What the cost is made of, in words."""
+    """Compare the terms of the cost, in words."""
     words = case.problem.cost.words()
     said = summary.get("cost_of", words)
     return [] if said == words else [f"cost_of is {said!r}, not {words!r}"]
 
 
 def _units(case: Case, summary: Mapping[str, Any]) -> list[str]:
-    """The units must be those that the config names."""
+    """Compare the units with those that the config names."""
     said, names = summary.get("units") or {}, case.problem.names
     known = {"", *names.state_units, *names.control_units}
     rows = said.get("rows") if isinstance(said, Mapping) else None
@@ -406,13 +440,13 @@ def _units(case: Case, summary: Mapping[str, Any]) -> list[str]:
     cost = names.time if case.counts else effort
     stated, every = case.stated.system.states, list(names.state_units)
     for key, mine in (("time", names.time), ("states", every[:stated]), ("cost", cost), ("J", effort)):
-        allowed = (mine, every) if key == "states" else (mine,)  # runs once told those of all
+        allowed = (mine, every) if key == "states" else (mine,)  # earlier versions wrote the units of added states too
         wrong += [f"units: {key} is {said[key]!r}, not {mine!r}"] if key in said and said[key] not in allowed else []
     return wrong
 
 
 def _parameters(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
-    """The names of the uncertain parameters, in the order of their values."""
+    """Compare the names of the uncertain parameters, in the order of their values."""
     mine = [] if case.problem.system.parameters is None else list(case.problem.system.names)
     said = summary.get("parameters", mine)
     return [] if said == mine else [f"parameters are {said!r}, not {mine!r}"]
@@ -431,12 +465,12 @@ COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
 
 
 def _equal(said: object, value: object) -> bool:
-    """Whether two entries of JSON are the same; a truth value is no number."""
+    """Return whether two entries of JSON are equal; a truth value is no number."""
     return said == value and isinstance(said, bool) is isinstance(value, bool)
 
 
 def _same(said: object, value: object, figures: float = FIGURES) -> bool:
-    """Whether two entries of JSON agree, numbers to rounding."""
+    """Return whether two entries of JSON agree, numbers up to rounding errors."""
     numbers = [one for one in (said, value) if isinstance(one, int | float) and not isinstance(one, bool)]
     if len(numbers) == 2:
         return abs(numbers[0] - numbers[1]) <= figures * max(abs(numbers[0]), abs(numbers[1]))
@@ -447,12 +481,12 @@ STORED = ("theta", "control", "breakpoints", "decision")
 
 
 def _sizes(case: Case) -> int:
-    """How many bounds of the sizes of the control's values follow its coefficients in a decision."""
+    """Return how many bounds of the control's sizes follow its coefficients in a decision."""
     return 0 if case.problem.execution is None else case.problem.system.controls * case.control.pieces
 
 
 def _solution(stored: StoredRun, case: Case) -> Verdicts:
-    """``solution.npz`` must hold the certificate's decision."""
+    """Compare the control in ``solution.npz`` with that of the certificate."""
     if case.certificate.get("decision") is None:
         return [], "there is no decision", []
     try:
@@ -483,7 +517,8 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
 
 
 def _witnessed(case: Case, arrays: Mapping[str, Any]) -> dict[str, str]:
-    """The disturbance of the worst constraint, which is that of the witness, drawn inwards by rounding."""
+    """Compare the disturbance of the worst constraint with that of the witness, which was moved inwards against
+    rounding."""
     witness = case.certificate.get("witness")
     if "worst_disturbance" not in arrays or not isinstance(witness, Mapping) or witness.get("disturbance") is None:
         return {}
@@ -494,6 +529,6 @@ def _witnessed(case: Case, arrays: Mapping[str, Any]) -> dict[str, str]:
         signal = numbers(witness["disturbance"], "disturbance")
         size = np.abs(said).max(initial=0.0)
         close = signal.shape == said.shape and bool((np.abs(signal - said) <= CLOSE * size).all())
-    except (Broken, TypeError):  # ragged, or text
+    except (Broken, TypeError):  # rows of different lengths, or text
         close = False
     return {"worst_disturbance": "" if close else "its worst disturbance is not that of the witness"}

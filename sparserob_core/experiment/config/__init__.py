@@ -1,1 +1,1 @@
-"""A config file as checked, typed data, and errors that name the place."""
+"""The config file as checked, typed data; every error names its place."""

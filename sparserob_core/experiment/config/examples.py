@@ -1,4 +1,4 @@
-"""The configs that come with this distribution: complete experiments, each a story."""
+"""The configs of this distribution: complete experiments, each with a story."""
 
 from __future__ import annotations
 
@@ -10,14 +10,25 @@ from typing import final
 
 from sparserob_core.errors import InputError
 
-SCHEMA = "# yaml-language-server:"  # a line for editors, beside the schema's file only
+SCHEMA = "# yaml-language-server:"  # a line for editors, of use only in the folder with the schema's file
 
 
 @final
 @dataclass(frozen=True)
 class Example:
-    """A config that comes with the distribution: its ``name``, the ``title`` of its runs, its ``story`` (the comment at
-    its beginning), and its ``text``, which is complete: of one that extends another it says what that says too."""
+    """A config of this distribution.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    title : str
+        The title of its runs.
+    story : str
+        The comment at its beginning.
+    text : str
+        Its complete text. That of a config which extends another one has the keys of both.
+    """
 
     name: str
     title: str
@@ -26,17 +37,17 @@ class Example:
 
 
 def shipped(name: str) -> Path:
-    """The file of a config of this distribution; it need not exist."""
+    """Return the file of a config of this distribution; it need not exist."""
     return _folder() / f"{name}.yaml"
 
 
 def examples() -> list[Example]:
-    """All of them, by name."""
+    """Return all configs of this distribution, by name."""
     return [_read(file) for file in sorted(_folder().glob("*.yaml"))]
 
 
 def example(name: str) -> Example:
-    """The one of that name; raises `InputError` when there is none."""
+    """Return the config of that name; raises `InputError` where there is none."""
     from sparserob_core.experiment.plugins.messages import nearest
 
     known = [file.stem for file in _folder().glob("*.yaml")]
@@ -46,7 +57,7 @@ def example(name: str) -> Example:
 
 
 def _folder() -> Path:
-    """Beside the package where it is installed, in the repository else."""
+    """Return the folder of the configs: next to the package in a repository, within it where it is installed."""
     package = Path(__file__).resolve().parents[2]
     places = [folder / "configs" for folder in (package, package.parent)]
     return next((place for place in places if place.is_dir()), places[-1])
@@ -61,8 +72,11 @@ def _read(file: Path) -> Example:
 
 
 def _complete(file: Path) -> str:
-    """The text of a config; of one that extends another with the keys of that which it has not itself, as they are
-    written there, and as plain data where that would not say the same."""
+    """Return the complete text of a config.
+
+    A config that extends another one gets the keys that it lacks, as they are written there. Where that text would have
+    another meaning, the result is plain data.
+    """
     from sparserob_core.experiment.config.extending import EXTENDS, extended
     from sparserob_core.experiment.config.reading.reader import read_source, read_value, write_yaml
 
@@ -79,7 +93,7 @@ def _complete(file: Path) -> str:
 
 
 def _keys(text: str) -> dict[str, str]:
-    """The lines of every key at the top of a config."""
+    """Return the lines of every key at the top of a config."""
     parts = re.split(r"^(?=[a-z_]+:)", text, flags=re.MULTILINE)[1:]
     return {part.partition(":")[0]: part if part.endswith("\n") else f"{part}\n" for part in parts}
 

@@ -1,4 +1,4 @@
-"""A config that begins from another one: ``extends: base.yaml``."""
+"""A config that extends another one: ``extends: base.yaml``."""
 
 from __future__ import annotations
 
@@ -21,21 +21,23 @@ MEANING = (
     " components of the same name are taken one by one; any other value stands in the place of the other's."
 )
 SECTIONS = {(name,) for name, field in RunConfig.model_fields.items() if [*models_in(field.annotation)]}
-"""Where keys are taken one by one, beside components of one name."""
+"""The sections whose keys are taken one by one, as those of components with the same name are."""
 
 
 def extended(source: Source) -> Source:
-    """The config with what the one that it extends says beside it, and so on along the chain.
+    """Return a config together with the keys of the config that it extends, and so on along the chain.
 
-    Keys of sections, and of components of the same name, are taken one by one; any other value, a list, a set or a
-    system, stands in the place of the other's. Raises `ConfigError` where there is no such file, or a circle.
+    Keys of sections, and of components of the same name, are taken one by one. Any other value, a list, a set or a
+    system, replaces the other's. Raises `ConfigError` where there is no such file, or a circle.
     """
     return _extended(source, ())
 
 
 def movable(source: Source) -> tuple[dict[str, Any], list[Complaint]]:
-    """The data of a config as they may stand elsewhere: the files of its plugins by their whole names, the numbers of
-    matrices instead of their files; and what is wrong with these."""
+    """Return the data of a config in a form that holds in any folder, and the faults that were found.
+
+    Files of plugins have their absolute names, and the numbers of matrices replace their files.
+    """
     data = copy.deepcopy(source.data)
     wrong = list(resolve(data, lambda _: source.folder))
     files = data.get("plugins")
@@ -72,7 +74,7 @@ def _fault(source: Source, said: str) -> ConfigError:
 
 
 def _over(base: object, own: object, path: Path) -> Any:
-    """The value at ``path`` of a config that extends another one, of the values in both."""
+    """Return the value at ``path`` of a config that extends another one, from the values of both."""
     slot = next((slot for place, slot in SLOTS.items() if place == path), None)
     if slot is not None:
         base, own = ({"name": value} if isinstance(value, str) else value for value in (base, own))

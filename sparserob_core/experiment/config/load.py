@@ -1,4 +1,4 @@
-"""From a config file to a checked `RunConfig`: every fault at once, each with its place and what was expected."""
+"""The way from a config file to a checked `RunConfig`; all faults are reported at once, each with its place."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.messages import NOT_PLAIN, NOT_TEXT, Complaint, complaints, malformed, models_in
 from sparserob_core.experiment.plugins.registry import load_registry
 
-KEPT = {*MaximiserEntry.model_fields} - {"name"}  # keys of a maximiser that are the framework's own
+KEPT = {*MaximiserEntry.model_fields} - {"name"}  # keys of a maximiser that belong to the framework
 
 
 @final
 @dataclass(frozen=True)
 class Loaded:
-    """A checked config with the registry that offers its components, and where it came from."""
+    """A checked config, the registry that offers its components, its source and its overrides."""
 
     config: RunConfig
     registry: Registry
@@ -35,15 +35,15 @@ class Loaded:
     overrides: tuple[Override, ...] = ()
 
     def place(self, path: Path) -> str | None:
-        """``file:line:column``, or the override, that gives the value at ``path``; ``None`` where its default holds."""
+        """Return where the value at ``path`` is given: ``file:line:column``, or the override; ``None`` for a
+        default."""
         change = _override(self.source, self.overrides, Complaint(path, ""))
         if change is not None:
             return f"override {change.text}"
         return None if _at(self.source.data, path) is None else self.source.where(path)
 
     def located(self, slot: Path, error: InputError) -> ConfigError:
-        """The same error with the place of the key that it is about: what building the component at ``slot`` found
-        wrong with its options."""
+        """Return an error of the component at ``slot`` as one that names the place of the key at fault."""
         plain = self.config.plain()
         path, rest = (*slot, *error.path), list[str | int]()
         while len(path) > len(slot) and _at(plain, path) is None:
@@ -58,12 +58,28 @@ def load_config(
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     known: Registry | None = None,
 ) -> Loaded:
-    """Read a config, apply the overrides, and check every key of it against the installed plugins.
+    """Read a config, apply the overrides, and check every key against the installed plugins.
 
-    ``known``: the components that there are, for a config that somebody else has left. No plugin that the config names
-    is loaded then, nor a config that it extends; a component that is not known stands as it is, and is refused by its
-    name where it is built.
-    Raises `ConfigError`: one line for each key at fault, ``file:line:column: key.path: what is wrong (got ...)``.
+    Parameters
+    ----------
+    config : str, Path, mapping or Source
+        The config.
+    overrides : mapping or iterable of str, optional
+        Changes of the config: a mapping of keys to values, or texts ``key=value``.
+    known : Registry, optional
+        The only components that may be used, for a config that somebody else has left. No plugin that the config names
+        is loaded then, nor a config that it extends. A component that is not in the registry is accepted as it stands,
+        and refused by its name where it is built.
+
+    Returns
+    -------
+    Loaded
+        The checked config.
+
+    Raises
+    ------
+    ConfigError
+        With one line for each key at fault: ``file:line:column: key.path: what is wrong (got ...)``.
     """
     given = read_source(config)
     given = extended(given) if known is None else given
@@ -79,7 +95,7 @@ def load_config(
         apply_override(data, change)
         _spell_out(data)
     wrong = list(malformed(data))
-    if known is None and not wrong:  # a directory that somebody has left has the numbers themselves
+    if known is None and not wrong:  # a run directory has the numbers themselves: no file is read for it
         wrong = list(resolve(data, lambda path: _folder(path, given, changes)))
     registry = _registry(data, given, changes) if known is None else known
     resolved, more = _checked(data, registry, strangers=known is not None)
@@ -91,7 +107,7 @@ def load_config(
 
 
 def _folder(path: Path, source: Source, changes: tuple[Override, ...]) -> File:
-    """What a file is relative to: the folder of the config, or the working directory where an override names it."""
+    """Return the folder that a file is relative to: that of the config, or the working directory for an override."""
     changed = _override(source, changes, Complaint(path, "")) is not None
     return File.cwd() if changed else source.folder
 
@@ -153,7 +169,7 @@ def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple
 
 
 def _below(data: dict[str, Any], registry: Registry) -> Iterator[str]:
-    """The keys of the sections, with the section in front: the options of the components that stand there."""
+    """Yield the keys of the sections, with the section in front; among them the options of their components."""
     for path, slot in SLOTS.items():
         entry = _at(data, path)
         name = entry.get("name") if isinstance(entry, dict) else slot.name
@@ -205,7 +221,7 @@ def _line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -
 
 
 def _override(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> Override | None:
-    """The override that put the key there: it set the key, or something below a key that was not written before."""
+    """Return the override that gave a key: it set the key, or one below a key that was not written before."""
     path = [str(step) for step in complaint.path]
     for change in reversed(changes):
         changed = [str(step) for step in change.path]

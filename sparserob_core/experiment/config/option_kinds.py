@@ -1,5 +1,7 @@
-"""Kinds of values in a config: which member of a union is meant shows in the value, so that an error speaks of that
-member only."""
+"""Types of values in a config.
+
+The value itself shows which member of a union is meant, so that an error is about that member only.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,10 @@ from sparserob_core.sip.convex_set import Array
 
 
 def one_of(expected: str, **kinds: type | tuple[type, ...]) -> Discriminator:
-    """Chooses the member of a union by the type of the value; anything else is not what was ``expected``."""
+    """Return the discriminator that chooses the member of a union by the type of the value.
+
+    ``kinds`` are the types of each member's tag. The error for any other value begins with ``expected``.
+    """
 
     def chosen(value: object) -> str | None:
         return (
@@ -35,7 +40,7 @@ OneOrMore: TypeAlias = Annotated[Number | Numbers, one_of("a number or a list of
 
 
 def _in_time(value: object) -> str | None:
-    """Rows of numbers, where any entry of a list is one."""
+    """Return the tag of a value that may be rows of numbers: they are rows where any entry of the list is a list."""
     if isinstance(value, list | tuple):
         return "rows" if any(isinstance(row, list | tuple) for row in value) else "list"
     return "number" if isinstance(value, NUMBER) and not isinstance(value, bool) else None
@@ -55,7 +60,7 @@ OneOrMoreFree: TypeAlias = Annotated[
 
 
 class Sparse(Options):
-    """Options that are written back without the keys that were left out."""
+    """Options that are written back without the keys that were not given."""
 
     @model_serializer(mode="wrap")
     def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -63,18 +68,39 @@ class Sparse(Options):
 
 
 def count(dimension: int) -> str:
-    """How many numbers, in words."""
+    """Return a number of numbers in words."""
     return f"{dimension} numbers" if dimension > 1 else "1 number"
 
 
 def free_bound(name: str, value: float | Sequence[float | None] | None, dimension: int, free: float) -> Array:
-    """A bound ``(dimension,)`` with ``free`` where it is null or missing."""
+    """Return a bound ``(dimension,)``, with ``free`` where it is null or not given."""
     return broadcast(name, free if value is None else value, dimension, free)
 
 
 def broadcast(name: str, value: float | Sequence[float | None], dimension: int, free: float = np.nan) -> Array:
-    """A vector ``(dimension,)`` from a number or a list, nulls replaced; raises `InputError` when the length is
-    another."""
+    """Return a vector from a number or a list.
+
+    Parameters
+    ----------
+    name : str
+        The key of the value, for errors.
+    value : float or sequence
+        A number for all coordinates, or a list with null where a coordinate is free.
+    dimension : int
+        The number of coordinates.
+    free : float, default nan
+        The number in place of null.
+
+    Returns
+    -------
+    array (dimension,)
+        The vector.
+
+    Raises
+    ------
+    InputError
+        If the list has another length.
+    """
     if not isinstance(value, Sequence):
         return np.full(dimension, float(value))
     if len(value) not in (1, dimension):

@@ -1,4 +1,4 @@
-"""The options of a component as the rows of a table: name, type, default, range, meaning."""
+"""The options of a component as the rows of a table: name, type, default, range and meaning."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TYPES = {"object": "mapping", "string": "text", "boolean": "true or false", "int
 
 @dataclass(frozen=True)
 class OptionRow:
-    """One option; ``name`` is dotted where an option is itself a mapping."""
+    """An option as a row of the table; its ``name`` is dotted where it lies within another option."""
 
     name: str
     type: str
@@ -35,8 +35,10 @@ class OptionRow:
 
 
 def option_rows(record: Plugin, ask: bool = True) -> list[OptionRow]:
-    """Every option of a component, and what may be below it; keys that several options share are listed below the first
-    of them. ``ask``: see `options_schema`."""
+    """Return every option of a component as a row, with the keys below it.
+
+    Keys that several options share are listed below the first of these options. ``ask`` is that of `options_schema`.
+    """
     schema = options_schema(record, ask)
     prefix = f"#/$defs/{record.kind}.{record.name}."
     return list(_Rows({prefix + name: part for name, part in schema.get("$defs", {}).items()}).rows(schema, ""))
@@ -44,7 +46,7 @@ def option_rows(record: Plugin, ask: bool = True) -> list[OptionRow]:
 
 @final
 class _Rows:
-    """Goes through a schema once; ``parts`` are its definitions, ``seen`` where each was first met."""
+    """The rows of a schema; ``parts`` are its definitions, ``seen`` the options at which each of them was listed."""
 
     def __init__(self, parts: Mapping[str, Any]) -> None:
         self.parts = parts
@@ -68,7 +70,7 @@ class _Rows:
                     yield from self.rows(self.parts.get(reference, {}), f"{place}.")
 
     def _members(self, field: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """The alternatives of a type, each with the name of its definition."""
+        """Yield the alternatives of a type, each with the name of its definition."""
         reference = field.get("$ref", "")
         whole = self.parts.get(reference, {}) if reference else field
         several = whole.get("anyOf") or whole.get("oneOf") or whole.get("allOf")

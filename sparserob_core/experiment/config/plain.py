@@ -1,4 +1,4 @@
-"""Resolved configs as plain data: what decides a result, how two of them differ, and a value in a few letters."""
+"""Resolved configs as plain data: their identity, their differences, and short texts of their values."""
 
 from __future__ import annotations
 
@@ -8,19 +8,25 @@ from collections.abc import Mapping
 from typing import Any
 
 BESIDE = ("executor", "observers", "title", "limits")
-"""Keys of a config that do not decide what a finished run finds."""
+"""Keys of a config that do not decide the result of a finished run."""
 
 
 def identity(plain: Mapping[str, Any]) -> str:
-    """The SHA-256 of a resolved config without the keys that do not decide what a finished run finds (where it is
-    solved, who watches, its title, how long it may take): of its JSON with sorted keys and without spaces."""
+    """Return the SHA-256 of a resolved config without the keys that do not decide the result of a finished run.
+
+    These are the executor, the observers, the title and the limits. The hash is that of the JSON text with sorted keys
+    and without spaces.
+    """
     kept = {key: value for key, value in plain.items() if key not in BESIDE}
     text = json.dumps(kept, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def difference(one: Any, two: Any, path: str = "") -> tuple[str, Any, Any] | None:
-    """The first place at which two parts of a config differ, and what stands there; a key that is missing is null."""
+    """Return the first place at which two parts of a config differ, and both values; ``None`` where they are equal.
+
+    A key that is missing counts as null.
+    """
     if isinstance(one, Mapping) and isinstance(two, Mapping):
         steps = [(str(key), one.get(key), two.get(key)) for key in {**one, **two}]
     elif (
@@ -37,7 +43,7 @@ def difference(one: Any, two: Any, path: str = "") -> tuple[str, Any, Any] | Non
 
 
 def value_text(value: object) -> str:
-    """A value of a config in a few letters: a component is its name and the options that are not null."""
+    """Return a short text of a value of a config; a component is its name with the options that are not null."""
     if isinstance(value, Mapping):
         options = ", ".join(
             f"{key} {value_text(item)}" for key, item in value.items() if key != "name" and item is not None

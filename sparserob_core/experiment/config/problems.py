@@ -1,4 +1,4 @@
-"""The problem ``linear``: every key of an uncertain linear optimal control problem, as a config writes it."""
+"""The keys of the problem ``linear``, an uncertain linear optimal control problem, as a config writes them."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _interval(value: object) -> object:
 Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_interval)]
 Rows: TypeAlias = Annotated[list[Annotated[list[Entry], Field(min_length=1)]], Field(min_length=1), OrPacked()]
 Column: TypeAlias = Annotated[list[Entry], Field(min_length=1), OrPacked(column=True)]
-MOST_PIECES = 1_000_000  # as many as a dictionary of equal pieces may have
+MOST_PIECES = 1_000_000  # the same limit as that of a dictionary of equal pieces
 Matrix: TypeAlias = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1), OrPacked()]
 
 
@@ -103,10 +103,10 @@ Parameters: TypeAlias = Annotated[
 
 @final
 class PieceOptions(Options):
-    """What a system is until a known time; entries are numbers, or arithmetic expressions in the parameters."""
+    """A system that holds until a known time; entries are numbers, or arithmetic expressions in the parameters."""
 
     until: float = Field(gt=0.0)
-    """When this piece ends; that of the last one is the horizon."""
+    """End of this piece; that of the last one is the horizon."""
 
     A: Rows
     """Square matrix, row by row."""
@@ -115,7 +115,7 @@ class PieceOptions(Options):
     """As many rows as ``A``, one column per control."""
 
     E: Rows | None = None
-    """How the disturbance enters; the identity unless given."""
+    """Matrix of the disturbance; the identity unless given."""
 
     c: Column | None = None
     """Constant drift, one entry per state; none unless given."""
@@ -123,9 +123,9 @@ class PieceOptions(Options):
 
 @final
 class SystemOptions(Options):
-    """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)``, or ``pieces`` of such systems that take turns at
-    known times; entries are numbers, or arithmetic expressions in the parameters, in the time ``t`` and in what
-    ``define`` names."""
+    """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)``, or ``pieces``: such systems that follow one another
+    at known times. Entries are numbers, or arithmetic expressions in the parameters, in the time ``t`` and in the names
+    of ``define``."""
 
     A: Rows | None = None
     """Square matrix, row by row."""
@@ -134,7 +134,7 @@ class SystemOptions(Options):
     """As many rows as ``A``, one column per control."""
 
     E: Rows | None = None
-    """How the disturbance enters, one column per component of it; the identity unless given."""
+    """Matrix of the disturbance, one column per component of it; the identity unless given."""
 
     pieces: Annotated[list[PieceOptions], Field(min_length=1)] | None = None
     """Instead of ``A``, ``B``, ``E`` and ``c``: systems with their own, each ``until`` a known time; they share the
@@ -142,7 +142,7 @@ class SystemOptions(Options):
 
     parameters: Parameters | None = None
     """Intervals ``{name: [lower, upper]}``, or names and a set, as ``{names: [...], polytope: {H: ..., h: ...}}``; none
-    if known. Beside entries in ``t`` intervals."""
+    where all is known. With entries in ``t`` only intervals."""
 
     c: Column | None = None
     """Constant drift such as gravity, one entry per state, in units of the state per time; none unless given."""
@@ -152,10 +152,10 @@ class SystemOptions(Options):
     0.2)"}``: ``kepler(M, e)`` is the ``E`` with ``E - e sin E = M``, ``0 <= e < 1``; none unless given."""
 
     delay: float = Field(default=0.0, ge=0.0)
-    """By how much later the control acts, less than the horizon; until then ``initial_control`` acts."""
+    """Delay of the control, less than the horizon; until then ``initial_control`` acts."""
 
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters; raises `InputError` when one cannot stand in an expression."""
+        """Return the names of the parameters; raises `InputError` where one cannot be used in an expression."""
         given = (
             self.parameters.names if isinstance(self.parameters, ParameterSetOptions) else list(self.parameters or {})
         )
@@ -171,8 +171,11 @@ class SystemOptions(Options):
         return tuple(given)
 
     def matrices(self) -> list[tuple[str, float | None, Matrices]]:
-        """``A``, ``B``, ``E`` and ``c`` of every piece, with its key and when it ends; of one that has no end where
-        there are no pieces. Raises `InputError` where both are given, or neither."""
+        """Return for each piece its key, its end, and its matrices ``A``, ``B``, ``E`` and ``c``.
+
+        A system without pieces is one without an end. Raises `InputError` where both a system and pieces are given, or
+        neither.
+        """
         if self.pieces is None:
             for key, rows in (("A", self.A), ("B", self.B)):
                 if rows is None:
@@ -188,8 +191,23 @@ class SystemOptions(Options):
         ]
 
     def build(self, horizon: float | None = None) -> System:
-        """The system, which may change with time up to the ``horizon`` where that is given; raises `InputError` that
-        begins with the key."""
+        """Return the system.
+
+        Parameters
+        ----------
+        horizon : float, optional
+            The final time; a system whose entries depend on the time needs it.
+
+        Returns
+        -------
+        System
+            The system.
+
+        Raises
+        ------
+        InputError
+            If a key is at fault; the error begins with the key.
+        """
         names = self.names()
         parameters, every = self._parameter_set(names), self.matrices()
         where, until, first = every[0]
@@ -205,7 +223,7 @@ class SystemOptions(Options):
         return SwitchedSystem(made, self.delay)
 
     def _changes(self, names: tuple[str, ...], every: list[tuple[str, float | None, Matrices]]) -> bool:
-        """Whether an entry, or what is defined, speaks of the time ``t``, where that is not a parameter's name."""
+        """Return whether an entry or a definition contains the time ``t``, where no parameter has that name."""
         if TIME in names:
             return False
         texts = [*(self.define or {}).values()]
@@ -243,7 +261,7 @@ class SystemOptions(Options):
 
 @final
 class UnitsOptions(Options):
-    """What everything is measured in, one text each; an empty one where no unit is known."""
+    """Units, one text each; an empty text where no unit is known."""
 
     states: list[str] = Field(default_factory=list)
     """Units of the states."""
@@ -260,7 +278,7 @@ class UnitsOptions(Options):
 
 @final
 class NamesOptions(Sparse):
-    """What everything is called in messages, tables, figures and recordings; no number changes."""
+    """Names in messages, tables, figures and recordings; no number changes."""
 
     states: list[str] = Field(default_factory=list)
     """Names of the states; x1, x2, ... unless given."""
@@ -272,14 +290,14 @@ class NamesOptions(Sparse):
     """Names of the disturbance's components; w1, w2, ... unless given."""
 
     units: UnitsOptions = UnitsOptions()
-    """What they are measured in."""
+    """Units of states, controls, disturbances and time."""
 
     plane: list[str] | None = None
-    """The two states that are a place, drawn to the right and upwards: the run then has a figure of the plane in which
-    the system moves."""
+    """The two states that are a position, drawn to the right and upwards: the run then has a figure of the plane in
+    which the system moves."""
 
     def build(self) -> Names:
-        """The names; raises `InputError` that begins with the key."""
+        """Return the names; raises `InputError` that begins with the key."""
         units = self.units
         return Names(
             states=self.states,
@@ -301,10 +319,10 @@ class StateCostOptions(Options):
     """Symmetric positive semidefinite matrix, row by row."""
 
     reference: OneOrMore = 0.0
-    """Where it is 0, one number per state; a number serves every state."""
+    """The state at which the term is 0, one number per state; a number holds for every state."""
 
     def term(self, key: str, states: int) -> Mapping[str, npt.ArrayLike]:
-        """The term of that key, as `Cost` takes it; raises `InputError`."""
+        """Return the term of the ``key``, as `Cost` takes it; raises `InputError`."""
         try:
             return {"Q": self.Q, "reference": broadcast("reference", self.reference, states)}
         except InputError as error:
@@ -321,7 +339,7 @@ class ControlCostOptions(Options):
 
 @final
 class CostOptions(Sparse):
-    """What a control costs; quadratic terms are those of the nominal trajectory, integrated exactly."""
+    """Cost of a control; quadratic terms are those of the nominal trajectory, integrated exactly."""
 
     l1: float = Field(default=1.0, ge=0.0)
     """Factor of the integral of the weighted absolute values; 0 for a purely quadratic cost."""
@@ -337,16 +355,16 @@ class CostOptions(Sparse):
     """Channels that count with their Euclidean norm, as one vector, instead of their absolute values."""
 
     state: StateCostOptions | None = None
-    """Integrated over time; none unless given."""
+    """Quadratic cost of the state, integrated over time; none unless given."""
 
     control: ControlCostOptions | None = None
-    """Integrated over time; none unless given."""
+    """Quadratic cost of the control, integrated over time; none unless given."""
 
     final: StateCostOptions | None = None
-    """Of the state at the horizon; none unless given."""
+    """Quadratic cost of the state at the horizon; none unless given."""
 
     def build(self, states: int) -> Cost:
-        """The cost; raises `InputError` that begins with the key."""
+        """Return the cost; raises `InputError` that begins with the key."""
         return Cost(
             l1=self.l1,
             group=self.group,
@@ -358,23 +376,22 @@ class CostOptions(Sparse):
 
 @final
 class DisturbanceOptions(Sparse):
-    """One of several disturbances."""
+    """A disturbance of a list of several."""
 
     bound: SetOptions = Field(alias="set")
-    """Set that it takes its values in."""
+    """Set of its values."""
 
     E: Rows | None = None
-    """How it enters, as many rows as there are states, one column per component of it; that of the system unless
-    given."""
+    """Its matrix, as many rows as there are states, one column per component of it; that of the system unless given."""
 
     kind: DisturbanceClass = Field(default="piecewise_constant", alias="class")
-    """Which functions it may be, as in ``disturbance_class``; ``l1_ball`` is that of all of a list, or of none."""
+    """Its class of functions, as in ``disturbance_class``; ``l1_ball`` holds for all of a list, or for none."""
 
     start: float | None = Field(default=None, alias="from", ge=0.0)
-    """When it begins to act; 0 unless given."""
+    """Time at which it begins to act; 0 unless given."""
 
     stop: float | None = Field(default=None, alias="to", ge=0.0)
-    """When it ends to act; at the horizon unless given."""
+    """Time at which it ceases to act; the horizon unless given."""
 
     pieces: int | None = Field(default=None, ge=1, le=MOST_PIECES)
     """Number of equal pieces on which it is constant; those of ``dictionaries.disturbance`` unless ``pieces`` or
@@ -384,7 +401,10 @@ class DisturbanceOptions(Sparse):
     """Ends of the pieces on which it is constant, increasing from 0 to the horizon."""
 
     def times(self, where: str, horizon: float) -> list[float] | Array | None:
-        """The ends of its pieces, ``None`` where it has none of its own; raises `InputError` where both say them."""
+        """Return the ends of its pieces; ``None`` where it has none of its own.
+
+        Raises `InputError` where both ``pieces`` and ``breakpoints`` are given.
+        """
         if self.pieces is not None and self.breakpoints is not None:
             raise InputError(path=where, expected="one of pieces and breakpoints", got="both")
         return self.breakpoints if self.pieces is None else np.linspace(0.0, horizon, self.pieces + 1)
@@ -437,19 +457,19 @@ def _system(
 
 @final
 class MeasurementOptions(Options):
-    """What is measured at every breakpoint of the control's dictionary: ``C x`` and a noise."""
+    """Measurement at every breakpoint of the control's dictionary: ``C x`` and a noise."""
 
     C: Matrix
     """One row per output, one number per state."""
 
     noise: SetOptions | None = None
-    """Set that the noise of the outputs takes its values in, bounded; none unless given."""
+    """Bounded set of the noise of the outputs; none unless given."""
 
     latency: float = Field(default=0.0, ge=0.0)
-    """How long it takes until a measurement is known to the control; 0 unless given."""
+    """Time until a measurement is known to the control; 0 unless given."""
 
     def build(self) -> Measurements:
-        """The measurements; raises `InputError` that begins with the key."""
+        """Return the measurements; raises `InputError` that begins with the key."""
         noise = None if self.noise is None else self.noise.build("measurements.noise", len(self.C))
         lengths = {len(row) for row in self.C}
         if len(lengths) > 1:
@@ -458,8 +478,7 @@ class MeasurementOptions(Options):
 
 
 class ProblemKeys(ProblemFactory, Options):
-    """The keys that all problems about a linear system share; what the system and the control are, they say
-    themselves."""
+    """The keys that all problems with a linear system share; each problem adds those of its system and its control."""
 
     horizon: float = Field(gt=0.0)
     """Final time."""
@@ -473,15 +492,15 @@ class ProblemKeys(ProblemFactory, Options):
             set=(Mapping, InitialStateOptions),
         ),
     ]
-    """State at time 0, one number per state; a number serves every state. Or a set of states: a ``centre`` and any set
-    of deviations from it, such as ``{centre: [-1, 1], box: 0.05}``."""
+    """State at time 0, one number per state; a number holds for every state. Or a set of states: a ``centre`` and any
+    set of deviations from it, such as ``{centre: [-1, 1], box: 0.05}``."""
 
     weights: NumbersInTime | None = None
     """Weight of every control in the cost, positive; 1 unless given. Or rows of a time and the weights from then on,
-    which are not negative, such as ``[[0, 1], [12, 2]]`` of one control; the first time is 0."""
+    which are not negative, such as ``[[0, 1], [12, 2]]`` for one control; the first time is 0."""
 
     cost: CostOptions = Field(default_factory=CostOptions)
-    """What is minimised; the integral of the weighted absolute values of the control unless given."""
+    """Cost that is minimised; the integral of the weighted absolute values of the control unless given."""
 
     disturbance: (
         Annotated[
@@ -494,19 +513,19 @@ class ProblemKeys(ProblemFactory, Options):
         ]
         | None
     ) = None
-    """Set that the disturbance takes its values in; none unless given. Or a list of disturbances, each with its set,
-    its ``E``, its class and its pieces, such as ``[{set: {box: 0.1}, E: [[0], [1]]}, {set: {box: 0.02}, E: [[1],
-    [0]], pieces: 8}]``."""
+    """Set of the values of the disturbance; none unless given. Or a list of disturbances, each with its set, its ``E``,
+    its class and its pieces, such as ``[{set: {box: 0.1}, E: [[0], [1]]}, {set: {box: 0.02}, E: [[1], [0]], pieces:
+    8}]``."""
 
     disturbance_class: DisturbanceClass = "piecewise_constant"
     """``piecewise_constant``: in the disturbance's dictionary; ``measurable``: any measurable function; ``l1_ball``:
     the coefficients of each channel have absolute sum at most the box's bound (a far smaller set)."""
 
     path: list[PathOptions] = Field(default_factory=list)
-    """Sets that the state stays in, each from ``from`` (0 unless given) to ``to`` (the horizon unless given)."""
+    """Sets in which the state stays, each from ``from`` (0 unless given) to ``to`` (the horizon unless given)."""
 
     terminal: list[TerminalOptions] = Field(default_factory=list)
-    """Sets that the state ends in, and values that it ends at."""
+    """Sets in which the state ends, and fixed final values."""
 
     integral: list[IntegralOptions] = Field(default_factory=list)
     """Bounds of integrals of state and control over windows: fuel of a channel, energy of a battery, a mean; as
@@ -516,7 +535,7 @@ class ProblemKeys(ProblemFactory, Options):
     """Names and units for messages, tables, figures and recordings."""
 
     def initial(self, states: int) -> list[float]:
-        """The initial state, or the centre of the initial states, one number per state; raises `InputError`."""
+        """Return the initial state, or the centre of the initial states, one number per state; raises `InputError`."""
         if isinstance(self.initial_state, InitialStateOptions):
             return [float(value) for value in self.initial_state.around("initial_state", states)[0]]
         given = self.initial_state if isinstance(self.initial_state, list) else [self.initial_state] * states
@@ -525,20 +544,38 @@ class ProblemKeys(ProblemFactory, Options):
         return given
 
     def deviations(self, states: int) -> ConvexSet | None:
-        """The set of deviations from `initial`, ``None`` for a single initial state; raises `InputError`."""
+        """Return the set of deviations from `initial`; ``None`` for a single initial state. Raises `InputError`."""
         if not isinstance(self.initial_state, InitialStateOptions):
             return None
         return self.initial_state.around("initial_state", states)[1]
 
     def noise(self, system: System) -> ConvexSet | None:
-        """The set of the disturbance where one is given, none of a list (`disturbances`); raises `InputError`."""
+        """Return the set of the disturbance; ``None`` where there is none, or a list (`disturbances`). Raises
+        `InputError`."""
         if self.disturbance is None or isinstance(self.disturbance, list):
             return None
         return self.disturbance.build("disturbance", system.disturbances)
 
     def disturbances(self, system: System, below: int = 0) -> list[Disturbance]:
-        """The disturbances where a list of them is given, under so many rows of zeros ``below`` each ``E``; raises
-        `InputError`."""
+        """Return the disturbances of a list; there are none where no list is given.
+
+        Parameters
+        ----------
+        system : System
+            The system.
+        below : int, default 0
+            The number of rows of zeros that are added below each ``E``.
+
+        Returns
+        -------
+        list of Disturbance
+            The disturbances.
+
+        Raises
+        ------
+        InputError
+            If a key is at fault; the error begins with the key.
+        """
         found: list[Disturbance] = []
         for i, one in enumerate(self.disturbance if isinstance(self.disturbance, list) else ()):
             where = f"disturbance.{i}"
@@ -555,7 +592,7 @@ class ProblemKeys(ProblemFactory, Options):
         return found
 
     def constraints(self) -> dict[str, Any]:
-        """Those that are written field by field, by their key, which is the list of the problem that they are in."""
+        """Return the constraints that are written field by field, by the key of their list in the problem."""
         given = {name: getattr(self, name) for name in type(self).model_fields}
         return {
             name: [one.build() for one in every]
@@ -564,52 +601,69 @@ class ProblemKeys(ProblemFactory, Options):
         }
 
     def windows(self, states: int) -> list[PathConstraint | MixedConstraint]:
-        """The path constraints, one per set or bounds of state and control together; raises `InputError`."""
+        """Return the path constraints, one per set or bound of state and control together; raises `InputError`."""
         listed = enumerate(self.path)
         return [one for i, item in listed for one in item.entries(f"path.{i}", states, self.horizon)]
 
     def ends(self, states: int) -> list[ConvexSet | Equality]:
-        """The terminal sets and equalities; raises `InputError`."""
+        """Return the terminal sets and equalities; raises `InputError`."""
         return [end for i, item in enumerate(self.terminal) for end in item.ends(f"terminal.{i}", states)]
 
 
 class LinearKeys(ProblemKeys):
-    """The keys of problems that write their system as matrices; what the control is, they say themselves."""
+    """The keys of problems that write their system as matrices; each problem adds those of its control."""
 
     system: SystemOptions
     """The system."""
 
 
 class ControlKeys(ProblemKeys):
-    """The keys of problems whose control is that of the system; what the system is, they say themselves."""
+    """The keys of problems whose control is that of the system; each problem adds those of its system."""
 
     makes: ClassVar[type[OptimalControlProblem]] = OptimalControlProblem
 
     control: SetOptions
-    """Set that the control takes its values in, bounded."""
+    """Bounded set of the values of the control."""
 
     initial_control: OneOrMore | None = None
-    """Control before time 0, one number per control; a number serves every control. Not told unless given."""
+    """Control before time 0, one number per control; a number holds for every control. Unknown unless given."""
 
     control_step: SetOptions | None = None
     """Set of the change of the control from one piece of its dictionary to the next, and from ``initial_control`` to
     the first piece where that is given; any change unless given."""
 
     measurements: MeasurementOptions | None = None
-    """What a policy measures and answers: ``{C: ..., noise: ..., latency: ...}``; all states, without noise and at
+    """Measurements that a policy answers: ``{C: ..., noise: ..., latency: ...}``; all states, without noise and at
     once, unless given."""
 
     execution: OneOrMore | None = None
-    """Share of the control, from 0 to 1, by which what is delivered may differ from the command, one number per control
-    or one for all of them, such as 0.02; what is commanded is delivered unless given."""
+    """Share of the control, from 0 to 1, by which the delivered control may differ from the command: one number per
+    control, or one for all, such as 0.02. The command is delivered exactly unless given."""
 
     repeat: bool = False
-    """Whether the plan begins again at the horizon, for ever: every final state is then one of the initial states, and
-    ``control_step`` holds from the last control to the first one too. Not with a delay."""
+    """Whether the plan is repeated for ever from the horizon on: every final state is then one of the initial states,
+    and ``control_step`` also holds from the last control to the first one. Not with a delay."""
 
     def problem(self, system: System, names: Names | None = None) -> OptimalControlProblem:
-        """The problem of a system; raises `InputError` that begins with the key at fault. ``names``: other ones than
-        those that the keys give."""
+        """Return the problem of a system.
+
+        Parameters
+        ----------
+        system : System
+            The system.
+        names : Names, optional
+            The names that replace those of the keys.
+
+        Returns
+        -------
+        OptimalControlProblem
+            The problem.
+
+        Raises
+        ------
+        InputError
+            If a key is at fault; the error begins with the key.
+        """
         if self.initial_control is not None and self.control_step is None and not system.delay > 0.0:
             raise InputError(
                 path="initial_control",
@@ -653,5 +707,5 @@ class LinearProblem(ControlKeys, LinearKeys):
     ``|u|``."""
 
     def build(self) -> OptimalControlProblem:
-        """The problem; raises `InputError` that begins with the key at fault."""
+        """Return the problem; raises `InputError` that begins with the key at fault."""
         return self.problem(self.system.build(self.horizon))

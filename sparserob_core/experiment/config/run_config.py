@@ -1,4 +1,4 @@
-"""The keys of a config and their defaults; what a component's own keys are, its options say."""
+"""The keys of a config and their defaults; those of a component are in its options."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Entry(Exact):
     model_config = ConfigDict(extra="allow", frozen=True, defer_build=True)
 
     name: str
-    """Which one; ``sparserob plugins`` lists them."""
+    """Name of the component; ``sparserob plugins`` lists them."""
 
     @property
     def options(self) -> dict[str, Any]:
@@ -32,8 +32,10 @@ class Entry(Exact):
 @final
 @dataclass(frozen=True)
 class Slot:
-    """Marks a key of the config that names one component of a ``kind``; ``name``: which one is meant where only options
-    are given."""
+    """The mark of a key of the config that names one component of a ``kind``.
+
+    ``name`` is the component that is used where only options are given.
+    """
 
     kind: str
     name: str | None = None
@@ -41,14 +43,14 @@ class Slot:
 
 @final
 class MaximiserEntry(Entry):
-    """A maximiser; the framework itself keeps its budget."""
+    """A maximiser with its budget, which belongs to the framework."""
 
     budget: int = Field(default=2000, ge=1)
     """Evaluations that one search may spend."""
 
     polish: float | None = Field(default=None, ge=0.0, lt=1.0)
-    """Share of the budget that goes to a local method, from the best points, at the end; null: what the maximiser says
-    of itself, a fifth as a rule, where ``g`` has a gradient or tuples are literal, and nothing elsewhere."""
+    """Share of the budget that a local method spends at the end, from the best points; null: the maximiser's own share,
+    as a rule a fifth, where ``g`` has a gradient or tuples are literal, and nothing elsewhere."""
 
 
 PIECES = Slot("dictionary", "piecewise_constant")
@@ -56,7 +58,7 @@ PIECES = Slot("dictionary", "piecewise_constant")
 
 @final
 class Dictionaries(Options):
-    """In which functions the control and the disturbance are written."""
+    """Functions of time of which control and disturbance are combinations."""
 
     control: Annotated[Entry, PIECES] = Entry.model_validate({"name": "piecewise_constant", "pieces": 100})
     """Dictionary of the control; 100 equal pieces by default."""
@@ -67,51 +69,51 @@ class Dictionaries(Options):
 
 @final
 class Limits(Options):
-    """How long a run may take."""
+    """Limits of the time of a run."""
 
     seconds: float | None = Field(default=None, gt=0.0)
-    """Seconds after which a run, a margin or a set of initial states ends with what it knows by then; null: none."""
+    """Seconds after which a run, a margin or a set of initial states ends with the results so far; null: no limit."""
 
 
 @final
 class RunConfig(Options):
-    """A complete experiment. Every key but ``problem`` has a default."""
+    """A complete experiment; every key but ``problem`` has a default."""
 
     title: str = ""
     """Title of the figures and tables; the file's name when empty."""
 
     problem: Annotated[Entry, Slot("problem")]
-    """What is to be solved."""
+    """The problem that is solved."""
 
     policy: Annotated[Entry, Slot("policy", "open_loop")] = Entry(name="open_loop")
-    """What the control may know while the system runs."""
+    """The policy: the measurements that the control may use while the system runs."""
 
     dictionaries: Dictionaries = Dictionaries()
-    """In which functions the control and the disturbance are written."""
+    """Functions of time of which control and disturbance are combinations."""
 
     regulariser: Annotated[Entry | None, Slot("regulariser", "ridge")] = Entry(name="ridge")
     """The strictly convex term that makes the optimiser unique; null for none."""
 
     continuation: Continuation = Continuation()
-    """How the weight of the regulariser decreases."""
+    """Decrease of the regulariser's weight."""
 
     method: Annotated[Entry, Slot("method", "exchange")] = Entry(name="exchange")
-    """How the semi-infinite program is solved."""
+    """The method that solves the semi-infinite program."""
 
     maximiser: Annotated[MaximiserEntry, Slot("maximiser", "direct")] = MaximiserEntry(name="direct")
-    """The global search, wherever a family of constraints has no closed form of its own."""
+    """The global search, used where a family of constraints has no closed form."""
 
     solver: Annotated[Entry, Slot("solver", "auto")] = Entry(name="auto")
-    """Who answers the finite programs: whoever is quickest (auto), or one that is named, which answers all of them."""
+    """The solver of the finite programs: the quickest for each (auto), or one that is named and asked for all."""
 
     executor: Annotated[Entry, Slot("executor", "serial")] = Entry(name="serial")
-    """Where programs that do not depend on one another are solved."""
+    """Place where independent programs are solved."""
 
     observers: tuple[Entry, ...] = (Entry(name="progress"),)
-    """Who receives the events of the run."""
+    """Observers, which receive the events of the run."""
 
     limits: Limits = Limits()
-    """How long a run may take."""
+    """Limits of the time of a run."""
 
     seed: int = Field(default=0, ge=0)
     """Seed of every random number."""
@@ -121,17 +123,17 @@ class RunConfig(Options):
     command line."""
 
     def plain(self) -> dict[str, Any]:
-        """The config as mappings, lists, numbers and text."""
+        """Return the config as mappings, lists, numbers and text."""
         plain: dict[str, Any] = self.model_dump(mode="json", by_alias=True)
         return plain
 
     def digest(self) -> str:
-        """Eight hexadecimal digits that change when the config does."""
+        """Return eight hexadecimal digits that change when the config changes."""
         return digest(self.plain())
 
 
 def digest(plain: object) -> str:
-    """The digest of a resolved config, from its mappings, lists, numbers and text."""
+    """Return the digest of a resolved config, from its mappings, lists, numbers and text."""
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
 
 
@@ -143,4 +145,4 @@ def _slots(model: type[Options], above: tuple[str, ...] = ()) -> Iterator[tuple[
 
 
 SLOTS: Mapping[tuple[str, ...], Slot] = dict(_slots(RunConfig))
-"""Where a config names one component. ``observers`` is a list."""
+"""The keys at which a config names one component; the key ``observers``, a list, is not among them."""

@@ -1,4 +1,4 @@
-"""The JSON schema of a config, for the plugins that are installed: editors complete and check with it."""
+"""The JSON schema of a config for the plugins that are installed; editors complete and check a config with it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from sparserob_core.options import meanings
 
 
 class _Lenient(GenerateJsonSchema):
-    """Says nothing about a type that JSON has no words for, and of every field what it means."""
+    """A schema generator that accepts any value of a type that JSON cannot describe, and adds the meaning of every
+    field."""
 
     def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
         written = super().model_schema(schema)
@@ -34,10 +35,20 @@ class _Lenient(GenerateJsonSchema):
 
 
 def options_schema(record: Plugin, ask: bool = True) -> dict[str, Any]:
-    """The JSON schema of a component's options, with the references of its parts under ``kind.name.``.
+    """Return the JSON schema of a component's options, with the references of its parts under ``kind.name.``.
 
-    ``ask=False``: of an ``open`` record only what is known without asking the package that it needs, whether that is
-    installed or not.
+    Parameters
+    ----------
+    record : Plugin
+        The component.
+    ask : bool, default True
+        Whether the package that an ``open`` component needs is asked for its options. Without that, only those are
+        returned that are known in any case, whether or not the package is installed.
+
+    Returns
+    -------
+    dict
+        The schema.
     """
     if record.open and not ask:
         return {} if record.options is None else record.options.model_json_schema(schema_generator=_Lenient)
@@ -46,7 +57,7 @@ def options_schema(record: Plugin, ask: bool = True) -> dict[str, Any]:
 
 
 def config_schema(registry: Registry) -> dict[str, Any]:
-    """The JSON schema (draft 2020-12) of the whole config."""
+    """Return the JSON schema (draft 2020-12) of the whole config."""
     schema = RunConfig.model_json_schema(schema_generator=_Lenient)
     parts: dict[str, Any] = schema["$defs"]
     for path, slot in SLOTS.items():
@@ -69,7 +80,7 @@ def config_schema(registry: Registry) -> dict[str, Any]:
 
 
 def _add_kinds(registry: Registry, parts: dict[str, Any]) -> None:
-    """Write out the models whose further keys are the registered components of a kind, as those of a set are."""
+    """Add to the models with one key per component of a kind, such as sets, the keys of all registered components."""
     for holder in [part for part in parts.values() if "kinds" in part]:
         kind = holder.pop("kinds")
         for name in registry.names(kind):
@@ -95,7 +106,10 @@ def _alternatives(field: dict[str, Any]) -> list[dict[str, Any]]:
 def _choice(
     registry: Registry, which: Part, default: str | None, parts: dict[str, Any], but: str | None = None
 ) -> dict[str, Any]:
-    """A component of a kind, by name or with its options; ``but``: one that cannot be meant, within its own options."""
+    """Return the schema of a component of a kind, by name or with its options.
+
+    ``but`` is a component that is left out: one within its own options.
+    """
     kind = which.kind
     names = [name for name in registry.names(kind, which.of) if name != but]
     entries = []

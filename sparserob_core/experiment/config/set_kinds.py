@@ -1,5 +1,5 @@
-"""The kinds of sets whose mathematics is in the core, as a config writes them; the plugin ``sparserob_sets`` registers
-them."""
+"""The kinds of sets that the core computes with, as a config writes them; the plugin ``sparserob_sets``
+registers them."""
 
 from __future__ import annotations
 
@@ -42,13 +42,14 @@ class BoxFactory(SetFactory, Sparse):
     shorthand: ClassVar[str | None] = "half_widths"
 
     half_widths: HalfWidths | None = None
-    """Half-widths about 0, a number for all or a list with null where free; ``box: 0.5`` is short for it."""
+    """Half-widths about 0: a number for all coordinates, or a list with null where one is free. ``box: 0.5`` is the
+    short form."""
 
     lower: OneOrMoreFree | None = None
-    """Lower bounds; a number serves every coordinate, null and a missing side are free."""
+    """Lower bounds; a number holds for every coordinate, and null or a missing side is free."""
 
     upper: OneOrMoreFree | None = None
-    """Upper bounds, likewise."""
+    """Upper bounds; a number holds for every coordinate, and null or a missing side is free."""
 
     @model_validator(mode="after")
     def _one_way(self) -> BoxFactory:
@@ -57,7 +58,7 @@ class BoxFactory(SetFactory, Sparse):
         return self
 
     def build(self, dimension: int) -> Box:
-        """The box."""
+        """Return the box."""
         if self.half_widths is None:
             return Box(
                 free_bound("lower", self.lower, dimension, -np.inf), free_bound("upper", self.upper, dimension, np.inf)
@@ -86,10 +87,10 @@ class PolytopeFactory(SetFactory, Options):
     """Normals, one row per half-space."""
 
     h: OneOrMore
-    """Right-hand sides, one per row; a number serves every row."""
+    """Right-hand sides, one per row; a number holds for every row."""
 
     def build(self, dimension: int) -> Polytope:
-        """The polytope."""
+        """Return the polytope."""
         if {len(row) for row in self.H} != {dimension}:
             raise InputError(
                 f"every row of H must have {dimension} numbers, got rows of {[len(row) for row in self.H]}"
@@ -116,11 +117,11 @@ class EllipsoidFactory(SetFactory, Sparse):
             matrix=(*LIST, Mapping),
         ),
     ]
-    """Symmetric positive definite matrix; a number stands for that multiple of the identity, the square of a ball's
+    """Symmetric positive definite matrix; a number means that multiple of the identity, the square of a ball's
     radius."""
 
     def build(self, dimension: int) -> Ellipsoid:
-        """The ellipsoid."""
+        """Return the ellipsoid."""
         if not isinstance(self.shape, list):
             return Ellipsoid(broadcast("centre", self.centre or 0.0, dimension), self.shape * np.eye(dimension))
         if len(self.shape) != dimension or {len(row) for row in self.shape} != {dimension}:
@@ -149,7 +150,7 @@ class NormFactory(SetFactory, Sparse):
     """Centre; the origin unless given."""
 
     def build(self, dimension: int) -> NormBall:
-        """The ball."""
+        """Return the ball."""
         return NormBall(float(self.p), self.radius, broadcast("centre", self.centre or 0.0, dimension))
 
     @staticmethod
@@ -161,10 +162,13 @@ class NormFactory(SetFactory, Sparse):
 
 
 def _or_free(bounds: Array) -> list[float | None]:
-    """Bounds as a config writes them: null where there is none."""
+    """Return bounds as a config writes them, with null where there is none."""
     return [float(value) if np.isfinite(value) else None for value in bounds]
 
 
 def _centred(centre: Array) -> dict[str, Any]:
-    """The key of a centre; none for the origin, so that the centre of initial states can stand beside the set."""
+    """Return the key of a centre.
+
+    There is none for the origin, so that a config can have the centre of the initial states as well as such a set.
+    """
     return {"centre": centre.tolist()} if centre.any() else {}

@@ -1,6 +1,6 @@
-"""Sets as a config writes them: one key per kind of set, several keys make their intersection.
+"""Sets as a config writes them: one key per kind of set; several keys mean the intersection.
 
-Which kinds there are, the registry knows: every plugin of the kind ``set`` is a key.
+The kinds are those of the registry: every plugin of the kind ``set`` is a key.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ KIND = SetPlugin.kind
 
 
 class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
-    """A set: the key says which kind, its value is the kind's options; several keys make the intersection of theirs."""
+    """A set: each key is a kind of set, its value the options of that kind; several keys mean the intersection."""
 
     _made: dict[str, SetFactory] = PrivateAttr(default_factory=dict)
 
@@ -73,7 +73,8 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
 
     @model_serializer(mode="wrap")
     def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """As a config writes it: without the keys that were left out, short where there is a short form."""
+        """Return the set as a config writes it: without keys that were not given, in the short form where there
+        is one."""
         plain = {key: value for key, value in handler(self).items() if value is not None}
         for key, value in (self.__pydantic_extra__ or {}).items():
             short = getattr(type(value), "shorthand", None)
@@ -88,8 +89,25 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
         return list(self.__pydantic_extra__ or {})
 
     def members(self, where: str, dimension: int) -> list[ConvexSet]:
-        """One set per key, in ``dimension`` coordinates, in the order in which they are written; raises `InputError`
-        that begins with the key below ``where``."""
+        """Return one set per key, in the order in which they are written.
+
+        Parameters
+        ----------
+        where : str
+            The key of the set in the config, for errors.
+        dimension : int
+            The number of coordinates.
+
+        Returns
+        -------
+        list of ConvexSet
+            The sets.
+
+        Raises
+        ------
+        InputError
+            If a set cannot be built, or has another dimension; the error begins with the key.
+        """
         found = []
         for kind, factory in self._made.items():
             try:
@@ -102,7 +120,26 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
         return found
 
     def build(self, where: str, dimension: int) -> ConvexSet:
-        """The intersection of all keys as one set; raises `InputError` when it is curved and not a single key."""
+        """Return the intersection of all keys as one set.
+
+        Parameters
+        ----------
+        where : str
+            The key of the set in the config, for errors.
+        dimension : int
+            The number of coordinates.
+
+        Returns
+        -------
+        ConvexSet
+            The set.
+
+        Raises
+        ------
+        InputError
+            If there are several keys and one of their sets is curved, or a set cannot be built; the error begins with
+            the key.
+        """
         members = self.members(where, dimension)
         try:
             joined = intersection(members)
@@ -117,7 +154,8 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
 
 
 def _checked(registry: Registry, kind: str, value: object, keys: set[str]) -> tuple[Options | None, list[Complaint]]:
-    """The typed options of one kind of set, or what is wrong with them; ``keys`` are those that are no kinds."""
+    """Return the typed options of one kind of set, or the faults in them; ``keys`` are the fields, which are no
+    kinds."""
     known = registry.names(KIND)
     if kind not in known:
         return None, [Complaint((), f"unknown key{nearest(kind, {*known, *keys})}{registry.notes()}")]
@@ -136,7 +174,7 @@ def _detail(fault: Complaint) -> InitErrorDetails:
 
 
 def shorthand(record: Plugin) -> str | None:
-    """The option that a bare number or list stands for; ``None`` where a kind of set has no short form."""
+    """Return the option that a bare number or list stands for; ``None`` where a kind of set has no short form."""
     return getattr(record.options_type(), "shorthand", None)
 
 
@@ -151,12 +189,12 @@ class MixedOptions(Options):
     """As many rows as ``H``, one column per control."""
 
     h: OneOrMore
-    """One number per row; a number serves every row."""
+    """One number per row; a number holds for every row."""
 
 
 @final
 class PathOptions(SetOptions, populate_by_name=True):
-    """A set that the state stays in during a window of time, or a bound of state and control together."""
+    """A set in which the state stays during a window of time, or a bound of state and control together."""
 
     start: float = Field(default=0.0, alias="from", ge=0.0)
     """Beginning of the window."""
@@ -165,19 +203,39 @@ class PathOptions(SetOptions, populate_by_name=True):
     """End of the window; the horizon unless given."""
 
     relative_to: list[list[float]] | None = None
-    """The set moves: rows of a time and a point, between which it goes along straight lines; at rest unless given."""
+    """Motion of the set: rows of a time and a point, with straight lines between them; at rest unless given."""
 
     mixed: MixedOptions | None = None
     """Bounds of state and control together, with the control of every piece that meets the window."""
 
     name: Annotated[str, Field(min_length=1)] | None = None
-    """What messages, tables and figures call it; path, or path[0] and so on, unless given."""
+    """Name in messages, tables and figures; path, or path[0] and so on, unless given."""
 
     def _given(self) -> list[str]:
         return super()._given() + ["mixed"] * (self.mixed is not None)
 
     def entries(self, where: str, states: int, horizon: float) -> list[PathConstraint | MixedConstraint]:
-        """One constraint per key; raises `InputError` that begins with the key below ``where``."""
+        """Return one constraint per key.
+
+        Parameters
+        ----------
+        where : str
+            The key of the entry in the config, for errors.
+        states : int
+            The number of states.
+        horizon : float
+            The final time.
+
+        Returns
+        -------
+        list of PathConstraint or MixedConstraint
+            The constraints.
+
+        Raises
+        ------
+        InputError
+            If a key is at fault; the error begins with the key.
+        """
         stop = horizon if self.stop is None else self.stop
         if not self.start <= stop <= horizon:
             raise InputError(
@@ -205,12 +263,12 @@ class PathOptions(SetOptions, populate_by_name=True):
 
 
 class TermOptions(Options, populate_by_name=True):
-    """A constraint that a config writes field by field, under the key of the list of a problem that it is in."""
+    """A constraint that a config writes field by field, as an entry of a list of the problem."""
 
     term: ClassVar[type[Window]]
 
     def build(self) -> Any:
-        """The constraint."""
+        """Return the constraint."""
         return self.term(**{name: getattr(self, name) for name in type(self).model_fields})
 
 
@@ -233,13 +291,13 @@ class IntegralOptions(TermOptions):
     """End of the window; the horizon unless given."""
 
     upper: OneOrMoreFree | None = None
-    """One number per row, null where there is no bound; a number serves every row."""
+    """Upper bounds, one number per row, null where there is none; a number holds for every row."""
 
     lower: OneOrMoreFree | None = None
-    """As ``upper``."""
+    """Lower bounds, one number per row, null where there is none; a number holds for every row."""
 
     name: Annotated[str, Field(min_length=1)] | None = None
-    """What messages, tables and figures call it; integral, or integral[0] and so on, unless given."""
+    """Name in messages, tables and figures; integral, or integral[0] and so on, unless given."""
 
 
 @final
@@ -247,12 +305,32 @@ class InitialStateOptions(SetOptions):
     """All initial states of a set: a centre, and the set of deviations from it; without a centre, the set itself."""
 
     centre: OneOrMore | None = None
-    """Centre of the initial states, one number per state; a number serves every state. Without one the set is where it
-    says, and its middle is the centre."""
+    """Centre of the initial states, one number per state; a number holds for every state. Without a centre the set is
+    that of the states themselves, and its middle is the centre."""
 
     def around(self, where: str, dimension: int) -> tuple[Array, ConvexSet]:
-        """The centre ``(d,)`` and the set of deviations from it; raises `InputError` that begins with the key below
-        ``where``."""
+        """Return the centre of the initial states, and the set of deviations from it.
+
+        Parameters
+        ----------
+        where : str
+            The key of the set in the config, for errors.
+        dimension : int
+            The number of states.
+
+        Returns
+        -------
+        centre : array (d,)
+            The centre.
+        deviations : ConvexSet
+            The set of deviations.
+
+        Raises
+        ------
+        InputError
+            If the set is not bounded, has two centres, or does not contain the deviation 0; the error begins with the
+            key.
+        """
         convex = self.build(where, dimension)
         if not convex.is_bounded:
             raise InputError("the set must be bounded", path=where)
@@ -278,14 +356,14 @@ class InitialStateOptions(SetOptions):
 
 
 def _has_centre(typed: object) -> bool:
-    """Whether a set was given a centre of its own: more than what a complete config says where it was given none."""
+    """Return whether a set was given a centre of its own, other than the default that a complete config writes."""
     if not isinstance(typed, Options) or "centre" not in typed.model_fields_set:
         return False
     return bool(getattr(typed, "centre", None) != type(typed).model_fields["centre"].default)
 
 
 def _moved(convex: ConvexSet, centre: Array, where: str) -> ConvexSet:
-    """The set of all ``x - centre``."""
+    """Return the set of all ``x - centre``."""
     if isinstance(convex, Box):
         return Box(convex.lower - centre, convex.upper - centre)
     if isinstance(convex, Polytope):
@@ -302,7 +380,7 @@ def _moved(convex: ConvexSet, centre: Array, where: str) -> ConvexSet:
 
 @final
 class TerminalOptions(SetOptions):
-    """A set, or fixed values, that the state ends in."""
+    """A set in which the state ends, or fixed final values."""
 
     equals: Annotated[FreeNumbers, Field(min_length=1)] | None = None
     """Final values, one per state, null where free."""
@@ -311,7 +389,7 @@ class TerminalOptions(SetOptions):
         return super()._given() + ["equals"] * (self.equals is not None)
 
     def ends(self, where: str, dimension: int) -> list[ConvexSet | Equality]:
-        """One set or equality per key; raises `InputError` that begins with the key below ``where``."""
+        """Return one set or equality per key; raises `InputError` that begins with the key below ``where``."""
         found: list[ConvexSet | Equality] = [*self.members(where, dimension)]
         if self.equals is not None:
             if len(self.equals) != dimension:

@@ -1,1 +1,1 @@
-"""The run directory: the one reader and the one writer of what a run leaves."""
+"""The run directory: the only reader and the only writer of its files."""

@@ -1,4 +1,4 @@
-"""The worst case of every constraint family of a run, as arrays that can be plotted and replayed: ``adversary.npz``."""
+"""The worst case of every constraint family of a run, as arrays for figures and replays: ``adversary.npz``."""
 
 from __future__ import annotations
 
@@ -32,15 +32,24 @@ SHAPES = {
 
 
 def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
-    """``adversary.npz``: the worst parameter, disturbance and initial state of every path and terminal constraint at a
-    decision ``(m N,)`` or ``(m, N)``.
+    """Return the worst parameter, disturbance and initial state of every path and terminal constraint at a decision.
 
-    One row per family ``f``: ``names``, ``rows`` (which side; 0 for a curved set), ``times``, ``directions (f, d)`` and
-    ``bounds`` with ``direction'x(time) - bound = violation`` in ``violations`` (negative: a margin),
-    ``parameters (f, nu)``, ``initial_states (f, d)``, and ``disturbances (f, mw, L)``, constant between the common
-    ``breakpoints (L + 1,)``; ``noises (f, K, p)`` where outputs are measured with a noise; ``states (f, d, T)`` at
-    ``state_times (T,)`` is what they do to the state. Nothing, ``{}``, for a program that is no control problem, or has
-    no state constraint.
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    decision : array (m N,) or (m, N)
+        The decision.
+
+    Returns
+    -------
+    dict of arrays
+        The arrays of ``adversary.npz``, with one row per family ``f``: ``names``, ``rows`` (the side; 0 for a curved
+        set), ``times``, ``directions (f, d)``, ``bounds`` and ``violations``, where ``direction'x(time) - bound =
+        violation`` (negative: a margin). Further ``parameters (f, nu)``, ``initial_states (f, d)``, and ``disturbances
+        (f, mw, L)``, constant between the common ``breakpoints (L + 1,)``. Where outputs are measured with a noise
+        ``noises (f, K, p)``. The states that they cause are ``states (f, d, T)`` at ``state_times (T,)``. Empty for a
+        program that is no control problem, or has no state constraint.
     """
     model, theta = experiment.model, np.asarray(decision, dtype=float).ravel()
     if model is None or not (kept := find_adversaries(model, theta)):
@@ -51,8 +60,24 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
 
 
 def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
-    """The state trajectories ``(f, d, T)`` that stored adversaries cause at a decision ``(m N,)``, at times ``(T,)``,
-    their own among them."""
+    """Return the state trajectories that stored adversaries cause at a decision.
+
+    Parameters
+    ----------
+    model : Transcription
+        The problem on its dictionaries.
+    theta : array (m N,)
+        The decision.
+    arrays : mapping
+        The arrays of `adversaries`.
+
+    Returns
+    -------
+    times : array (T,)
+        The times, with those of the adversaries among them.
+    states : array (f, d, T)
+        The trajectories.
+    """
     response = model.response
     breakpoints = arrays["breakpoints"]
     grid = response.grid.refined(breakpoints)
@@ -63,7 +88,7 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
     acting, begun = controlled(model, theta, grid.control_piece, noises), arrays["initial_states"]
     execution = model.functionals.execution
     if execution is not None and not callable(acting):
-        inner = finer(grid, times)  # an error changes its sign within a piece
+        inner = finer(grid, times)  # an error of execution may change its sign within a piece
         command = acting[:, inner.control_piece]
         held = Response(response.system, inner, response.initial_state)
         fine = Response(response.system, finer(inner, times), response.initial_state)
@@ -77,8 +102,24 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
 def controlled(
     model: Transcription, decision: Array, which: np.ndarray, noises: Array | None = None
 ) -> Array | Callable[[int, Array], Array]:
-    """What `walk` drives a system with at a decision, on pieces that lie in the pieces ``which`` of the grid: inputs
-    ``(m, pieces)``, or under feedback what answers the states, measured with ``noises (K, p, n)``."""
+    """Return the control at a decision, in the form in which `walk` takes it.
+
+    Parameters
+    ----------
+    model : Transcription
+        The problem on its dictionaries.
+    decision : array
+        The decision.
+    which : array of int
+        For each piece of the simulation the piece of the grid that contains it.
+    noises : array (K, p, n), optional
+        The noises of the measurements.
+
+    Returns
+    -------
+    array (m, pieces) or callable
+        The inputs, or under feedback a function of the piece and the states.
+    """
     if model.feedback is None:
         return model.functionals.on_grid(model.nominal(decision))[:, which]
     from sparserob_core.control.studies.measuring import Measuring
@@ -95,21 +136,22 @@ def controlled(
 
 
 def attained(arrays: Mapping[str, Array], times: Array, states: Array) -> Array:
-    """The violations ``(f,)`` that the replayed ``states (f, d, T)`` reach in the directions and at the times of the
-    adversaries."""
+    """Return the violations ``(f,)`` that the replayed ``states (f, d, T)`` reach at the adversaries' times and
+    directions."""
     nearest = np.abs(times[None] - arrays["times"][:, None]).argmin(axis=1)
     reached = states[np.arange(nearest.size), :, nearest]
     return np.asarray((arrays["directions"] * reached).sum(axis=1) - arrays["bounds"])
 
 
 def read_adversaries(directory: Path, model: Transcription) -> dict[str, Array]:
-    """The adversaries that a run has stored, or none; raises `InputError` when the file does not fit the run."""
+    """Return the adversaries that a run has stored, or none; raises `InputError` where the file does not fit
+    the run."""
     file = directory / FILE
     arrays = read_arrays(file)
     if not arrays:
         return {}
     if "names" in arrays and "initial_states" not in arrays and model.problem.initial_set is None:
-        # a file of a version that knew one initial state only
+        # an earlier version wrote this file, when there was one initial state only
         arrays = {**arrays, "initial_states": np.tile(model.response.initial_state, (arrays["names"].size, 1))}
     _require_shapes(file, arrays, model)
     known = [constraint.name for constraint in model.constraints if constraint.name in arrays["names"]]
@@ -160,7 +202,7 @@ def _require_shapes(file: Path, arrays: Mapping[str, Array], model: Transcriptio
 
 
 def _stacked(found: Sequence[Adversary], model: Transcription) -> dict[str, Array]:
-    """One row per adversary, on the union of their breakpoints."""
+    """Return the arrays of adversaries, one row each, on the union of their breakpoints."""
     points = np.unique(np.concatenate([one.breakpoints for one in found]))
     middles = (points[:-1] + points[1:]) / 2
     channels = 0 if model.functionals.disturbance is None else model.response.system.disturbances

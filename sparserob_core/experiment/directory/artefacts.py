@@ -1,4 +1,4 @@
-"""The directory that a run leaves: complete files under their final names, or none. The one writer of files."""
+"""The only writer of a run directory: a file is complete under its final name, or does not exist."""
 
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ from sparserob_core.sip.events import RoundFinished
 
 
 def write_whole(file: Path, content: bytes) -> None:
-    """Write a file whole, under a temporary name first, which is then replaced; raises `SparseRobError` when the disk
-    refuses, which says what stands under the file's name then: nothing, or what was written before."""
+    """Write a file under a temporary name, and then give it its own.
+
+    Raises `SparseRobError` where the disk refuses; the error says whether the file has its former content or does not
+    exist.
+    """
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -39,12 +42,12 @@ def write_whole(file: Path, content: bytes) -> None:
 def _stands(file: Path) -> bool:
     try:
         return file.exists()
-    except OSError:  # of a disk that refuses everything
+    except OSError:  # the disk refuses everything
         return False
 
 
 def require_room(directory: Path) -> None:
-    """Raise `InputError` unless files can be written into a run's directory: before what they are to hold is
+    """Raise `InputError` unless files can be written into a run directory; this is asked before their content is
     computed."""
     if not os.access(directory, os.W_OK | os.X_OK):
         raise InputError(f"{directory}: cannot be written to; expected a directory that takes the result, or a copy")
@@ -52,8 +55,10 @@ def require_room(directory: Path) -> None:
 
 @final
 class RunDirectory:
-    """Writes the files of a directory, each whole. One that `create_directory` made is locked until it is left: it is a
-    context manager."""
+    """The writer of the files of a directory; each file is written completely or not at all.
+
+    As a context manager it releases the lock of the directory, which `create_directory` takes.
+    """
 
     def __init__(self, path: Path, lock: Lock | None = None) -> None:
         self.path, self._lock = path, lock
@@ -81,10 +86,26 @@ class RunDirectory:
 
 
 def create_directory(out: str | Path | None, name: str, digest: str, again: str = "") -> RunDirectory:
-    """Make the directory of a run: ``out``, which must be new or empty, else ``runs/<name>/<UTC stamp>-<digest>``; lock
-    it until it is left. A directory that holds the file ``again`` can be gone on with.
+    """Make the directory of a run and lock it.
 
-    Raises `InputError` when it is neither, when another run is writing into it, or when it cannot be written to.
+    Parameters
+    ----------
+    out : str, Path or None
+        The directory, new or empty. Unless given it is ``runs/<name>/<UTC stamp>-<digest>``.
+    name, digest : str
+        The parts of the default name.
+    again : str, default ""
+        The name of a file. A directory that holds it need not be empty.
+
+    Returns
+    -------
+    RunDirectory
+        The writer of the directory, which is locked until the context ends.
+
+    Raises
+    ------
+    InputError
+        If the directory is not empty, if another run writes into it, or if it cannot be written to.
     """
     path = Path(out) if out is not None else _stamped(name, digest)
     lock = Lock(path)
@@ -101,11 +122,27 @@ def create_directory(out: str | Path | None, name: str, digest: str, again: str 
 
 
 def share_directory(out: str | Path, first: str, text: str) -> RunDirectory:
-    """Make a directory that several processes fill at once, each with files of its own, or join the others: ``out``,
-    which must be new or empty, or hold the file ``first``. Who comes first writes ``text`` into it, whole; that of
-    somebody else is left as it is. It is not locked.
+    """Make or join a directory that several processes fill at once, each with files of its own.
 
-    Raises `InputError` when it is neither, or when it cannot be written to.
+    The first process writes the ``text`` into the file ``first`` completely; a file of another process is left as it
+    is. The directory is not locked.
+
+    Parameters
+    ----------
+    out : str or Path
+        The directory, which is new or empty, or holds the file ``first``.
+    first, text : str
+        The name of the first file, and its content.
+
+    Returns
+    -------
+    RunDirectory
+        The writer of the directory.
+
+    Raises
+    ------
+    InputError
+        If the directory holds other files only, or cannot be written to.
     """
     path = Path(out)
     with _faults_of(path):
@@ -115,7 +152,7 @@ def share_directory(out: str | Path, first: str, text: str) -> RunDirectory:
         try:
             temporary.write_text(text, encoding="utf-8", newline="")
             with suppress(FileExistsError):
-                (path / first).hardlink_to(temporary)  # whole, and never in the place of another one: no rename is both
+                (path / first).hardlink_to(temporary)  # complete, and it never replaces a file, as a rename would
         finally:
             temporary.unlink(missing_ok=True)
     return RunDirectory(path)
@@ -123,7 +160,7 @@ def share_directory(out: str | Path, first: str, text: str) -> RunDirectory:
 
 @contextmanager
 def _faults_of(path: Path) -> Iterator[None]:
-    """What the system refuses about a directory, as `InputError`."""
+    """Raise errors of the system about a directory as `InputError`."""
     try:
         yield
     except (FileExistsError, NotADirectoryError) as error:
@@ -133,11 +170,13 @@ def _faults_of(path: Path) -> Iterator[None]:
 
 
 def _require_empty(path: Path, unless: Sequence[str] = ()) -> None:
-    """Raise `InputError` when there are files but those of a lock, unless one of these is among them: of a lock the
-    owner is to be named, and what can be gone on with may hold anything. Files that are just being written under the
-    name of one of these are no others."""
+    """Raise `InputError` where a directory holds files, unless a file among ``unless`` is one of them.
+
+    A lock does not count, as its owner is named elsewhere. A directory that is continued may hold anything. Temporary
+    files of the names ``unless`` do not count either.
+    """
     passing = (LOCK, *(f".{name}." for name in unless if name))
-    # listed before one of these is looked for: who fills the directory at the same moment writes that one first
+    # the files are listed first: a process that fills the directory at the same moment begins with a file of `unless`
     others = any(not file.name.startswith(passing) for file in path.iterdir())
     if others and not any(name and (path / name).exists() for name in unless):
         raise InputError(f"{path}: expected a new or an empty directory, got one that holds files")
@@ -151,13 +190,13 @@ def _stamped(name: str, digest: str) -> Path:
 
 
 def trace_columns(history: Sequence[RoundFinished]) -> dict[str, Any]:
-    """One array per field of `RoundFinished` that is a number or a text, one entry per round."""
+    """Return one array per field of `RoundFinished` that is a number or a text, with one entry per round."""
     plain = [name for name, kind in RoundFinished.__annotations__.items() if kind in ("int", "float", "str", "bool")]
     return {name: np.array([getattr(entry, name) for entry in history]) for name in plain}
 
 
 def finite(data: Any) -> Any:
-    """The same data with null for every number that is not finite, and lists for arrays: what JSON can say."""
+    """Return data in a form that JSON can hold: null for numbers that are not finite, and lists for arrays."""
     if isinstance(data, Mapping):
         return {str(key): finite(value) for key, value in data.items()}
     if isinstance(data, np.ndarray | np.generic):

@@ -1,5 +1,5 @@
-"""The contents of ``certificate.json``: what a run claims, and everything that proves it, without the means that found
-it."""
+"""The contents of ``certificate.json``: the claims of a run and everything that proves them, but not how it was
+found."""
 
 from __future__ import annotations
 
@@ -24,35 +24,59 @@ if TYPE_CHECKING:
     from sparserob_core.control.studies.causal import CausalBound
 
 FORMAT = 1
-MANY_CELLS = 1000  # from which those that are whole pieces, and follow one another, are written as one
-INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
-WELL = 1e-14  # of its distance from the middle: a point that is so far from the boundary needs not be drawn
+MANY_CELLS = 1000  # number of cells from which neighbours that are whole pieces are written as one
+INWARDS = 1.0 - 1e-13  # factor by which points of a curved set are moved inwards, against rounding errors
+WELL = 1e-14  # distance from the boundary at which a point need not be moved, relative to that from the middle
 
 
 def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None:
-    """The certificate of a result, as plain data; ``None`` for a program that is no control problem, and of a run that
-    failed. Of one that was stopped before there was a decision, or before it was transcribed (`bare_certificate`), it
-    holds the lower bound alone.
+    """Return the certificate of a result, as plain data.
 
-    ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a
-    normal direction (of the state, or of the control and its steps), of equalities, and of the control's pieces where
-    the dictionary is not that of their indicators;
-    ``tangent``: the control at which the bound replaces quadratic terms and norms of the cost by their tangents;
-    ``norms``: vectors that it may put in the place of norms, on every piece, where the control's set has slanted sides.
-    ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown, to
-    ``tolerance`` in each row's own unit (decision 0016); a direction ``z`` of a curved set stands for ``z normals``.
-    ``fewest_active``: between what the least share of time lies that any admissible control must act, with the
-    multipliers of a program of its own, or those of the cost where there are none, and with the decision that acts
-    least and its proof where that is another one. Where the cost is the time that the control acts, ``J`` is beside it,
-    and ``tree`` holds the parts of the controls, each with multipliers of its own. ``witness``: what refutes the
-    decision. Under feedback ``decision`` is the nominal control, ``gains (K, K, m, p)`` are what answers the
-    innovations, ``policy`` says which cost is charged and which breakpoints every piece answers, as ranges ``[first,
-    last]`` from 0 on, every constraint with a multiplier is one at a ``disturbance`` (a measurable one jumps at its
-    ``changes``), at a ``deviation`` of the initial state from its centre where there is a set of them, and at a
-    ``noise (K, p)`` of the outputs, of which ``observer (K, d, p)`` makes innovations; ``causal`` is the bound against
-    every causal policy. ``repeat``: the plan begins again at the horizon for ever; its steps across the seam are
-    constraints of ``control_step`` at the horizon, under feedback each at a deviation ``following`` of the next
-    period's initial state too.
+    ``cost`` and ``lower_bound`` are those of ``result.json``. The other keys:
+
+    ``multipliers``
+        They belong to constraints at a time, a parameter and a normal direction (of the state, or of the control and
+        its steps), and to equalities. Others belong to the control's pieces where the dictionary is not that of their
+        indicators. ``tangent`` is the control at which the bound replaces quadratic terms and norms of the cost by
+        their tangents. ``norms`` are vectors that may replace norms, on every piece, where the control's set has
+        slanted sides.
+    ``proof``
+        For each constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown, to a
+        ``tolerance`` in each row's own unit (decision 0016). A direction ``z`` of a curved set stands for ``z
+        normals``.
+    ``fewest_active``
+        The bounds of the least share of time for which any admissible control must act. Their multipliers are those of
+        a program of its own, or those of the cost where there are none. The decision that acts least and its proof are
+        added where this is another one.
+    ``J``, ``tree``
+        Where the cost is the time for which the control acts: the usual cost, and the parts of the controls, each with
+        multipliers of its own.
+    ``witness``
+        The case that refutes the decision.
+    ``repeat``
+        The plan is repeated for ever from the horizon on. Its steps across the seam are constraints of ``control_step``
+        at the horizon. Under feedback each is also at a deviation ``following`` of the next period's initial state.
+
+    Under feedback ``decision`` is the nominal control, and ``gains (K, K, m, p)`` answer the innovations. The
+    ``observer (K, d, p)`` makes innovations of outputs. ``policy`` has the cost that is charged, and the breakpoints
+    that every piece answers, as ranges ``[first, last]`` counted from 0. Every constraint with a multiplier is at a
+    ``disturbance`` (a measurable one jumps at its ``changes``). It is also at a ``deviation`` of the initial state from
+    its centre where there is a set of them, and at a ``noise (K, p)`` of the outputs. ``causal`` is the bound for every
+    causal policy.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    result : Result
+        Its result.
+
+    Returns
+    -------
+    dict or None
+        The certificate; ``None`` for a program that is no control problem, and for a run that failed. A run that was
+        stopped before it was transcribed has the lower bound alone (`bare_certificate`). So has a run that was stopped
+        before there was a decision.
     """
     if isinstance(experiment, PlainExperiment) or result.status == "failed":
         return None
@@ -89,8 +113,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
 
 
 def bare_certificate(experiment: Experiment, result: Result) -> dict[str, Any]:
-    """The certificate of a result of which nothing is proven but its lower bound of 0: no term of a cost is
-    negative."""
+    """Return the certificate of a result of which only the lower bound 0 is proven: no term of a cost is negative."""
     return {
         "format": FORMAT,
         "config": experiment.loaded.config.digest(),
@@ -104,17 +127,19 @@ def bare_certificate(experiment: Experiment, result: Result) -> dict[str, Any]:
 
 
 def _runs(row: np.ndarray) -> list[list[int]]:
-    """The places ``[first, last]`` of the truth values ``(K,)`` that follow one another."""
+    """Return the ranges ``[first, last]`` of consecutive true values among ``(K,)``."""
     turns = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
     return [[int(first), int(end) - 1] for first, end in turns.reshape(-1, 2)]
 
 
 def causal_data(bound: CausalBound) -> dict[str, Any]:
-    """A bound against every causal policy: ``lower_bound``, ``null`` where none exists, the ``signals`` of the
-    disturbance, ``(mw, blocks)`` each, and the ``multipliers`` of constraints under one of them; with the cost
-    ``worst`` the ``shares`` with which the effort under every signal counts. Of outputs with a noise, the ``outputs (K,
-    p)`` beside the nominal ones and the ``initial_states (d,)`` of every signal: its noise is what makes up for the
-    rest."""
+    """Return a bound for every causal policy, as plain data.
+
+    ``lower_bound`` is ``null`` where no policy exists. ``signals`` are disturbances ``(mw, blocks)``, and the
+    ``multipliers`` belong to constraints under one of them. With the cost ``worst`` the ``shares`` are the weights of
+    the effort under every signal. Where outputs have a noise, ``outputs (K, p)`` and ``initial_states (d,)`` are those
+    of every signal. The outputs are relative to the nominal ones, and the noise is the difference that remains.
+    """
     return {
         "lower_bound": bound.lower if np.isfinite(bound.lower) else None,
         "signals": list(bound.signals),
@@ -134,7 +159,8 @@ def causal_data(bound: CausalBound) -> dict[str, Any]:
 
 
 def _counted(experiment: ControlExperiment, result: Result) -> dict[str, Any]:
-    """The multipliers of the cost; or the cost beside the count, and the tree of parts with their multipliers."""
+    """Return the multipliers of the cost; or, where the time of action is the cost, the usual cost and the tree of
+    parts."""
     if result.sparsest is None:
         return {"multipliers": _multipliers(experiment, result.dual)}
     constraints: dict[str, int] = {}
@@ -176,15 +202,19 @@ def _fewest(experiment: ControlExperiment, activity: Activity | None) -> dict[st
 
 
 def _proofs(experiment: ControlExperiment, proofs: Sequence[Proof]) -> dict[str, Any]:
-    """Per constraint; under feedback not of those on the control, which need no cells."""
+    """Return the proof of each constraint; under feedback constraints on the control have none, as they need no
+    cells."""
     about = {one.name for one in experiment.transcription.constraints}
     kept = [one for one in proofs if experiment.transcription.feedback is None or one.family in about]
     return {proof.family: _cells(experiment, proof) for proof in kept if proof.verdict == "proven"}
 
 
 def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | None:
-    """``None`` unless every constraint can be stated in numbers: a sampled one, of the scenario approach, cannot. Under
-    feedback a constraint is one at a disturbance, on its own pieces ``(mw, pieces)``."""
+    """Return the multipliers of a bound with their constraints, as plain data.
+
+    Returns ``None`` unless every constraint can be written in numbers, which is not so for a sample of the scenario
+    approach. Under feedback a constraint is at a disturbance, on its own pieces ``(mw, pieces)``.
+    """
     problem, program = experiment.problem, experiment.program
     z = dual.z if problem.execution is None or dual.z is None else _without_sizes(program, dual.z)
     steps = Steps.of(problem, experiment.control)
@@ -227,15 +257,18 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
 
 
 def _without_sizes(program: SemiInfiniteProgram, z: Array) -> Array:
-    """Multipliers of the images without those that bound the size of every value of the control: of a value from both
-    sides, with opposite signs."""
+    """Return multipliers of the images without those of the bounds of the control's sizes.
+
+    Two bounds limit each value, one from either side; their multipliers enter with opposite signs.
+    """
     size = program.image_size
     above, below = z[-2 * size : -size], z[-size:]
     return np.concatenate([z[:size] - above + below, z[size : -2 * size]])
 
 
 def _on_pieces(problem: OptimalControlProblem, z: Array | None, pieces: int) -> Array | None:
-    """The multipliers of the control ``(m, K)`` on its ``pieces``, those of its set's slanted sides folded in."""
+    """Return the multipliers of the control ``(m, K)`` on its ``pieces``, with those of its set's slanted sides
+    added."""
     if z is None:
         return None
     m, (sides, _) = problem.system.controls, slanted(problem.control)
@@ -245,14 +278,16 @@ def _on_pieces(problem: OptimalControlProblem, z: Array | None, pieces: int) -> 
 
 
 def _of_norms(problem: OptimalControlProblem, z: Array, pieces: int) -> Array:
-    """The multipliers of the control ``(m, K)`` on its ``pieces`` without those of its set's slanted sides: what the
-    bound puts in the place of the norms, which neither the slopes nor the tangent tell closely."""
+    """Return the multipliers of the control ``(m, K)`` on its ``pieces`` without those of its set's slanted sides.
+
+    The bound replaces norms by them; neither slopes nor tangent give them accurately.
+    """
     answer: Array = z[: problem.system.controls * pieces].reshape(-1, pieces)
     return answer
 
 
 def _parameter(problem: OptimalControlProblem, said: TimedExplanation) -> Array:
-    """The parameter of a constraint, certainly inside its set; the middle one for a constraint without uncertainty."""
+    """Return the parameter of a constraint, certainly inside its set; without uncertainty the middle one."""
     bound = problem.system.parameters
     if bound is None:
         return np.zeros(0)
@@ -261,14 +296,14 @@ def _parameter(problem: OptimalControlProblem, said: TimedExplanation) -> Array:
 
 
 def _direction(said: TimedExplanation) -> dict[str, Any]:
-    """The normal; of a mixed constraint with its part on the control, and the piece of that."""
+    """Return the normal of a constraint; for a mixed one also its part on the control, and the piece of that."""
     if said.gain is None:
         return {"direction": said.direction + 0.0}  # no negative zeros
     return {"direction": np.concatenate([said.direction, said.gain]) + 0.0, "piece": said.piece}
 
 
 def _admissible(problem: OptimalControlProblem, said: TimedExplanation) -> Array | None:
-    """The disturbance of a constraint, certainly in its set on every piece; ``None`` without one."""
+    """Return the disturbance of a constraint, certainly in its set on every piece; ``None`` where there is none."""
     bound = problem.disturbance
     if bound is None or said.disturbance is None:
         return None
@@ -277,8 +312,10 @@ def _admissible(problem: OptimalControlProblem, said: TimedExplanation) -> Array
 
 
 def _deviation(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
-    """The deviation of the initial state that a constraint is at, and of the next period's, certainly in their set;
-    nothing without one."""
+    """Return the deviations of the initial states of this and of the next period, certainly in their set.
+
+    The mapping is empty where the constraint has none.
+    """
     bound = problem.initial_set
     if bound is None or said.deviation is None:
         return {}
@@ -288,7 +325,7 @@ def _deviation(problem: OptimalControlProblem, said: TimedExplanation) -> dict[s
 
 
 def _noise(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
-    """The noise ``(K, p)`` that a constraint is at, certainly in its set; nothing without one."""
+    """Return the noise ``(K, p)`` of a constraint, certainly in its set; the mapping is empty where there is none."""
     bound = None if problem.measurements is None else problem.measurements.noise
     if bound is None or said.noise is None:
         return {}
@@ -315,8 +352,11 @@ def _cells(experiment: ControlExperiment, proof: Proof) -> dict[str, Any]:
 
 
 def _joined(lower: Array, upper: Array, first: Array, last: Array) -> tuple[Array, Array]:
-    """Cells of time ``[lower_i, upper_i]``, those that are among ``[first_j, last_j]`` (``(k, 1)``) joined with such
-    neighbours: whoever checks them cuts them where anything turns or jumps."""
+    """Return cells of time ``[lower_i, upper_i]``, where neighbours that are whole pieces are joined.
+
+    Whole pieces are those among ``[first_j, last_j]`` (``(k, 1)``). A check divides the cells wherever the signals have
+    a corner or a jump.
+    """
     order = np.argsort(lower, kind="stable")
     lower, upper = lower[order], upper[order]
     whole = np.isin(lower, first) & np.isin(upper, last)
@@ -349,7 +389,7 @@ def _witness(experiment: ControlExperiment, result: Result) -> dict[str, Any] | 
 
 
 def _driven(experiment: ControlExperiment, said: TimedExplanation, decision: Array) -> TimedExplanation:
-    """The same constraint at the deviations that drive a closed loop to it most, where there is one."""
+    """Return a constraint at the deviations that drive a closed loop to it most, where there is a loop."""
     feedback = experiment.transcription.feedback
     if feedback is None or experiment.problem.disturbance_class != "piecewise_constant":
         return said

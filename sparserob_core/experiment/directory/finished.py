@@ -1,7 +1,7 @@
-"""What a run directory holds, read back as data: the one reader of its files.
+"""The only reader of a run directory: its files as data.
 
-Nothing that a directory names is executed: its config is checked against the components of this distribution and of
-the plugin files that the user names himself (`read_config`), arrays are plain numbers and text (`read_arrays`).
+Nothing that a directory names is executed. Its config is checked against the components of this distribution and of
+plugin files that the user names (`read_config`). Its arrays are plain numbers and text (`read_arrays`).
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ if TYPE_CHECKING:
 
 UNFINISHED = "the run has not finished"
 NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
-ANSWERS = ("gains", "observer")  # how a decision answers what is measured, where it does: states, or outputs
-SAME = 1e-9  # of the largest number of an array, how far it may be from what follows from another
+ANSWERS = ("gains", "observer")  # arrays of a feedback decision: gains, and the observer where outputs are measured
+SAME = 1e-9  # difference that is allowed between dependent arrays, as a share of the largest number of the array
 LARGEST_TEXT = 2**27
-"""Bytes of one JSON file, at most. The largest that runs write have some 10 million; with ten times as many a file
-could take all of a machine."""
+"""Largest number of bytes of a JSON file. The largest that runs write have some 10 million; with ten times the limit a
+file could take all memory of a machine."""
 MOST_ENTRIES, MOST_LISTS = 2**23, 2**21
-"""Commas and brackets in one JSON file, at most, which are told before it is read: a number takes some 50 bytes, a list
-or an object 200. The largest that runs write have a million of either; a file of nothing but empty lists would take 25
-times its size, and the time to make them is not a check's own, which ends when it is told to."""
+"""Largest numbers of commas and of brackets in a JSON file; they are counted before it is read. A number takes some 50
+bytes, a list or an object 200. The largest files that runs write have a million of either. A file of empty lists alone
+would take 25 times its size, and the time limit of a check could not end the reading."""
 LARGE = re.compile(r"[eE]\+?[0-9]{3}|[0-9]{99}")
-"""Without one of these, a number with a point or an exponent is finite."""
+"""A pattern of large numbers: a text without it has only finite numbers with a point or an exponent."""
 IMPOSED = {"multipliers": "f", "times": "f", "indices": "f", "rows": "i", "families": "U"}
-"""What ``solution.npz`` says of every imposed constraint, and the kinds of numpy that say it."""
+"""The columns of ``solution.npz`` for the imposed constraints, with their kinds of numpy."""
 SIMPLE = {"int": "iu", "float": "fiu", "str": "U", "bool": "b"}
-"""Types of the fields of a round that a column of ``trace.npz`` can hold, and the kinds of numpy that serve."""
+"""Types of the fields of a round that a column of ``trace.npz`` can hold, with their kinds of numpy."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class StoredRun:
-    """The files of a run directory, each read when it is first asked for.
+    """The files of a run directory, each read when it is first needed.
 
-    Every property raises `InputError` that names the file when it is missing, cannot be read, or does not fit, among
-    these where its arrays take more than ``largest`` bytes (`LARGEST` unless given).
+    Every property raises `InputError` that names its file, where this is missing, cannot be read or does not fit. It
+    does so too where its arrays take more than ``largest`` bytes (`LARGEST` unless given).
     """
 
     directory: Path
@@ -63,12 +63,12 @@ class StoredRun:
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """``result.json``."""
+        """The contents of ``result.json``."""
         return read_summary(self.directory / "result.json")
 
     @cached_property
     def solution(self) -> dict[str, Array]:
-        """``solution.npz``; empty where there is none."""
+        """The arrays of ``solution.npz``; none where there is no such file."""
         file, arrays = self.directory / "solution.npz", self.arrays("solution.npz")
         for prefix in ("", BOUND):
             columns = {prefix + name: arrays[prefix + name] for name in IMPOSED if prefix + name in arrays}
@@ -85,8 +85,10 @@ class StoredRun:
 
     @cached_property
     def history(self) -> tuple[RoundFinished, ...]:
-        """The rounds: ``trace.npz``, with the decisions and the cuts that ``rounds.npz`` keeps of them. Columns that
-        are no field of `RoundFinished` are passed over: a later version may write more of them."""
+        """The rounds: ``trace.npz``, with the decisions and the cuts in ``rounds.npz``.
+
+        Columns that are no field of `RoundFinished` are ignored: a later version may write more of them.
+        """
         file, trace = self.directory / "trace.npz", self.arrays("trace.npz")
         plain = {name: kind for name, kind in RoundFinished.__annotations__.items() if kind in SIMPLE}
         columns = {name: trace[name] for name in plain if name in trace}
@@ -108,19 +110,23 @@ class StoredRun:
 
     @cached_property
     def cuts(self) -> tuple[Cut, ...]:
-        """The imposed constraints that ``solution.npz`` holds."""
+        """The imposed constraints in ``solution.npz``."""
         return cuts_of(self.solution, self._formulation(self.solution)) if "families" in self.solution else ()
 
     @cached_property
     def proving(self) -> tuple[tuple[Cut, ...], Array]:
-        """The constraints that prove the lower bound, of a policy each at the deviation behind its index, and the
-        multipliers of the equalities; none where ``solution.npz`` does not hold them."""
+        """The constraints that prove the lower bound, and the multipliers of the equalities.
+
+        The index of a policy's constraint is followed by its deviation. There are none where ``solution.npz`` does not
+        hold them.
+        """
         columns = {name.removeprefix(BOUND): one for name, one in self.solution.items() if name.startswith(BOUND)}
         cuts = cuts_of(columns, "literal") if {*CUTS} <= {*columns} else ()
         return cuts, np.ravel(columns.get("equalities", np.zeros(0)))
 
     def _formulation(self, arrays: Mapping[str, Array]) -> Formulation:
-        """What the indices of arrays say whose version did not write it down: it follows from the method."""
+        """Return the formulation of indices in arrays of a version that did not write it; it follows from the
+        method."""
         if not arrays or FORMULATIONS in arrays:
             return "reduced"
         from sparserob_core.experiment.config.reading.reader import read_source
@@ -134,7 +140,7 @@ class StoredRun:
 
     @cached_property
     def evaluations(self) -> SearchTrace | None:
-        """``evaluations.npz``; ``None`` where there is none."""
+        """The search in ``evaluations.npz``; ``None`` where there is no such file."""
         file, arrays = self.directory / "evaluations.npz", self.arrays("evaluations.npz")
         if not arrays:
             return None
@@ -151,19 +157,28 @@ class StoredRun:
         return SearchTrace.stored(arrays)
 
     def arrays(self, name: str) -> dict[str, Array]:
-        """The arrays of one of its ``.npz`` files; none when there is no such file."""
+        """Return the arrays of one of its ``.npz`` files; none where there is no such file."""
         return read_arrays(self.directory / name, self.largest)
 
     def config(self, plugins: Iterable[str | Path] = ()) -> Loaded:
-        """``config.yaml``, see `read_config`."""
+        """Return the checked config of the run, as `read_config` does."""
         return read_config(self.directory, plugins)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """A run directory: its ``experiment``, the decision ``theta (m, N)``, ``summary`` (``result.json``), ``solution``
-    (``solution.npz``), and the files themselves (``stored``)."""
+    """A run directory with a control, and its experiment.
+
+    Parameters
+    ----------
+    stored : StoredRun
+        Its files.
+    experiment : ControlExperiment
+        Its experiment.
+    theta : array (m, N)
+        The coefficients of the control; under feedback of the nominal one.
+    """
 
     stored: StoredRun
     experiment: ControlExperiment
@@ -171,8 +186,10 @@ class FinishedRun:
 
     @cached_property
     def decision(self) -> Array:
-        """The whole decision ``(n,)``: ``theta``, and under feedback the variables of the gains. Raises `InputError`
-        where ``solution.npz`` does not hold it, or where its arrays are not of one decision."""
+        """The whole decision ``(n,)``: ``theta`` and, under feedback, the variables of the gains.
+
+        Raises `InputError` where ``solution.npz`` does not hold it, or where its arrays do not belong to one decision.
+        """
         if self.experiment.transcription.feedback is None:
             found = self.theta.ravel()
         else:
@@ -186,8 +203,10 @@ class FinishedRun:
         return found
 
     def require_certified(self) -> None:
-        """Raise `InputError` where ``certificate.json``, if there is one, is about another control. Whether what it
-        claims of that control is true is for `check` to say."""
+        """Raise `InputError` where ``certificate.json``, if there is one, is about another control.
+
+        The truth of its claims about this control is left to `check`.
+        """
         file = self.directory / "certificate.json"
         said = read_json(file) if file.is_file() else {}
         held = {"decision": self.theta} | {name: self.solution.get(name, np.zeros(0)) for name in ANSWERS}
@@ -203,7 +222,7 @@ class FinishedRun:
                 )
 
     def _agrees(self, decision: Array) -> None:
-        """Raise `InputError` where what ``solution.npz`` holds beside a decision is not what follows from it."""
+        """Raise `InputError` where the other arrays of ``solution.npz`` do not follow from the decision."""
         model = self.experiment.transcription
         followed = {"theta": model.nominal(decision), "control": model.pieces(decision)}
         if model.feedback is not None:
@@ -228,22 +247,22 @@ class FinishedRun:
 
     @property
     def directory(self) -> Path:
-        """Where it is."""
+        """The run directory."""
         return self.stored.directory
 
     @property
     def summary(self) -> Mapping[str, Any]:
-        """``result.json``."""
+        """The contents of ``result.json``."""
         return self.stored.summary
 
     @property
     def solution(self) -> Mapping[str, Array]:
-        """``solution.npz``."""
+        """The arrays of ``solution.npz``."""
         return self.stored.solution
 
 
 def stored_run(directory: str | Path) -> StoredRun:
-    """The run in a directory; raises `InputError` when there is none."""
+    """Return the run in a directory; raises `InputError` where there is none."""
     path = Path(directory)
     for name in ("config.yaml", "result.json"):
         if not (path / name).is_file():
@@ -253,10 +272,25 @@ def stored_run(directory: str | Path) -> StoredRun:
 
 
 def read_config(directory: Path, plugins: Iterable[str | Path] = ()) -> Loaded:
-    """The config of a run directory, checked, as data: the components are those of this distribution and of the files
-    ``plugins``, which the user names, whatever the config says; another one is refused by its name when it is built.
+    """Return the checked config of a run directory, as data.
 
-    Raises `InputError` when it cannot be understood.
+    Parameters
+    ----------
+    directory : Path
+        The run directory.
+    plugins : iterable of str or Path, default ()
+        Files of plugins that the user names. Only their components and those of this distribution are used, whatever
+        the config names. Another component is refused by its name when it is built.
+
+    Returns
+    -------
+    Loaded
+        The config.
+
+    Raises
+    ------
+    InputError
+        If the config cannot be understood.
     """
     from sparserob_core.experiment.config.load import load_config
     from sparserob_core.experiment.plugins.registry import load_own_registry
@@ -269,8 +303,27 @@ def read_config(directory: Path, plugins: Iterable[str | Path] = ()) -> Loaded:
 def read_finished(
     directory: Path, plugins: Iterable[str | Path] = (), experiment: Experiment | None = None
 ) -> FinishedRun:
-    """Read a run directory and build its experiment again, unless ``experiment`` is at hand; raises `InputError` when
-    it is none, holds no control, or a file of it cannot be understood. ``plugins`` as in `read_config`."""
+    """Read a run directory with a control, and build its experiment.
+
+    Parameters
+    ----------
+    directory : Path
+        The run directory.
+    plugins : iterable of str or Path, default ()
+        Files of plugins, as for `read_config`.
+    experiment : Experiment, optional
+        The experiment, where it is built already.
+
+    Returns
+    -------
+    FinishedRun
+        The run.
+
+    Raises
+    ------
+    InputError
+        If the directory is none of a run, holds no control, or has a file that cannot be understood.
+    """
     from sparserob_core.experiment.assemble import assemble
 
     stored = stored_run(directory)
@@ -292,8 +345,11 @@ def read_finished(
 
 
 def read_json(file: Path) -> dict[str, Any]:
-    """The contents of a JSON file; raises `InputError` when it cannot be read, is too large or no object, or holds a
-    number that is not finite: a run writes null where there is none."""
+    """Return the contents of a JSON file.
+
+    Raises `InputError` where it cannot be read, is too large, or is no object. It does so too for a number that is not
+    finite, since a run writes null instead.
+    """
     try:
         data, odd = _read(file)
     except InputError:
@@ -314,7 +370,7 @@ def read_json(file: Path) -> dict[str, Any]:
 
 
 def _read(file: Path) -> tuple[object, bool]:
-    """What a JSON file says, and whether any of its numbers may be too large or none."""
+    """Return the data of a JSON file, and whether any of its numbers may be infinite or NaN."""
     size, odd = file.stat().st_size, list[str]()
     if size > LARGEST_TEXT:
         raise InputError(f"{file}: cannot be read: expected at most {LARGEST_TEXT} bytes, got {size}")
@@ -339,7 +395,7 @@ def _read(file: Path) -> tuple[object, bool]:
 
 
 def _numbers(data: dict[str, Any]) -> Iterator[tuple[str, int | float]]:
-    """Every number of JSON, with the keys that lead to it."""
+    """Yield every number of JSON data, each with its place."""
     stack: list[tuple[str, Any]] = [("", data)]
     while stack:
         place, value = stack.pop()
@@ -352,7 +408,7 @@ def _numbers(data: dict[str, Any]) -> Iterator[tuple[str, int | float]]:
 
 
 def read_summary(file: Path) -> dict[str, Any]:
-    """The contents of ``result.json``; raises `InputError` when it is not the result of a run."""
+    """Return the contents of ``result.json``; raises `InputError` where it is not the result of a run."""
     summary = read_json(file)
     status = summary.get("status")
     if not isinstance(status, str) or status not in MEANING:

@@ -1,4 +1,4 @@
-"""One run at a time in a directory: a lock file that names its owner."""
+"""The lock of a directory, so that one run at a time writes into it: a file that names its owner."""
 
 from __future__ import annotations
 
@@ -13,19 +13,23 @@ from sparserob_core.errors import InputError
 
 NAME = ".lock"
 GUARD = ".lock.takeover"
-TRIES = 3  # to get a lock that others hold and let go of at the same moment
+TRIES = 3  # attempts to take a lock that others take and release at the same moment
 
 
 @final
 class Lock:
-    """The lock of a directory. It is created exclusively, so that of two processes one gets it, and holds the number
-    and the host of its owner; one whose owner was killed on this host is taken over."""
+    """The lock of a directory: a file with the process number and the host of its owner.
+
+    The file is created exclusively, so that only one of two processes gets the lock. A lock whose owner was killed on
+    this host is taken over.
+    """
 
     def __init__(self, directory: Path) -> None:
         self.file = directory / NAME
 
     def acquire(self) -> None:
-        """Raises `InputError` when somebody else holds it, and `OSError` when nothing can be written there."""
+        """Take the lock; raises `InputError` where somebody else holds it, and `OSError` where nothing can be
+        written."""
         for _ in range(TRIES):
             try:
                 self.file.touch(exist_ok=False)
@@ -38,8 +42,10 @@ class Lock:
         raise self._held("")
 
     def _sign(self) -> None:
-        """Write the owner into a lock that was just created; where the disk is full it goes again: one without an
-        owner would keep everybody out."""
+        """Write the owner into a lock that was just created.
+
+        Where the disk is full, the lock is removed: a lock without an owner would exclude everybody.
+        """
         try:
             self.file.write_text(_me(), encoding="utf-8")
         except OSError:
@@ -47,16 +53,17 @@ class Lock:
             raise
 
     def release(self) -> None:
-        """Let go of it; nothing happens where it is somebody else's, or gone."""
+        """Release the lock; nothing happens where it belongs to somebody else, or does not exist."""
         with suppress(OSError):
             if self._content() == _me():
                 self.file.unlink()
 
     def _taken_over(self) -> bool:
-        """Whether the lock of a process that is dead is ours now; not, but it may be free, when it has just vanished.
+        """Return whether this process took over the lock of a process that is dead.
 
-        Only who creates the guard exclusively may replace the lock, and only after having looked again: two that find
-        the same dead owner cannot both get it.
+        The result is false, and the lock may be free, where it has just vanished. Only the process that creates the
+        guard exclusively may replace the lock, and only after a second look at it. Two processes that find the same
+        dead owner therefore cannot both take the lock.
         """
         found = self._content()
         if found is None:
@@ -94,7 +101,7 @@ class Lock:
 
 
 def owner_of(directory: Path) -> tuple[int, str]:
-    """The number of the process that holds the lock of a directory, and its host; 0 and no host where nobody does."""
+    """Return the process that holds the lock of a directory and its host; 0 and an empty text where nobody does."""
     try:
         return _owner((directory / NAME).read_text(encoding="utf-8", errors="replace"))
     except OSError:
@@ -106,7 +113,7 @@ def _me() -> str:
 
 
 def _owner(content: str) -> tuple[int, str]:
-    """The number of the process, 0 where it is not known, and the host."""
+    """Return the number of the process, 0 where it is not known, and the host."""
     try:
         data = json.loads(content)
         return int(data["process"]), str(data["host"])
@@ -119,7 +126,7 @@ def _is_dead(content: str) -> bool:
 
 
 def is_dead(process: int, host: str) -> bool:
-    """Whether the process is known to be gone; of another host nothing is known."""
+    """Return whether a process is known to have ended; nothing is known of a process on another host."""
     if process <= 0 or host != platform.node():
         return False
     try:

@@ -1,4 +1,4 @@
-"""Where a run comes from: what a reader needs, years later, to know what was run, on what, and when."""
+"""The provenance of a run: what a reader needs, years later, to know what was run, where and when."""
 
 from __future__ import annotations
 
@@ -18,9 +18,20 @@ PATIENCE = 5.0  # seconds for git
 
 
 def provenance(plain: Mapping[str, Any], git: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What ``result.json`` says of where a run comes from: the ``hash`` of the resolved config ``plain`` (`identity`),
-    when it ``started`` (UTC), the ``git`` revision of the config's folder (`git_revision`), the ``host``, and the
-    SHA-256 of every plugin file.
+    """Return the entry ``provenance`` of ``result.json``.
+
+    Parameters
+    ----------
+    plain : mapping
+        The resolved config.
+    git : mapping or None
+        The revision of the config's folder (`git_revision`).
+
+    Returns
+    -------
+    dict
+        The ``hash`` of the config (`identity`), the time when the run ``started`` (UTC), the ``git`` revision, the
+        ``host``, and the SHA-256 of every plugin file.
     """
     return {
         "hash": identity(plain),
@@ -37,13 +48,15 @@ def provenance(plain: Mapping[str, Any], git: Mapping[str, Any] | None) -> dict[
 
 
 def cores() -> int:
-    """The processors that this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def git_revision(folder: Path) -> dict[str, Any] | None:
-    """The revision of the folder's git repository, and whether tracked files were ``changed`` since; ``None`` where
-    there is no repository, or no git."""
+    """Return the revision of a folder's git repository, and whether tracked files were ``changed`` since.
+
+    Returns ``None`` where there is no repository, or no git.
+    """
     command = ["git", "-c", "core.fsmonitor=false", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""What a run writes down of its result: the contents of ``result.json`` and ``solution.npz``."""
+"""The contents of ``result.json`` and ``solution.npz``, from the result of a run."""
 
 from __future__ import annotations
 
@@ -27,12 +27,15 @@ from sparserob_core.sip.program import TOLERANCE, EqualityErrors, SemiInfinitePr
 from sparserob_core.sip.result import Result
 
 PROVEN = ("certified", "verified")
-"""Statuses with an upper bound: what is not proven of the constraints is no bound, whatever the search suggests."""
+"""Statuses with an upper bound: without a proof of the constraints the cost is no bound, whatever a search suggests."""
 PACKAGES = ("sparserob", "numpy", "scipy", "piqp", "proxsuite", "clarabel")
 
 
 def summary_of(result: Result, control: Array | None, model: Transcription | None) -> dict[str, Any]:
-    """``result.json`` but for what only the run knows (title, seed, versions); ``model``: of a control problem."""
+    """Return the contents of ``result.json`` except for what only the run knows (title, seed, versions).
+
+    ``control (m, K)`` and ``model`` are those of a control problem.
+    """
     acting = asdict(sparsity(control, model.control.breakpoints)) if control is not None and model is not None else None
     units = {} if model is None else units_of(model, result)
     parameters = () if model is None or model.problem.system.parameters is None else model.problem.system.names
@@ -74,8 +77,11 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
 
 
 def units_of(model: Transcription, result: Result) -> dict[str, Any]:
-    """The units of what is told: of ``time``, of the ``states``, of the ``cost`` and its bounds, of ``J``, of every row
-    of a constraint (``rows``, by its name) and of the ``worst`` violation; nothing where the problem names none."""
+    """Return the units of ``result.json``; none where the problem names none.
+
+    They are those of ``time``, of the ``states``, of the ``cost`` and its bounds, and of ``J``. ``rows`` has those of
+    every row of a constraint, by its name; ``worst`` is that of the worst violation.
+    """
     names = model.problem.names
     if not (names.time or names.state_units or names.control_units):
         return {}
@@ -99,9 +105,12 @@ def units_of(model: Transcription, result: Result) -> dict[str, Any]:
 
 
 def _tolerance(proof: Proof) -> dict[str, Any]:
-    """What was proven of one constraint: that it is exceeded by at most ``proven`` of each row's own unit (negative: a
-    margin), ``kept`` of every row in the user's. ``rows``: the violation of every row that counts as none, in the
-    user's units: at most `TOLERANCE` of its size."""
+    """Return what was proven of one constraint.
+
+    A violation is at most ``proven`` of each row's own unit (negative: a margin), and ``kept`` of every row in the
+    user's units. ``rows`` is the violation of every row that counts as none, in the user's units: at most `TOLERANCE`
+    of its size.
+    """
     share = proof.bound if proof.share is None else proof.share
     return {
         "own": TOLERANCE,
@@ -112,12 +121,13 @@ def _tolerance(proof: Proof) -> dict[str, Any]:
 
 
 def _equalities(errors: EqualityErrors) -> dict[str, Any]:
-    """By how much every fixed final state is ``missed`` at most, and how much of that is ``excused``, in its unit."""
+    """Return the error bound of every fixed final state (``missed``), and the error that is allowed (``excused``), in
+    its unit."""
     return {"missed": errors.missed, "excused": errors.allowed}
 
 
 def _witness(worst: WorstConstraint | None, states: int | None) -> dict[str, Any]:
-    """The worst constraint; an initial state has so many ``states`` as were stated, which are the first ones."""
+    """Return the worst constraint; its initial state has the first ``states`` coordinates, those of the user."""
     return {
         "violation": None if worst is None else worst.violation,
         "constraint": None if worst is None else worst.constraint,
@@ -133,8 +143,10 @@ def _witness(worst: WorstConstraint | None, states: int | None) -> dict[str, Any
 
 
 def control_of(result: Result, program: SemiInfiniteProgram, dictionary: Dictionary | None) -> Array | None:
-    """The control on every piece ``(m, K)`` of the dictionary; ``None`` without a decision or for a program of another
-    kind."""
+    """Return the control ``(m, K)`` on every piece of the dictionary.
+
+    Returns ``None`` without a decision, and for a program of another kind.
+    """
     if result.decision is None or dictionary is None:
         return None
     theta = _nominal(result.decision, program, dictionary)
@@ -142,7 +154,8 @@ def control_of(result: Result, program: SemiInfiniteProgram, dictionary: Diction
 
 
 def _nominal(decision: Array | None, program: SemiInfiniteProgram, dictionary: Dictionary) -> Array:
-    """The coefficients ``(m, N)`` of the control; under feedback of the nominal one, with which a decision begins."""
+    """Return the coefficients ``(m, N)`` of the control; under feedback of the nominal one, with which a decision
+    begins."""
     count = program.channels * dictionary.functions
     return np.asarray(decision)[:count].reshape(program.channels, dictionary.functions)
 
@@ -154,13 +167,31 @@ def arrays_of(
     control: Array | None,
     answers: Mapping[str, Array] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """``solution.npz``: the decision, and for a control problem ``breakpoints``, ``control``, ``theta``; one row per
-    imposed index in ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``,
-    ``families``, ``formulations`` (what its index says) and ``multipliers``; ``worst_disturbance (mw, pieces)`` where
-    the worst constraint has one; as ``bound_indices``, ``bound_rows``, ... the constraints that prove the lower bound,
-    and as ``bound_equalities`` the multipliers of the equalities; under feedback the ``answers``, ``gains (K, K, m,
-    p)`` and of outputs the ``observer (K, d, p)``, and each constraint of the bound at the deviation behind its
-    index."""
+    """Return the arrays of ``solution.npz``.
+
+    Parameters
+    ----------
+    result : Result
+        The result of a run.
+    program : SemiInfiniteProgram
+        Its program.
+    dictionary : Dictionary or None
+        The dictionary of the control, for a control problem.
+    control : array (m, K) or None
+        The control on its pieces.
+    answers : mapping
+        Under feedback ``gains (K, K, m, p)`` and, for outputs, the ``observer (K, d, p)``.
+
+    Returns
+    -------
+    dict of arrays
+        The ``decision``; for a control problem also ``breakpoints``, ``control`` and ``theta``; and the ``answers``.
+        For each imposed index one row of ``times``, ``indices`` (padded with NaN where families differ in dimension),
+        ``rows``, ``families``, ``formulations`` (the meaning of the index) and ``multipliers``. ``worst_disturbance
+        (mw, pieces)`` where the worst constraint has one. The constraints that prove the lower bound are
+        ``bound_indices``, ``bound_rows``, and so on; ``bound_equalities`` are the multipliers of the equalities. Under
+        feedback the index of each constraint of the bound is followed by its deviation.
+    """
     told = _told(result.indices)
     count, width = told["indices"].shape
     arrays = {
@@ -185,7 +216,7 @@ def arrays_of(
 
 
 def _told(cuts: Sequence[Cut]) -> dict[str, Array]:
-    """Constraints as arrays, one row each."""
+    """Return constraints as arrays, one row each."""
     indices = np.full((len(cuts), max((np.size(cut.index) for cut in cuts), default=0)), np.nan)
     for position, cut in enumerate(cuts):
         indices[position, : np.size(cut.index)] = cut.index
@@ -199,7 +230,7 @@ def _told(cuts: Sequence[Cut]) -> dict[str, Array]:
 
 
 def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
-    """Versions of Python and of the packages that decide the numbers."""
+    """Return the versions of Python and of the packages that decide the numbers."""
     found = {package: _version(package) for package in packages}
     return {"python": platform.python_version(), **{name: one for name, one in found.items() if one is not None}}
 
@@ -208,5 +239,5 @@ def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
 def _version(package: str) -> str | None:
     try:
         return metadata.version(package)
-    except Exception:  # noqa: BLE001  not installed, or a broken folder of that name, of which each Python raises its own
+    except Exception:  # noqa: BLE001  not installed, or a broken folder, for which each Python raises another error
         return None

@@ -15,14 +15,17 @@ from sparserob_core.sip.program import Formulation
 
 CUTS = ("families", "indices", "rows", "multipliers")
 FORMULATIONS = "formulations"
-BOUND = "bound_"  # before the names of what solution.npz says of the constraints that prove the bound
-NUMBERS = 500_000  # of all decisions, that a run keeps
+BOUND = "bound_"  # prefix of the arrays in solution.npz for the constraints that prove the bound
+NUMBERS = 500_000  # largest total size of the decisions that a run keeps
 
 
 def round_arrays(history: Sequence[RoundFinished]) -> dict[str, Array]:
-    """``rounds.npz``: the ``decisions (r, n)`` of all rounds and their ``costs (r,)``; of every imposed constraint its
-    round, from 0, in ``rounds (c,)``, and ``families``, ``formulations``, ``indices`` (padded with NaN), ``rows``,
-    ``multipliers``. Nothing, ``{}``, where that is not known or too much.
+    """Return the arrays of ``rounds.npz``.
+
+    They are the ``decisions (r, n)`` of all rounds and their ``costs (r,)``. For every imposed constraint ``rounds
+    (c,)`` has its round, counted from 0; ``families``, ``formulations``, ``indices`` (padded with NaN), ``rows`` and
+    ``multipliers`` describe it. The mapping is empty where a decision is unknown, or the total size of all exceeds
+    `NUMBERS`.
     """
     decisions = [entry.decision for entry in history if entry.decision is not None]
     if not decisions or len(decisions) < len(history) or sum(decision.size for decision in decisions) > NUMBERS:
@@ -47,10 +50,11 @@ def round_arrays(history: Sequence[RoundFinished]) -> dict[str, Array]:
 def with_decisions(
     history: Sequence[RoundFinished], arrays: Mapping[str, Array], before: Formulation = "reduced"
 ) -> tuple[RoundFinished, ...]:
-    """The rounds with what `round_arrays` kept of them, and the cuts that came and went; as they are where nothing was
-    kept. ``before`` as in `cuts_of`.
+    """Return the rounds with the decisions and cuts that `round_arrays` kept, and with the cuts that were added and
+    dropped.
 
-    Raises `KeyError` or `ValueError` for arrays that do not belong to them.
+    The rounds are returned as they are where nothing was kept. ``before`` is that of `cuts_of`. Raises `KeyError` or
+    `ValueError` for arrays that do not belong to the rounds.
     """
     if not arrays:
         return tuple(history)
@@ -80,8 +84,10 @@ def with_decisions(
 
 
 def cuts_of(arrays: Mapping[str, Array], before: Formulation = "reduced") -> tuple[Cut, ...]:
-    """The imposed constraints that ``solution.npz`` or ``rounds.npz`` holds. ``before``: the formulation of their
-    indices in a run of a version that did not write it."""
+    """Return the imposed constraints in the arrays of ``solution.npz`` or ``rounds.npz``.
+
+    ``before`` is the formulation of their indices where an earlier version did not write it.
+    """
     forms = arrays[FORMULATIONS] if FORMULATIONS in arrays else np.full(len(arrays["rows"]), before)
     columns = (arrays[name] for name in CUTS)
     return tuple(

@@ -1,4 +1,4 @@
-"""How sparse a control is in time."""
+"""The sparsity of a control in time."""
 
 from __future__ import annotations
 
@@ -15,9 +15,17 @@ PROVEN, SAME = "L1 is sparsest here: proven", 1e-6
 
 @dataclass(frozen=True)
 class Sparsity:
-    """``active_fraction``: the share of the horizon during which any channel acts; ``switches``: how often a channel
-    changes its value.
+    """The sparsity of a control.
 
+    Parameters
+    ----------
+    active_fraction : float
+        The share of the horizon during which any channel acts.
+    switches : int
+        The number of times that a channel changes its value.
+
+    Notes
+    -----
     Values and changes up to ``1e-6`` of the control's largest value (of 1, if that is larger) count as none.
     """
 
@@ -26,7 +34,7 @@ class Sparsity:
 
 
 def sparsity(control: Array, breakpoints: Array) -> Sparsity:
-    """The `Sparsity` of a control ``(m, K)`` on the pieces between ``breakpoints (K + 1,)``."""
+    """Return the `Sparsity` of a control ``(m, K)`` on the pieces between ``breakpoints (K + 1,)``."""
     threshold = ZERO * max(1.0, float(np.abs(control).max(initial=0.0)))
     active = (np.abs(control) > threshold).any(axis=0)
     lengths = np.diff(breakpoints)
@@ -37,10 +45,11 @@ def sparsity(control: Array, breakpoints: Array) -> Sparsity:
 
 
 def verdict(result: Result) -> str | None:
-    """Whether an optimum of the L1 norm is sparsest: what this result shows of that; ``None`` where it shows nothing.
+    """Return in words whether an optimum of the L1 norm is sparsest, as far as a result shows it; ``None`` where it
+    does not.
 
-    It is proven where no admissible control acts less than an optimum of the usual cost; a control that acts less is
-    told with how much less, in the units of time.
+    It is proven where no admissible control acts less than an optimum of the usual cost. Where a control acts less, the
+    difference is given in the units of time.
     """
     found, known = result.sparsest, result.activity
     if result.status != "certified" or known is None or known.upper is None or not known.norm:

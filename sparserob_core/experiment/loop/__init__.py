@@ -1,1 +1,1 @@
-"""A plan in closed loop: the controller of a config or of a run, and what it does to the system under disturbances."""
+"""Controllers of finished runs, and their simulation in closed loop."""

@@ -31,15 +31,33 @@ def controller(
     seconds: float | None = None,
     plugins: Iterable[str | Path] = (),
 ) -> Controller:
-    """The `Controller` that applies the proven control of a config (a file, a mapping or a problem, which is solved
-    first, without files), of a run's directory, or of what ``sr.run``, or ``sr.solve`` for a problem, returned.
+    """Return a controller that applies the proven control of a config or of a run.
 
-    ``resolve``: what is left of the horizon is solved anew at every step, for about ``seconds`` a step at most (no
-    limit unless given), and the last proven plan goes on where that does not give a better one. Under feedback, where
-    that is too little for a whole program, its nominal control alone is solved anew, for the same gains. What does not
-    depend on the state is then made here, which ``prepared`` tells the seconds of, not in the steps. ``plugins``:
-    files that offer what a run was made with. Raises `InputError` where there is no proven control, or where nothing
-    can be solved anew: with a delay, or a dictionary whose functions are no indicators.
+    Parameters
+    ----------
+    config : str, Path, mapping, OptimalControlProblem or finished run
+        A config or a problem, which is solved first, without files; or a run's directory, or the value of ``sr.run``,
+        or of ``sr.solve`` for a problem.
+    resolve : bool, default False
+        Whether the remaining horizon is solved anew at every step. The last proven plan goes on where that gives no
+        better one. Under feedback only the nominal control is solved anew, for the same gains, where the time is too
+        short for the whole program.
+    seconds : float, optional
+        The approximate limit of the time of one step; none unless given. It needs ``resolve``.
+    plugins : iterable of str or Path, default ()
+        Files of plugins that the run was made with.
+
+    Returns
+    -------
+    Controller
+        The controller. With ``resolve`` everything that does not depend on the state is computed here, not in the
+        steps; its ``prepared`` has the seconds of that.
+
+    Raises
+    ------
+    InputError
+        If there is no proven control. With ``resolve`` also where nothing can be solved anew: with a delay, or a
+        dictionary whose functions are no indicators.
     """
     if not isinstance(resolve, bool | np.bool_):
         raise InputError(path="resolve", expected="true or false", got=f"{resolve!r}")
@@ -51,7 +69,10 @@ def controller(
 
 
 def resolving(experiment: ControlExperiment, seconds: float | None) -> Resolving:
-    """What solves the remaining horizons of an experiment, with its solver and tolerance."""
+    """Return the solver of the remaining horizons of an experiment, with its tolerance and the ``seconds`` of a step.
+
+    Raises `InputError` where the config's method minimises something else than the cost of the problem.
+    """
     counts, letters = counting(experiment.loaded)
     if counts or letters is not None:
         raise InputError(

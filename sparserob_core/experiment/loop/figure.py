@@ -1,4 +1,4 @@
-"""The figure of a study in closed loop: states inside the tube of the plan, and the control that was applied."""
+"""The figure of a study in closed loop: the states in the tube of the plan, and the control that was applied."""
 
 from __future__ import annotations
 
@@ -32,8 +32,10 @@ COLOURS = {
 
 
 def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
-    """Draw loops over the tube of their plan into a file (.png, .pdf, .svg); raises `InputError` when it cannot be
-    written."""
+    """Draw loops over the tube of their plan into a file (.png, .pdf, .svg).
+
+    Raises `InputError` where the file cannot be written.
+    """
     active = stored_active(finished.experiment.transcription, finished.solution)
     status = str(finished.summary["status"])
     data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
@@ -42,12 +44,16 @@ def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
 
 
 def draw_loops(loops: ClosedLoops, data: FigureData) -> Figure:
-    """Every state of the first loops of every law in the tube of the plan, which what is solved anew may leave and has
-    none, below the controls that were applied, and the plan's; of a plan that repeats the first period."""
+    """Return the figure of closed loops.
+
+    It has every state of the first loops of every law in the tube of the plan, and below them the controls that were
+    applied and that of the plan. There is no tube where the horizon is solved anew, since the states may then leave it.
+    For a plan that repeats it shows the first period.
+    """
     states, channels = len(data.drawn_states), len(data.control)
     figure, axes = panels(states + channels, 1.7, extra=0.35)
     for component, ax in zip(data.drawn_states, axes[:states], strict=True):
-        if not loops.resolve:  # control that is solved anew may leave the tube of the first plan, and no wall
+        if not loops.resolve:  # with a new plan, states may leave the tube of the first one, but violate no constraint
             draw_tube(ax, data, component)
         named = set[str]()
         for law, path in loops.paths:

@@ -1,4 +1,4 @@
-"""Close the loop around the exact system: a controller, disturbances of every law, and what they make of each other."""
+"""The simulation in closed loop: a controller and the exact system, under disturbances of every law."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
@@ -34,16 +34,13 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.program import TOLERANCE
 
-if TYPE_CHECKING:
-    pass
-
-LOOPS, RESOLVED_LOOPS = 10, 1  # of every law, unless told
-SHOWN, DRAWN = 400, 3  # times, and loops of every law, that are drawn
+LOOPS, RESOLVED_LOOPS = 10, 1  # numbers of loops of every law by default, without and with a re-solve
+SHOWN, DRAWN = 400, 3  # numbers of times, and of loops of every law, in the figure
 CONTROL, STEP = "control", "control_step"
 ROUNDING = 1e-12  # of the size of the set of controls
 
-# law, disturbance (1, mw, M) of every period, parameter (1, nu), parameters beside the time (1, d, size), state (1, d),
-# noise (K, p) of every period
+# law, disturbance (1, mw, M) of every period, parameter (1, nu), parameters of a system that depends on the time
+# (1, d, size), state (1, d), noise (K, p) of every period
 Drawn = tuple[str, list[Array | None], Array, Array | None, Array | None, list[Array | None]]
 
 
@@ -59,14 +56,44 @@ def loop(
     plugins: Iterable[str | Path] = (),
     notify: Notify = ignore,
 ) -> ClosedLoops:
-    """Run the controller of a finished run (`as_run`) in closed loop: what ``sparserob loop RUN`` does.
+    """Run the controller of a finished run in closed loop, as ``sparserob loop RUN`` does.
 
-    Every constraint's worst case is replayed once, and every law of `simulate` drives ``trajectories`` loops (10, or 1
-    where the remaining horizon is solved anew at every step: ``resolve``, ``seconds`` as for `controller`). A plan that
-    repeats runs for so many ``periods``: each law draws a disturbance for every one, and worst cases take turns. The
-    state moves exactly, and is looked at inside the pieces too. The result is written to ``loop.json`` in the run's
-    directory, and drawn into the file ``out`` when given. Raises `InputError` for a directory that is no finished run
-    with a proven control, or another argument at fault, before anything is written.
+    The worst case of every constraint is replayed once, and every law of `simulate` drives some loops. The state is
+    propagated exactly, and the constraints are also checked within the pieces. The result is written to ``loop.json``
+    in the run's directory.
+
+    Parameters
+    ----------
+    run : str, Path, Outcome or SolvedProblem
+        The run (`as_run`).
+    resolve : bool, default False
+        Whether the remaining horizon is solved anew at every step, as for `controller`.
+    trajectories : int, optional
+        The number of loops of every law; 10 unless given, or 1 with ``resolve``.
+    seed : int, default 0
+        The seed of random numbers.
+    seconds : float, optional
+        The approximate limit of the time of one step, as for `controller`.
+    periods : int, default 1
+        The number of periods, for a plan that repeats. Each law draws a disturbance for every period, and worst cases
+        follow one another.
+    out : str or Path, optional
+        The file of a figure.
+    plugins : iterable of str or Path, default ()
+        Files of plugins that the run was made with.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+
+    Returns
+    -------
+    ClosedLoops
+        The violations, the costs and the times of the steps.
+
+    Raises
+    ------
+    InputError
+        If the directory is no finished run with a proven control, or another argument is at fault. It is raised before
+        anything is written.
     """
     from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
     from sparserob_core.experiment.loop.figure import write_loops
@@ -134,7 +161,7 @@ def _closed(
             if laws[law] <= DRAWN and not period:
                 kept.append((law, states[shown, :, 0].T, closing.applied))
             before, begun = closing.applied[:, -1:].T, states[-1].T.copy()
-            begun[:, model.stated.system.states :] = 0.0  # integrals, and what parameters add, begin anew
+            begun[:, model.stated.system.states :] = 0.0  # integrals, and states that parameters add, begin at 0 again
         spent += [1e3 * one.seconds for one in acting.steps]
         resolved += sum(one.resolved for one in acting.steps)
         uncovered += max(sum(not one.covered for one in acting.steps), int(acting.ever_uncovered))
@@ -175,9 +202,23 @@ def _closed(
 
 
 class _Closing:
-    """What drives a system: a controller, asked at the breakpoints of the control in the order in which they come.
-    ``which``: the pieces of the model's grid that are walked through; ``noise (K, p)``: that of measured outputs;
-    ``begins``: when, for the controller; ``told``: what states are at the parameters beside the time."""
+    """The input of a system: a controller, called at the breakpoints of the control in their order.
+
+    Parameters
+    ----------
+    model : Transcription
+        The problem on its dictionaries.
+    acting : Controller
+        The controller.
+    which : array of int
+        For each piece of the simulation the piece of the model's grid that contains it.
+    noise : array (K, p) or None
+        The noise of measured outputs.
+    begins : float
+        The time at which the period begins, for the controller.
+    told : callable, optional
+        The states at the parameters of a system that depends on the time.
+    """
 
     def __init__(
         self,
@@ -194,7 +235,7 @@ class _Closing:
         self._asked = 0
 
     def __call__(self, number: int, state: Array) -> Array:
-        """The inputs ``(m + constants, 1)`` on a piece that begins in ``state (d, 1)``."""
+        """Return the inputs ``(m + constants, 1)`` on a piece that begins in ``state (d, 1)``."""
         piece, points = int(self.which[number]), self.model.control.breakpoints
         grid = self.model.response.grid
         middle = (grid.breakpoints[piece] + grid.breakpoints[piece + 1]) / 2
@@ -206,7 +247,7 @@ class _Closing:
         return np.asarray(grid.inputs(self.applied)[:, piece, None])
 
     def _measured(self, state: Array) -> Array:
-        """What is measured of a state ``(d,)``."""
+        """Return the measurement of a state ``(d,)``."""
         observer = self.model.observer
         if observer is None:
             return state[: self.model.stated.system.states]
@@ -215,7 +256,8 @@ class _Closing:
 
 
 def _replayed(worst: Mapping[str, Array], beside: ParametersInTime | None, periods: int) -> Iterator[Drawn]:
-    """The worst case of every constraint, under the plan; from period to period they take turns."""
+    """Yield the worst case of every constraint under the plan; in the next period that of the next constraint
+    follows."""
     count = worst["names"].size if worst else 0
     for row in range(count):
         turns = [(row + period) % count for period in range(periods)]
@@ -233,7 +275,7 @@ def _sampled(
     counts: tuple[int, int],
     rng: np.random.Generator,
 ) -> Iterator[Drawn]:
-    """So many loops of every law, of so many periods; one loop where nothing is uncertain."""
+    """Yield some loops of every law, for a number of periods; a single loop where nothing is uncertain."""
     functionals, parameters, (count, periods) = model.functionals, model.parameters, counts
     if not functionals.disturbed and parameters.set is None and model.noise is None and beside is None:
         yield "iid", [None] * periods, np.zeros((1, 0)), None, None, [None] * periods
@@ -253,7 +295,7 @@ def _sampled(
 
 
 def _stepped(model: Transcription, applied: Array) -> float:
-    """By how much the steps of controls ``(k, m)`` that follow one another leave their set at most."""
+    """Return by how much the steps of consecutive controls ``(k, m)`` leave their set at most."""
     step = model.problem.control_step
     return -np.inf if step is None or len(applied) < 2 else float(step.violation(np.diff(applied, axis=0)).max())
 
@@ -261,8 +303,10 @@ def _stepped(model: Transcription, applied: Array) -> float:
 def _violations(
     model: Transcription, finished: FinishedRun, states: Array, times: Array, applied: Array
 ) -> dict[str, float]:
-    """The largest violation of every constraint along states ``(T, d, 1)``, with the control ``(m, K)`` that was
-    applied."""
+    """Return the largest violation of every constraint along states ``(T, d, 1)``.
+
+    ``applied (m, K)`` is the control that was applied.
+    """
     theta = applied.ravel() if model.control.is_indicators else finished.theta.ravel()
     counts: Sequence[ViolationCount] = [_count(one, model, times, theta) for one in model.constraints]
     for position, state in enumerate(states):
@@ -280,7 +324,7 @@ def _count(one: StateConstraint, model: Transcription, times: Array, theta: Arra
 
 
 def _paid(model: Transcription, control: Array) -> float:
-    """The first term of the cost of a control ``(m, K)``."""
+    """Return the first term of the cost of a control ``(m, K)``."""
     problem, prices = model.problem, model.problem.prices(model.control.breakpoints)
     sizes = np.abs(control)
     for block in problem.cost.blocks:

@@ -1,4 +1,4 @@
-"""What a study in closed loop found, and the words that go with it."""
+"""The result of a simulation in closed loop, and the words for it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,51 @@ from sparserob_core.sip.convex_set import Array
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClosedLoops:
-    """Loops of a `Controller` around the exact system, ``loops`` for each law: ``steps`` in all, of which ``resolved``
-    took a control that was solved anew, and ``uncovered`` had a state that the proof does not cover.
+    """Closed loops of a `Controller` and the exact system, under disturbances of every law.
 
-    ``constraints``: the largest violation of each (negative: a margin), with its ``tolerance``, over the breakpoints
-    and times inside every piece; the set of controls is ``control``. ``milliseconds (steps,)`` of every step.
-    ``cost`` is that of the run, ``planned`` the first term of it for the plan's own control (under feedback the nominal
-    one), ``costs (loops,)`` the same term for the control that was applied, law after law. ``paths`` and ``controls``
-    are the first loops of every law, for drawing. ``units``: of the violations, as the config names them;
-    ``cost_unit``: of the cost of the run, ``paid_in``: of
-    that of a control, where they are known.
+    Parameters
+    ----------
+    title : str
+        The title of the run.
+    directory : Path
+        Its directory.
+    status : str
+        Its status.
+    resolve : bool
+        Whether the remaining horizon was solved anew at every step.
+    seed : int
+        The seed of random numbers.
+    laws : mapping
+        The number of loops of every law.
+    constraints : mapping
+        The largest violation of each constraint (negative: a margin) and its tolerance, over the breakpoints and times
+        within every piece. The set of controls is ``control``.
+    milliseconds : array (steps,)
+        The time that every step has taken.
+    resolved : int
+        The number of steps that took a control that was solved anew.
+    uncovered : int
+        The number of steps with a state that the proof does not cover.
+    cost : float
+        The cost of the run.
+    planned : float
+        The first term of the cost for the plan's own control, under feedback the nominal one.
+    costs : array (loops,)
+        The same term for the control that was applied, law after law.
+    seconds : float
+        The seconds that the study has taken.
+    shown : array
+        The times of the figure.
+    paths, controls : sequence
+        The states and the controls of the first loops of every law, for the figure.
+    units : mapping
+        The units of the violations, as the config names them.
+    cost_unit, paid_in : str
+        The units of the cost of the run and of that of a control, where they are known.
+    undrawn : str
+        The reason why there is no figure, where one was asked for.
+    periods : int
+        The number of periods of every loop.
     """
 
     title: str
@@ -49,15 +84,15 @@ class ClosedLoops:
     cost_unit: str = ""
     paid_in: str = ""
     undrawn: str = ""
-    """Why there is no figure, where one was asked for."""
+    """Reason why there is no figure, where one was asked for."""
     periods: int = 1
-    """How often the plan was begun in every loop; costs are those of a period on average."""
+    """Number of periods of every loop; costs are averages over the periods."""
 
     __repr__ = brief
 
     @property
     def steps(self) -> int:
-        """How many steps there were."""
+        """The number of steps."""
         return int(self.milliseconds.size)
 
     @property
@@ -67,17 +102,17 @@ class ClosedLoops:
 
     @property
     def contradicts(self) -> bool:
-        """Whether a loop does what is proven impossible."""
+        """True where a loop contradicts the proof."""
         return bool(self.violated) or self.uncovered > 0
 
     @property
     def paid(self) -> Mapping[str, Array]:
-        """The ``costs`` of every law."""
+        """The ``costs`` of every law, by its name."""
         ends = np.cumsum(list(self.laws.values()))[:-1]
         return dict(zip(self.laws, np.split(self.costs, ends), strict=True))
 
     def summary(self) -> dict[str, Any]:
-        """What ``loop.json`` holds."""
+        """Return the contents of ``loop.json``."""
         median, late = np.quantile(self.milliseconds, [0.5, 0.99]).tolist()
         return {
             "title": self.title,
@@ -110,7 +145,7 @@ class ClosedLoops:
         }
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, str]]]:
-        """Columns and rows for people."""
+        """Return the columns and rows of a table."""
         summary = self.summary()
         time, cost = summary["milliseconds"], summary["cost"]
         unit, paid_in = (f" {one}" if one else "" for one in (self.cost_unit, self.paid_in))
@@ -137,7 +172,7 @@ class ClosedLoops:
         return (), rows
 
     def remarks(self) -> Iterator[str]:
-        """What is to be said beside the numbers."""
+        """Yield the notes below the table."""
         if self.violated:
             yield f"a loop contradicts the proof: it violates {', '.join(self.violated)}; one of the two is wrong"
         elif self.uncovered:

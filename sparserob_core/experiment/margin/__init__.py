@@ -1,1 +1,1 @@
-"""How much uncertainty a problem tolerates."""
+"""Margins: the critical factor on a part of a problem, and the shortest feasible horizon."""

@@ -1,4 +1,4 @@
-"""Above which factor on the disturbance no causal policy exists, beside the margin of a policy."""
+"""The factor on the disturbance above which no causal policy exists, reported with the margin of a policy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.result import Result
 
-BEYOND = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)  # of a factor: how far above the largest that is not excluded one is tried
+BEYOND = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)  # relative distances above the largest factor that is not excluded
 
 
 def causal_upper(
@@ -24,11 +24,29 @@ def causal_upper(
     tools: Tools,
     notify: Notify,
 ) -> tuple[float, Ended | None]:
-    """A factor at which, and above which, no causal policy exists, by checked multipliers, NaN where none was found;
-    and why the search for it ended, ``None`` where there was none.
+    """Return a factor from which on no causal policy exists, proven by checked multipliers.
 
-    A policy for a set serves every smaller one, so that what is excluded at a factor is excluded above. ``model_at``
-    transcribes the problem at a factor, ``results`` are the policy's own runs by their factor.
+    A policy for a set also serves every smaller one, so that a factor that is excluded excludes all larger ones.
+
+    Parameters
+    ----------
+    model_at : callable
+        The transcription of the problem at a factor.
+    scaling : Scaling
+        The problem as a function of the factor.
+    results : dict
+        The runs of the policy, by their factor.
+    tools : Tools
+        The solver and the deadline.
+    notify : callable
+        A function that receives `StudyProgress`.
+
+    Returns
+    -------
+    factor : float
+        The factor; NaN where none was found.
+    ended : str or None
+        The reason for which the search ended; ``None`` where there was none.
     """
     from sparserob_core.experiment.run.events import StudyProgress
 

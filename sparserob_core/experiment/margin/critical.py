@@ -1,5 +1,7 @@
-"""Where a scaled problem ceases to be feasible: one convex program where the factor enters linearly, a root of the
-slack where it does not."""
+"""The factor at which a scaled problem ceases to be feasible.
+
+It is found by one convex program where the factor enters linearly, and as a root of the slack otherwise.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +24,26 @@ from sparserob_core.sip.working.ledger import unproven
 from sparserob_core.sip.working.scaled import largest_factor, least_slack
 
 ROOM = 1e3  # bounds of the slack, in units of the violation without control
-PROBES = 80  # factors at most at which the slack is computed
+PROBES = 80  # largest number of factors at which the slack is computed
 
 
 @final
 @dataclass(frozen=True)
 class Critical:
-    """``found``: the critical factor is between ``good`` (seems feasible) and ``bad`` (seems not); ``always``,
-    ``never`` feasible; or ``unknown``. ``cuts``: the constraints that mattered, in the user's units."""
+    """The critical factor, without proof.
+
+    Parameters
+    ----------
+    status : {"found", "always", "never", "unknown"}
+        ``found``: the factor is between ``good`` and ``bad``. ``always``, ``never``: the problem seems feasible at
+        every factor, or at none. ``unknown``: nothing was found.
+    good, bad : float
+        A factor that seems feasible, and one that seems infeasible.
+    message : str, default ""
+        The message of the program that was solved.
+    cuts : sequence of Cut, default ()
+        The constraints that were active, in the user's units.
+    """
 
     status: Literal["found", "always", "never", "unknown"]
     good: float = np.nan
@@ -47,10 +61,30 @@ def critical_factor(
     notify: Notify,
     seen: dict[float, str],
 ) -> Critical:
-    """Find the critical factor to about ``width``, which is what ordinary runs then have to prove.
+    """Find the critical factor to about ``width``; ordinary runs prove it afterwards.
 
-    ``joined``: the programs in units that do not depend on the factor, where that enters linearly. ``seen`` takes what
-    each factor that is looked at seems to be."""
+    Parameters
+    ----------
+    programs : ParametricProgram
+        The programs by their factor.
+    joined : ParametricProgram or None
+        The programs in units that do not depend on the factor, where it enters linearly.
+    scaling : Scaling
+        The problem as a function of the factor.
+    tools : Tools
+        The solver and the deadline.
+    width : float
+        The accuracy.
+    notify : callable
+        A function that receives `StudyProgress`.
+    seen : dict
+        The factors that were tried; the answer at each is added here.
+
+    Returns
+    -------
+    Critical
+        The factor.
+    """
     if joined is not None:
         found = _by_one_program(joined, scaling, tools, width)
         if found.status != "unknown" or not scaling.nested:
@@ -63,7 +97,7 @@ def critical_factor(
 
 
 def _by_scaled_gains(programs: ParametricProgram, scaling: Scaling, tools: Tools) -> Critical:
-    """Under feedback the gains times the factor take the place of the gains: one program that is linear in both."""
+    """Find the factor under feedback by one program, linear in the factor and in the product of gains and factor."""
     program = programs.program(1.0)
     program = program if program.own_units is None else program.own_units.program
     factor = largest_factor(program, tools, scaling.highest)
@@ -75,7 +109,7 @@ def _by_scaled_gains(programs: ParametricProgram, scaling: Scaling, tools: Tools
 
 
 def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float) -> Critical:
-    """The factor as a decision variable: its two bounds meet at the critical factor."""
+    """Find the factor as a decision variable of one program, whose two bounds meet at the critical factor."""
     program = extreme_program(programs, scaling.sense, scaling.highest)
     result = Exchange(tolerance=max(0.05 * width, 1e-9)).solve(program, replace(tools, regulariser=None))
     tools.deadline.check()
@@ -93,7 +127,7 @@ def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools,
 
 
 def _in_users_units(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> list[Cut]:
-    """The ``cuts`` of a program in its own units in those of the user."""
+    """Return the ``cuts`` of a program in its own units in those of the user."""
     units = {one.name: 1.0 if one.index_units is None else one.index_units for one in program.families}
     return [replace(cut, index=cut.index * units[cut.family]) for cut in cuts]
 
@@ -101,7 +135,7 @@ def _in_users_units(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> list[C
 def _by_slack(
     programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, notify: Notify, seen: dict[float, str]
 ) -> Critical:
-    """A bracket of the factor at which the least relaxation that leaves something feasible changes its sign."""
+    """Find a bracket of the factor at which the least relaxation for feasibility changes its sign."""
 
     def slack(factor: float) -> float:
         value = _slack(programs, factor, tools)
@@ -124,8 +158,10 @@ def _by_slack(
 
 
 def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
-    """The least relaxation of the rows, infinite where the bounds or equalities cannot be met at all, or the system is
-    not defined."""
+    """Return the least relaxation of the rows that makes the program feasible.
+
+    It is infinite where bounds or equalities cannot hold at all, or where the system is not defined.
+    """
     try:
         program = programs.program(factor)
         program = program if program.own_units is None else program.own_units.program
@@ -153,8 +189,11 @@ def _room(program: SemiInfiniteProgram) -> tuple[float, float]:
 def _bracketed(
     slack: Callable[[float], float], good: tuple[float, float], bad: tuple[float, float], width: float
 ) -> Critical:
-    """The rule of false position, aimed half a width beyond the root, towards the end that is further away; halving
-    when that stalls."""
+    """Return a bracket of the root of the slack, by the rule of false position.
+
+    Each point is moved beyond the root, by a fifth of the width, towards the end that is further away. The interval is
+    halved where this stalls.
+    """
     stalled = 0
     for _ in range(PROBES):
         span = abs(bad[0] - good[0])

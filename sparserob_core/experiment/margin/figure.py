@@ -1,4 +1,4 @@
-"""The picture of a margin: the cost against the factor, and where nothing is feasible."""
+"""The figure of a margin: the cost as a function of the factor, and the infeasible factors."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 
 def write_margin_figure(file: Path, found: Margin, varied: Scaling) -> None:
-    """Draw the curve of a margin into a file (.png, .pdf, .svg), which is complete or not there.
+    """Draw the curve of a margin into a file (.png, .pdf, .svg), which is complete or does not exist.
 
-    Raises `InputError` when matplotlib is missing, and when the file cannot be written.
+    Raises `InputError` where matplotlib is missing, and where the file cannot be written.
     """
     look.require_matplotlib()
     with look.style():
@@ -31,8 +31,12 @@ def write_margin_figure(file: Path, found: Margin, varied: Scaling) -> None:
 
 
 def draw_margin(found: Margin, varied: Scaling) -> Figure:
-    """Both bounds of the cost at every point, joined by a chord where the cost is convex in the factor, by a band where
-    it is only monotone; what is proven infeasible is hatched; the upper axis counts in the problem's own unit."""
+    """Return the figure of a margin.
+
+    It has both bounds of the cost at every point. A chord joins the points where the cost is convex in the factor, a
+    band where it is only monotone. The side that is proven infeasible is hatched, and the upper axis is in the unit of
+    the problem.
+    """
     figure, (ax,) = look.panels(1, 2.9)
     proven = [point for point in found.curve if point.status in FEASIBLE]
     factors = np.array([point.factor for point in proven])
@@ -91,20 +95,22 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
 
 
 def least_cost(found: Margin) -> str:
-    """The label of an axis of costs, with their unit where it is known."""
+    """Return the label of an axis of costs, with their unit where it is known."""
     return measured("least cost $J$", found.cost_unit)
 
 
 def _band(factors: Array, lower: Array, upper: Array, rising: bool) -> tuple[Array, Array, Array]:
-    """Between two points the cost is monotone, so it lies between the lower bound at one and the upper bound at the
-    other: a certified band."""
+    """Return the band in which the cost lies: between two points it is monotone.
+
+    It is therefore between the lower bound at one point and the upper bound at the other.
+    """
     x = np.repeat(factors, 2)[1:-1]
     below, above = (lower[:-1], upper[1:]) if rising else (lower[1:], upper[:-1])
     return x, np.repeat(below, 2), np.repeat(above, 2)
 
 
 def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
-    """The proven infeasible side, as a hatched band behind its edge."""
+    """Draw the side that is proven infeasible, as a hatched band beyond its edge."""
     low, high = float(factors.min()), float(factors.max())
     room = 0.12 * max(high - low, 1e-9)
     left, right = low - 0.03 * (high - low), high + 0.03 * (high - low)
@@ -118,7 +124,7 @@ def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
 
 
 def _unit_axis(ax: Axes, found: Margin) -> None:
-    """A second axis in the unit of the problem, where that is a multiple of the factor."""
+    """Draw a second axis in the unit of the problem, where its quantity is a multiple of the factor."""
     share = found.amounts[0] / found.lower if np.isfinite(found.lower) and found.lower > 0 else np.nan
     straight = (
         found.curve

@@ -1,4 +1,4 @@
-"""The shortest horizon that is feasible: scanned and covered, since feasibility is not monotone in the horizon."""
+"""The shortest feasible horizon: horizons are scanned and covered, since feasibility is not monotone in the horizon."""
 
 from __future__ import annotations
 
@@ -25,16 +25,19 @@ from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.result import Result
 
 HORIZON = "horizon"
-SCAN = 16  # equal parts of all horizons that the search begins with, where no curve asks for more
-MOST = 400  # runs that the search takes at most, beside those of the curve
-MET = 4.0  # widths by which the two ends of a finished search may differ
+SCAN = 16  # number of equal parts into which the search first divides all horizons, where no curve asks for more
+MOST = 400  # largest number of runs of the search, without those of the curve
+MET = 4.0  # largest distance of the two ends of a finished search, in widths
 
 
 @final
 @dataclass(eq=False)
 class HorizonSearch:
-    """One search over the horizons up to that of the ``problem``, whose dictionaries keep the number of their pieces.
-    ``width``: how close the two ends are to be, in the unit of time."""
+    """The search over the horizons up to that of the ``problem``.
+
+    Its dictionaries keep the number of their pieces. ``width`` is the distance of the two ends that is asked for, in
+    the unit of time.
+    """
 
     title: str
     problem: OptimalControlProblem
@@ -53,7 +56,10 @@ class HorizonSearch:
         self._cells = Horizons(self._bare, self.control, self.disturbance)
 
     def margin(self, count: int) -> Margin:
-        """The shortest feasible horizon between what is covered and what is proven, with a curve of ``count`` runs."""
+        """Return the shortest feasible horizon, between those that are excluded and one that is proven.
+
+        The margin has a curve of ``count`` runs.
+        """
         started, best, stuck = time.perf_counter(), None, ""
         longest = self.problem.horizon
         scan = longest * np.arange(1, max(count, SCAN) + 1) / max(count, SCAN)
@@ -111,7 +117,7 @@ class HorizonSearch:
         return "undecided", f"what is between {low:.9g} and {self._in(best.factor)} could not be proven: {stuck}"
 
     def _in(self, time: float) -> str:
-        """A time with its unit."""
+        """Return a time with its unit."""
         return f"{time:.9g} {self.problem.names.time}".rstrip()
 
     def _why(self, horizon: float) -> str:
@@ -119,11 +125,13 @@ class HorizonSearch:
         return point.message if point is not None else "the constraints clash"
 
     def _cover(self, scan: list[float]) -> str:
-        """Cover horizons from 0 on by cells on each of which nothing is feasible, until one is feasible; where that did
-        not succeed, why."""
+        """Cover horizons from 0 on by cells in which nothing is feasible, until one is feasible.
+
+        Returns the reason where that did not succeed, else an empty text.
+        """
         starts = [entry.start for entry in self.problem.windows]
         starts.append(self._cells.changes)
-        # windows that begin after 0 part cells: their rows are there beyond only
+        # a window that begins after 0 divides a cell, since its rows exist for longer horizons only
         points = sorted({0.0, *scan, *(start for start in starts if 0.0 < start < self.problem.horizon)})
         cells, best = list(pairwise(points))[::-1], np.inf
         while cells:
@@ -149,7 +157,7 @@ class HorizonSearch:
         return ""
 
     def _stuck(self, low: float, high: float, short: bool) -> str:
-        """Why an interval that was not excluded is not to be halved any more; empty where it is."""
+        """Return the reason why an interval that was not excluded is not halved again; empty where it is."""
         point = self.points[high]
         if point.status not in (*FEASIBLE, "infeasible"):
             return f"the run at {self._in(high)} is {point.status}: {point.message}"
@@ -164,8 +172,11 @@ class HorizonSearch:
         return f"{MOST} runs did not suffice" if len(self.points) > MOST else ""
 
     def _descend(self, low: float, points: list[float]) -> None:
-        """The first feasible one of ``points`` beyond ``low``, and the shortest feasible horizon next to it: what is
-        left to do where horizons could not be covered any further."""
+        """Find the first feasible one of ``points`` beyond ``low``, and by bisection the shortest feasible horizon
+        before it.
+
+        It is used where horizons cannot be covered any further.
+        """
         before = low
         for point in points:
             if self._run(point).status in FEASIBLE:
@@ -176,12 +187,12 @@ class HorizonSearch:
             before = point
 
     def _excluded(self, low: float, high: float) -> bool:
-        """Whether multipliers of a run at one of the ends prove that nothing is feasible in between."""
+        """Return whether multipliers of a run at one of the two ends prove that nothing is feasible between them."""
         known = [self._multipliers(end) for end in (high, low)]
         return any(self._cells.amount(rows, low, high) > 0.0 for rows in known if rows)
 
     def _run(self, horizon: float) -> Point:
-        """An ordinary run at a horizon, remembered."""
+        """Return the run at a horizon, which is made only once."""
         if horizon not in self.points:
             model, result = self._solved(self.problem, horizon, self.told.begin(horizon))
             self.points[horizon] = Point(
@@ -195,7 +206,8 @@ class HorizonSearch:
         return self.points[horizon]
 
     def _multipliers(self, horizon: float) -> list[Multiplier]:
-        """Those that prove a horizon infeasible; without limits on steps, of which a proof on cells knows nothing."""
+        """Return the multipliers that prove a horizon infeasible, without limits on steps, which no proof on cells
+        covers."""
         if horizon not in self._farkas and horizon > 0.0:
             model, result = self._solved(self._bare, horizon)
             self._farkas[horizon] = _multipliers_of(model, result) if result.status == "infeasible" else []
@@ -220,7 +232,35 @@ def horizon_search(
     tolerance: float,
     notify: Notify,
 ) -> HorizonSearch:
-    """The search of a margin of the horizon; raises `InputError` where nothing could be proven."""
+    """Return the search for a margin of the horizon.
+
+    Parameters
+    ----------
+    title : str
+        The title of the experiment.
+    problem : OptimalControlProblem
+        The problem, with the longest horizon.
+    dictionaries : tuple of two Dictionary
+        The dictionaries of control and disturbance.
+    method : Exchange
+        The method of the runs.
+    tools : Tools
+        The solver and the deadline.
+    tolerance : float
+        The distance of the two ends that is asked for, relative to the longest horizon.
+    notify : callable
+        A function that receives the events of the search.
+
+    Returns
+    -------
+    HorizonSearch
+        The search.
+
+    Raises
+    ------
+    InputError
+        If the plan repeats or has integral constraints, or if nothing could be proven of the problem.
+    """
     width = tolerance * problem.horizon
     if problem.repeat:
         raise InputError(
@@ -240,8 +280,10 @@ def horizon_search(
 
 
 def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
-    """What proves that a horizon is infeasible, row by row; rows of a curved set of controls are not needed, since the
-    least value over that set is taken."""
+    """Return the multipliers that prove a horizon infeasible, row by row.
+
+    Rows of a curved set of controls are left out, since the proof takes the least value over that set.
+    """
     problem, found = model.problem, []
     starts = {one.name: one.start for one in model.constraints[: len(problem.path)]}  # terminal sets come after them
     shares = model.control.breakpoints / model.control.horizon

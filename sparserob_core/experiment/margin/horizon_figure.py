@@ -1,4 +1,4 @@
-"""The picture of a margin of the horizon: the cost at scanned horizons, and the horizons that are excluded."""
+"""The figure of a margin of the horizon: the cost at scanned horizons, and the horizons that are excluded."""
 
 from __future__ import annotations
 
@@ -17,16 +17,21 @@ if TYPE_CHECKING:
 
 
 def write_horizon_figure(file: Path, found: Margin) -> None:
-    """Draw the curve of fuel against time into a file (.png, .pdf, .svg), which is complete or not there; raises
-    `InputError` when matplotlib is missing, and when the file cannot be written."""
+    """Draw the curve of cost against horizon into a file (.png, .pdf, .svg), which is complete or does not exist.
+
+    Raises `InputError` where matplotlib is missing, and where the file cannot be written.
+    """
     look.require_matplotlib()
     with look.style():
         look.write_figure(file, draw_horizons(found))
 
 
 def draw_horizons(found: Margin) -> Figure:
-    """Both bounds of the cost at every scanned horizon, not joined, since nothing is claimed in between; crosses where
-    nothing is feasible, and a hatched band over the horizons that are all excluded."""
+    """Return the figure of a margin of the horizon.
+
+    It has both bounds of the cost at every scanned horizon, which are not joined, since nothing is claimed between
+    them. Crosses mark horizons that are infeasible or not decided, and a hatched band those that are all excluded.
+    """
     figure, (ax,) = look.panels(1, 2.9)
     proven = [point for point in found.curve if point.status in FEASIBLE]
     horizons = np.array([point.factor for point in proven])

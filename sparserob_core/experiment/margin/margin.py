@@ -1,4 +1,4 @@
-"""How much of something a problem bears: the critical factor, certified from both sides, and the cost on the way."""
+"""The margin of an experiment: a critical factor with proofs from both sides, and the cost at other factors."""
 
 from __future__ import annotations
 
@@ -46,21 +46,49 @@ def margin(
     notify: Notify = ignore,
     observers: Iterable[Observer] = (),
 ) -> Margin:
-    """The margin of an experiment: what ``sparserob margin CONFIG key=value ... --of OF`` does, of a config, a
-    problem, or a run (`as_config`).
+    """Find the critical factor of an experiment, as ``sparserob margin CONFIG key=value ... --of OF`` does.
 
-    ``of``: ``disturbance``, ``parameters``, ``initial_state`` or ``execution`` (the largest factor that is feasible;
-    sets are scaled about their centre), ``path.0``, ``terminal.0`` or ``control`` (the smallest), ``path.0.from`` (the
-    earliest start of a window, in the unit of time), or ``horizon`` (the shortest that is feasible, up to the
-    config's; the number of pieces is kept, and feasibility is not monotone, so that horizons are scanned and covered).
-    ``tolerance``: how close the two sides are to be, relative to the factor, or to 1 if that is larger (for a window
-    to its end, for the horizon to the config's). ``curve``: the cost at so many factors on the feasible side, each by
-    a run of its own; at so many horizons, feasible or not. ``out``: a new or empty directory for ``margin.json`` and
-    ``margin.png``; with ``write`` and none given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives
-    `StudyProgress`. ``observers`` watch it as a study of one axis, whose points are found on the way, from
-    `SweepStarted` to `SweepFinished`. An interrupt, and the limit ``limits.seconds`` of the config, end the search
-    with what it has proven by then, ``undecided``. Raises `InputError` when an argument or the config is at fault, and
-    `TimeLimitError` when the limit comes before there is anything to solve.
+    Parameters
+    ----------
+    config : str, Path, mapping, OptimalControlProblem or finished run
+        The config, a problem, or a run (`as_config`).
+    of : str, default "disturbance"
+        The part of the problem that is scaled. The largest feasible factor is searched for ``disturbance``,
+        ``parameters``, ``initial_state`` and ``execution``; sets are scaled about their centre. The smallest is
+        searched for ``path.0``, ``terminal.0``, ``integral.0``, ``control`` and ``control_step``. ``path.0.from`` gives
+        the earliest start of a window, in the unit of time. ``horizon`` gives the shortest feasible horizon up to the
+        config's, with the same number of pieces. Feasibility is not monotone in it, so that horizons are scanned and
+        covered.
+    overrides : mapping or iterable of str, optional
+        Changes of the config.
+    tolerance : float, default 1e-6
+        The distance of the two sides that is asked for: relative to the factor, or to 1 if that is larger. For a window
+        it is relative to its end, for the horizon to the config's.
+    curve : int, default 0
+        The number of factors on the feasible side at which the cost is computed, each by a run of its own. For the
+        horizon the number of horizons, feasible or not.
+    out : str or Path, optional
+        The directory for ``margin.json`` and ``margin.png``, new or empty.
+    write : bool, default False
+        Whether to write ``runs/NAME-margin/STAMP-HASH`` where ``out`` is not given.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+    observers : iterable of Observer, default ()
+        Observers of the search. They receive the events of a study with one axis, from `SweepStarted` to
+        `SweepFinished`; its points are added when they are found.
+
+    Returns
+    -------
+    Margin
+        The margin. An interrupt and ``limits.seconds`` of the config end the search; the margin then has what is proven
+        so far, with the status ``undecided``.
+
+    Raises
+    ------
+    InputError
+        If an argument or the config is at fault.
+    TimeLimitError
+        If the limit comes before there is anything to solve.
     """
     if not hasattr(tolerance, "__float__") or not 1e-9 <= tolerance <= 0.1:
         raise InputError(f"tolerance: expected a number from 1e-9 to 0.1, got {tolerance!r}")
@@ -95,14 +123,14 @@ def margin(
         raise
     finally:
         rows, seconds = dict(search.told.rows), search.told.seconds
-        with suppress(KeyboardInterrupt):  # it ends the observers; the search is over, and its directory free
+        with suppress(KeyboardInterrupt):  # an interrupt ends the observers: search and directory are finished
             broadcast(
                 SweepFinished(rows=rows, seconds=seconds, stopped=stopped, pressed=deadline.pressed, answer=answer)
             )
 
 
 def _opening(search: MarginSearch | HorizonSearch, directory: Path) -> SweepStarted:
-    """What observers of a margin hear first: a study of one axis that knows no point yet."""
+    """Return the first event for observers of a margin: a study of one axis without points."""
     scaled = None if isinstance(search, HorizonSearch) else search.scaling
     return SweepStarted(
         title=f"{search.title}: margin of {search.told.of}",
@@ -116,13 +144,14 @@ def _opening(search: MarginSearch | HorizonSearch, directory: Path) -> SweepStar
 
 
 def summary_of_margin(found: Margin) -> dict[str, Any]:
-    """``margin.json``: every field but the directory; numbers that are not finite become null."""
+    """Return the contents of ``margin.json``: every field but the directory, with null for numbers that are not
+    finite."""
     summary: dict[str, Any] = finite(asdict(replace(found, directory=None)))
     return {name: value for name, value in summary.items() if name != "directory"}
 
 
 def margin_rows(found: Margin) -> list[tuple[str, str]]:
-    """What a user wants to know of a margin, as rows of a table."""
+    """Return the results of a margin as rows of a table."""
     rows = [("status", f"{found.status}: {found.message}")]
     unit = f" {found.cost_unit}" if found.cost_unit else ""
     if found.of == HORIZON:
@@ -149,7 +178,7 @@ def margin_rows(found: Margin) -> list[tuple[str, str]]:
 
 
 def curve_rows(found: Margin) -> list[tuple[str, str, str, str]]:
-    """The curve of a margin as rows of a table: factor or horizon, status, and both bounds of the cost."""
+    """Return the curve of a margin as rows of a table: factor or horizon, status, and both bounds of the cost."""
 
     def number(value: float) -> str:
         return f"{value:.9g}" if np.isfinite(value) else "-"
@@ -185,7 +214,7 @@ def _search(loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Not
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control, disturbance, policy=policy))
     joined: ParametricProgram | None = None
-    if chosen.affine and policy is None:  # programs at several factors become one: in the units of the factor 1
+    if chosen.affine and policy is None:  # one program for all factors, in the units of the factor 1
         own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
         joined = ParametricProgram(lambda factor: like(own, units.of_problem(accumulated(chosen.at(factor)))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)
@@ -206,8 +235,10 @@ def _search(loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Not
 
 
 def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:
-    """For every entry of ``path`` and of ``terminal`` in the config, the sets of the problem that it became: none, one
-    or several."""
+    """Return for every entry of ``path`` and of ``terminal`` in the config the positions of its sets in the problem.
+
+    An entry may have become no set, one or several.
+    """
     factory = loaded.registry.build("problem", loaded.config.problem.name, loaded.config.problem.options)
     if not isinstance(factory, ProblemKeys):
         return [[i] for i in range(len(problem.path))], [[i] for i in range(len(problem.terminal))]
@@ -219,7 +250,7 @@ def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[lis
 
 
 def _restricts(one: Any) -> bool:
-    """Whether a set or an equality is more than the whole space: a problem drops those that are not."""
+    """Return whether a set or an equality is more than the whole space; a problem drops those that are not."""
     if hasattr(one, "fixed"):
         return bool(one.fixed.size)
     flat = one.halfspaces()
@@ -232,15 +263,20 @@ def _counted(kept: Sequence[Sequence[bool]]) -> list[list[int]]:
 
 
 def _method(loaded: Loaded) -> Exchange:
-    """The exchange of the config, or one with its defaults: a margin asks what is feasible, not how another method
-    fares."""
+    """Return the exchange method of the config, or one with default options where the config has another method.
+
+    A margin asks which factors are feasible, not how well another method performs.
+    """
     entry = loaded.config.method
     built = loaded.registry.build("method", entry.name, entry.options)
     return built if isinstance(built, Exchange) else Exchange()
 
 
 def _written(directory: RunDirectory, found: Margin, varied: Scaling | None) -> Margin:
-    """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
+    """Write the files of a margin, and return it with its directory.
+
+    The figure is an extra: where it cannot be drawn, the numbers are written all the same, and there is a warning.
+    """
     if len(found.curve) > 1:
         from sparserob_core.experiment.margin.figure import write_margin_figure
         from sparserob_core.experiment.margin.horizon_figure import write_horizon_figure

@@ -1,4 +1,4 @@
-"""The runs of a margin, told as the points of a study that is found on the way."""
+"""The runs of a margin, reported as the points of a study that finds its points as it proceeds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from sparserob_core.sip.result import Status, relative_gap
 @final
 @dataclass(frozen=True)
 class Point:
-    """An ordinary run at one factor: what was proven of it, and the bounds of the cost (infinite where infeasible)."""
+    """An ordinary run at one factor: its status, and the bounds of the cost, which are infinite where it is
+    infeasible."""
 
     factor: float
     amount: float
@@ -31,8 +32,10 @@ class Point:
 
 @final
 class Points:
-    """Tells ``notify`` of every run of a search over factors of something: that it begins, how its bounds move, and its
-    answer. ``rows``: what was told, by the number of the run."""
+    """The reports of every run of a search over factors: its beginning, the changes of its bounds, and its answer.
+
+    They are sent to ``notify``. ``rows`` has the answers by the number of the run.
+    """
 
     def __init__(self, of: str, notify: Notify) -> None:
         self.of, self.notify = of, notify
@@ -41,15 +44,15 @@ class Points:
 
     @property
     def seconds(self) -> float:
-        """Seconds since the search began."""
+        """The seconds since the search began."""
         return time.monotonic() - self.began
 
     def say(self, text: str) -> None:
-        """Words of what is looked for."""
+        """Report what is searched, in words."""
         self.notify(StudyProgress(text=text))
 
     def begin(self, factor: float) -> Notify:
-        """A run at a factor begins: what is to receive its events."""
+        """Report the beginning of a run at a factor; returns the function that receives its events."""
         place, self.count = self.count, self.count + 1
         text = f"{self.of} at {factor:.9g} is run"
         self._tell(text, found=[(float(factor),)], now=[place], running=1)
@@ -62,7 +65,7 @@ class Points:
         return Bounds(moved).receive
 
     def end(self, point: Point) -> None:
-        """The answer of the run that has begun last."""
+        """Report the answer of the run that began last."""
         place, proven = self.count - 1, np.isfinite(point.upper_bound)
         gap = relative_gap(point.lower_bound, point.upper_bound)
         told = {"status": point.status, "message": point.message, "cost": point.upper_bound if proven else None}

@@ -1,4 +1,4 @@
-"""What a margin varies: one set or window of a problem, as a function of a single number."""
+"""The part of a problem that a margin scales, a set or a window, as a function of one number."""
 
 from __future__ import annotations
 
@@ -17,22 +17,36 @@ from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.sip.convex_set import Array
 
 Sense: TypeAlias = Literal["largest", "smallest"]
-LARGEST = 1e6  # factors beyond are not looked at
-MOST_UNCERTAIN = 1024.0  # the same for factors on a set of parameters, whose matrices change with them
+LARGEST = 1e6  # the largest factor that is tried
+MOST_UNCERTAIN = 1024.0  # the largest factor on a set of parameters, which changes the matrices
 CONTROL = "factor on the control set"
-SHORT = 1e-9  # of a window, what is left of it where a control must last in it
-POINT = 1e-6  # the factor of a curved set that stands for 0: such a set has an interior
+SHORT = 1e-9  # share of a window that must remain where a control is held over several intervals in it
+POINT = 1e-6  # the factor that replaces 0 for a curved set, which must have an interior
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """``at(factor)`` is the problem with ``of`` changed by the factor; ``at(1)`` is the problem as it was, except for a
-    window's start.
+    """A problem as a function of one factor.
 
-    ``sense``: whether the *largest* or the *smallest* feasible factor is asked for. ``affine``: the right-hand sides
-    and bounds of the program are affine in the factor, and nothing else depends on it. Factors are in ``[0, highest]``;
-    ``amount(factor)`` is what it comes to of ``quantity``. ``label`` says of what it is a factor.
+    Parameters
+    ----------
+    of : str
+        The part of the problem that changes.
+    label : str
+        The factor in words, for figures.
+    sense : {"largest", "smallest"}
+        The feasible factor that is searched.
+    at : callable
+        The problem at a factor. ``at(1)`` is the original problem, except for the start of a window.
+    quantity : str
+        The quantity that changes.
+    amount : callable
+        The amount of the quantity at a factor.
+    affine : bool, default True
+        Whether the right-hand sides and bounds of the program are affine in the factor, and nothing else depends on it.
+    highest : float
+        The end of the interval ``[0, highest]`` of factors.
     """
 
     of: str
@@ -44,23 +58,39 @@ class Scaling:
     affine: bool = True
     highest: float = LARGEST
     relative: bool = True
-    """Whether the factor multiplies something; otherwise it is itself an amount of ``quantity``: a time."""
+    """Whether the factor multiplies a quantity; otherwise it is itself an amount of ``quantity``: a time."""
     nested: bool = True
-    """Whether a feasible factor makes every smaller (for the largest) or greater one (for the smallest) feasible
-    too."""
+    """Whether a feasible factor implies that every smaller one (for the largest) or larger one (for the smallest) is
+    feasible too."""
     cost_unit: str = ""
-    """Of the cost, where the problem names one."""
+    """Unit of the cost, where the problem names one."""
     unit: str = ""
-    """Of the quantity, where it is that of some states of several units alone."""
+    """Unit of the quantity, where only some of the states, which have different units, determine it."""
 
 
 def scaling(
     problem: OptimalControlProblem, of: str, members: Sequence[Sequence[int]], ends: Sequence[Sequence[int]]
 ) -> Scaling:
-    """The scaling named ``of``. ``members`` and ``ends``: for every entry of ``path`` and of ``terminal`` in a config,
-    its positions in the problem.
+    """Return the scaling named ``of``.
 
-    Raises `InputError` when there is no such thing to vary, with the nearest name, or when it cannot be scaled.
+    Parameters
+    ----------
+    problem : OptimalControlProblem
+        The problem.
+    of : str
+        The part that changes.
+    members, ends : sequence
+        For every entry of ``path`` and of ``terminal`` in a config its positions in the problem.
+
+    Returns
+    -------
+    Scaling
+        The problem as a function of the factor.
+
+    Raises
+    ------
+    InputError
+        If the problem has no such part (the message has the most similar name), or the part cannot be scaled.
     """
     choices = dict(_choices(problem, members, ends))
     if of in choices:
@@ -82,7 +112,7 @@ def scaling(
 
 
 def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
-    """The same with the unit behind its quantity, where the problem names one for all that it may be of."""
+    """Return a scaling with the unit of its quantity, where the problem names a single one for it."""
     names = problem.names
     of_states = joined(set(names.state_units)) if len(set(names.state_units)) == 1 else ""
     unit = {
@@ -122,7 +152,7 @@ def _choices(
 
 
 def _set(problem: OptimalControlProblem, of: str, label: str, sense: Sense, quantity: str) -> Scaling:
-    """A set of the problem, which is the field ``of``."""
+    """Return the scaling of a set, the field ``of`` of the problem."""
     resized = _resizing(of, getattr(problem, of))
     return Scaling(
         of, label, sense, lambda f: replace(problem, **{of: resized(f)}), quantity, lambda f: _reach(resized(f))
@@ -130,7 +160,7 @@ def _set(problem: OptimalControlProblem, of: str, label: str, sense: Sense, quan
 
 
 def _listed(problem: OptimalControlProblem, field: str, of: str, positions: Sequence[int]) -> Scaling:
-    """Some constraints of a list of the problem, those that one entry of a config has made."""
+    """Return the scaling of the constraints of a list of the problem that come from one entry of a config."""
     entries = list(getattr(problem, field))
     resized = {i: _resizing(of, entries[i]) for i in positions}
 
@@ -160,7 +190,7 @@ def _parameters(problem: OptimalControlProblem) -> Scaling:
 
 
 def _initial_state(problem: OptimalControlProblem) -> Scaling:
-    """The set of deviations about the centre, where there is one; else the initial state itself."""
+    """Return the scaling of the set of deviations about the centre, or of the initial state where there is no set."""
     bound = problem.initial_set
     if problem.repeat:
         raise InputError(
@@ -173,7 +203,7 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
             "initial_state",
             "factor on the set of initial states",
             "largest",
-            # about the centre, which is no deviation, not about the middle of the deviations
+            # scaled about the centre, which is the deviation 0, not about the middle of the deviations
             lambda f: replace(problem, initial_set=bound.in_units(one / f) if f > 0.0 else None),
             "largest deviation of x_i(0)",
             _times(float(reach.max())),
@@ -195,7 +225,7 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
 
 
 def _of_largest(problem: OptimalControlProblem, sizes: Array) -> str:
-    """The unit of the states with the largest of the ``sizes (d,)``, where these share one."""
+    """Return the unit of the states with the largest of the ``sizes (d,)``, where they have the same one."""
     known, largest = problem.names.state_units, np.flatnonzero(sizes == sizes.max()).tolist()
     units = {known[one] for one in largest if known}
     return units.pop() if len(units) == 1 else ""
@@ -204,7 +234,7 @@ def _of_largest(problem: OptimalControlProblem, sizes: Array) -> str:
 def _control(problem: OptimalControlProblem) -> Scaling:
     paths = problem.windows
     named = [i for i, entry in enumerate(paths) if entry.name == "control"]
-    if named:  # where the rate is the control, the bounds of the control itself are constraints of the augmented state
+    if named:  # where the rate is the input, the bounds of the control are constraints of the augmented state
         return replace(_listed(problem, "path", "control", named), label=CONTROL)
     return _set(problem, "control", CONTROL, "smallest", "largest |u_i|")
 
@@ -219,7 +249,7 @@ def _execution(problem: OptimalControlProblem) -> Scaling:
         lambda f: replace(problem, execution=np.minimum(f * shares, 1.0)),
         "largest share of a command",
         _times(most),
-        affine=False,  # a factor times the sizes of the decision
+        affine=False,  # the factor multiplies the sizes of the decision
         highest=1.0 / most,
     )
 
@@ -252,14 +282,17 @@ def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int])
 
 
 def _bounds(value: Any) -> ConvexSet:
-    """A set, or that of a constraint."""
+    """Return a set, or the set of a constraint."""
     bounds: ConvexSet = getattr(value, "bounds", value)
     return bounds
 
 
 def _resizing(of: str, value: Any) -> Callable[[float], Any]:
-    """A set, or a constraint, scaled by a factor about its middle; raises `InputError` for a single point, and for a
-    set without a middle. A curved set stays curved, however small the factor."""
+    """Return a function that scales a set, or a constraint, by a factor about its middle.
+
+    A curved set stays curved, however small the factor. Raises `InputError` for a single point, and for a set without a
+    middle.
+    """
     try:
         bound = _bounds(value)
     except InputError as error:
@@ -287,7 +320,10 @@ def _times(base: float) -> Callable[[float], float]:
 
 
 def _half_width(bound: ConvexSet) -> float:
-    """Of the widest side that is bounded; where a set is free on one side of every coordinate, the largest bound."""
+    """Return half the width of the widest bounded side.
+
+    It is the largest bound where a set is free on one side of every coordinate.
+    """
     axes = np.eye(bound.dimension)
     sides = np.stack([bound.support(axes), bound.support(-axes)])
     widths = sides.mean(axis=0)

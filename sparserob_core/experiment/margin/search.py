@@ -1,4 +1,4 @@
-"""Both sides of a critical factor, each proven by an ordinary run, and the cost on the feasible side."""
+"""The proof of a critical factor from both sides, each by an ordinary run, and the cost on the feasible side."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sparserob_core.sip.working.ledger import prover_of
 
 Answer: TypeAlias = Literal["certified", "unbounded", "infeasible", "undecided"]
 FEASIBLE: tuple[Status, ...] = ("certified", "verified")
-# how far from the critical factor a run is tried, in widths, until its answer is proven
+# Distances from the critical factor, in widths, at which runs are tried until an answer is proven.
 STEPS = (
     0.25,
     1.0,
@@ -38,37 +38,67 @@ STEPS = (
     16.0,
     64.0,
 )
-# The same where only what the constraints that matter exclude is run: ends that are small beside what moves the state
-# are told apart no more closely.
+# Distances that are tried only where the active constraints alone exclude the factor. Terminal sets that are small in
+# relation to the motion of the state are not resolved more finely.
 FARTHER = (*STEPS, 256.0, 1024.0, 4096.0)
 
 
 Sides: TypeAlias = tuple[Answer, str, Point | None, Point | None]
-"""An answer, its message, and the runs that prove the feasible side and the other one."""
+"""An answer, its message, and the runs that prove the feasible and the infeasible side."""
 
 
 @final
 @dataclass(frozen=True)
 class Margin:
-    """The critical factor lies in ``[lower, upper]``.
+    """The critical factor of a problem, which lies in ``[lower, upper]``, with the runs that prove it.
 
-    Where the ``sense`` is *largest* (``disturbance``, ``parameters``, ``initial_state``) there is a proven feasible
-    control at ``lower``, and a checked Farkas certificate that there is none at ``upper``; where it is *smallest* (sets
-    that are enlarged, starts of windows) it is the other way round. ``feasible`` and ``infeasible`` are the two runs
-    that say so. ``quantity`` is what a factor comes to in the units of the problem: ``amounts`` of it at ``lower`` and
-    at ``upper``. ``status``: ``certified`` (both sides are proven); ``unbounded`` (feasible as far as was looked: up to
-    the factor ``lower``, or for the smallest down to 0); ``infeasible`` (at every factor; ``message`` says why);
-    ``undecided`` (a side could not be proven). ``curve``: runs on the feasible side, by factor. ``directory``: where it
-    was written to, if it was.
+    Parameters
+    ----------
+    title : str
+        The title of the experiment.
+    of : str
+        The part of the problem that is scaled.
+    sense : {"largest", "smallest"}
+        The feasible factor that is searched. ``largest`` (``disturbance``, ``parameters``, ``initial_state``,
+        ``execution``): a control is proven feasible at ``lower``, and a checked Farkas certificate excludes any at
+        ``upper``. ``smallest`` (sets that are enlarged, starts of windows): the other way round.
+    quantity : str
+        The quantity that a factor changes, with its unit.
+    status : {"certified", "unbounded", "infeasible", "undecided"}
+        ``certified``: both sides are proven. ``unbounded``: feasible as far as the search went, up to the factor
+        ``lower``, or down to 0 for the smallest. ``infeasible``: at every factor. ``undecided``: a side could not be
+        proven.
+    message : str
+        The explanation of the status.
+    lower, upper : float
+        The bounds of the factor.
+    amounts : tuple of float
+        The quantity at ``lower`` and at ``upper``, in the units of the problem.
+    feasible, infeasible : Point or None
+        The two runs that prove the bounds.
+    curve : tuple of Point
+        Runs on the feasible side, by factor.
+    remarks : tuple of str
+        Warnings.
+    seconds : float
+        The seconds that the search has taken.
+    directory : Path or None
+        The directory that was written, if there is one.
+    covered : tuple
+        Of the horizon: the cells that fill ``(0, lower]``.
+    causal_upper : float
+        Under a policy, of the disturbance: no causal policy exists at this factor and above.
+    causal_ended : str or None
+        The reason why no smaller such factor was searched (as in ``result.json``); ``None`` where there was no search.
+    cost_unit : str
+        The unit of the cost and its bounds, where the problem names one.
 
-    Of the ``horizon``, where feasibility is not monotone: nothing is feasible at any horizon in ``(0, lower]``, which
-    the cells ``covered`` fill, each proven by one set of multipliers with the horizon as a parameter; at ``upper`` a
-    control is proven, the shortest for which one was found. ``infeasible``: no horizon up to the config's is feasible.
-    ``curve``: runs at equally spaced horizons, feasible or not.
-
-    Under a policy, of the ``disturbance``: at ``causal_upper`` and above no causal policy exists; ``causal_ended`` says
-    why no smaller factor was sought (as in ``result.json``), ``None`` where none was. ``cost_unit``: of the cost and
-    its bounds, where the problem names one.
+    Notes
+    -----
+    Feasibility is not monotone in the ``horizon``. Nothing is feasible at any horizon in ``(0, lower]``: one set of
+    multipliers, with the horizon as a parameter, proves it on each of the cells ``covered``. At ``upper`` a control is
+    proven, at the shortest horizon for which one was found. ``infeasible`` then means that no horizon up to the
+    config's is feasible. ``curve`` has runs at equally spaced horizons, feasible or not.
     """
 
     title: str
@@ -97,11 +127,34 @@ class Margin:
 @final
 @dataclass(eq=False)
 class MarginSearch:
-    """One search. ``programs``: those of ordinary runs, by their factor; ``joined``: the same in units that do not
-    depend on it, where the factor enters linearly. ``cuts``: the constraints that matter at the critical factor, in the
-    user's units. ``width``: how close the two sides are to be, relative to the factor
-    if that is above 1. ``beyond``: what tells, of the ``results`` by their factor, above
-    which factor nothing exists that answers the disturbance in whatever way, and why no smaller one was sought."""
+    """The search of one margin.
+
+    Parameters
+    ----------
+    title : str
+        The title of the experiment.
+    programs : ParametricProgram
+        The programs of ordinary runs, by their factor.
+    joined : ParametricProgram or None
+        The programs in units that do not depend on the factor, where it enters linearly.
+    scaling : Scaling
+        The problem as a function of the factor.
+    method : Exchange
+        The method of the runs.
+    tools : Tools
+        The solver and the deadline.
+    width : float
+        The distance of the two sides that is asked for, relative to the factor where this is above 1.
+    told : Points
+        The reports of the runs.
+    points, seen, results : list, dict, dict
+        The runs, the factors that were tried without proof, and the results by their factor.
+    cuts : sequence of Cut
+        The constraints that are active at the critical factor, in the user's units.
+    beyond : callable, optional
+        A function of the ``results``. It returns the factor from which no causal policy exists, and the reason why no
+        smaller one was searched.
+    """
 
     title: str
     programs: ParametricProgram
@@ -118,7 +171,7 @@ class MarginSearch:
     beyond: Callable[[dict[float, Result]], tuple[float, Ended | None]] | None = None
 
     def margin(self, count: int) -> Margin:
-        """The margin, with a curve of ``count`` points."""
+        """Return the margin, with a curve of ``count`` points."""
         started, curve = time.perf_counter(), tuple[Point, ...]()
         sides: Sides | None = None
         try:
@@ -166,16 +219,22 @@ class MarginSearch:
         )
 
     def _found(self) -> Critical:
-        """The critical factor; of a largest one the factor 0 is run before, so that a search that is ended early knows
-        whether anything is feasible."""
+        """Return the critical factor.
+
+        For a largest factor the factor 0 is run first, so that a search that ends early knows whether anything is
+        feasible.
+        """
         if self.scaling.sense == "largest" and self.scaling.nested and self.run(0.0).status == "infeasible":
             return Critical("never")
         asked = self.programs, self.joined, self.scaling, self.tools, self.width
         return critical_factor(*asked, self.told.notify, self.seen)
 
     def _known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[Point, ...]]:
-        """What an interrupted search knows: both sides where they were proven before, else the runs nearest to each
-        other that prove one side each; and every proven run on the feasible side, as a curve."""
+        """Return the sides that an interrupted search knows, and every proven run on the feasible side as a curve.
+
+        They are both sides where these were proven before. Otherwise they are the nearest two runs of which each proves
+        one side.
+        """
         proven = sorted((one for one in self.points if one.status in FEASIBLE), key=lambda one: one.factor)
         if sides is not None:
             return (sides[0], f"{sides[1]}; no more of the curve: {said}", *sides[2:]), tuple(proven)
@@ -214,7 +273,7 @@ class MarginSearch:
         return "certified", f"beyond it: {bad.message}", good, bad
 
     def _never(self, found: Critical) -> Sides:
-        """Nothing is feasible: the run at the kindest factor says why."""
+        """Return the sides where nothing is feasible; the run at the most favourable factor says why."""
         kindest = {"largest": 0.0, "smallest": self.scaling.highest}[self.scaling.sense] if self.scaling.nested else 1.0
         refused = self.run(kindest)
         if refused.status != "infeasible":
@@ -227,11 +286,11 @@ class MarginSearch:
         return "infeasible", f"{at}nothing is feasible: {refused.message}", None, refused
 
     def _proven(self, factor: float, outward: float, wanted: tuple[Status, ...]) -> Point | None:
-        """The nearest run beside the critical factor that proves what is wanted of that side."""
+        """Return the run nearest to the critical factor whose status is one of those ``wanted`` on that side."""
         width = self.width * (max(1.0, abs(factor)) if self.scaling.affine else 1.0)
         tried = [float(np.clip(factor + outward * step * width, 0.0, self.scaling.highest)) for step in FARTHER]
         first = None
-        if "infeasible" in wanted:  # a run where nothing says so yet looks long for what it cannot find
+        if "infeasible" in wanted:  # without this test, a run too close to the critical factor would take very long
             first = next((i for i, beside in enumerate(tried) if self._excludes(beside)), None)
         begun = () if first is None else self.cuts
         for beside in tried[: len(STEPS)] if first is None else tried[first:]:
@@ -241,7 +300,7 @@ class MarginSearch:
         return None
 
     def _excludes(self, factor: float) -> bool:
-        """Whether the constraints that matter at the critical factor alone leave nothing at another one."""
+        """Return whether the active constraints at the critical factor alone are infeasible at another factor."""
         if not self.cuts:
             return False
         program = self.programs.program(factor)
@@ -253,12 +312,24 @@ class MarginSearch:
         return relaxed.solve(rows, 0.0).status == "infeasible"
 
     def _close(self, begun: Sequence[Cut], program: SemiInfiniteProgram, tools: Tools) -> Result:
-        """The run of a program in its own units that has ``begun`` with these constraints."""
+        """Return the result of a program in its own units, whose run begins with the constraints ``begun``."""
         return self.method.close(program, tools, prover_of(program, tools), shifted(begun, 0.0, program))
 
     def run(self, factor: float, begun: Sequence[Cut] = ()) -> Point:
-        """An ordinary run at a factor, made once, that has ``begun`` with these constraints; a factor at which the
-        problem is not defined fails."""
+        """Run the problem at a factor, unless that was done before.
+
+        Parameters
+        ----------
+        factor : float
+            The factor.
+        begun : sequence of Cut, default ()
+            Constraints with which the run begins.
+
+        Returns
+        -------
+        Point
+            The answer; ``failed`` where the problem is not defined at the factor.
+        """
         for point in self.points:
             if point.factor == factor:
                 return point
@@ -278,7 +349,7 @@ class MarginSearch:
         return point
 
     def _curve(self, feasible: Point, status: Answer, count: int) -> tuple[Point, ...]:
-        """Runs from the feasible side of the critical factor to no uncertainty, or to a set twice as large."""
+        """Return runs from the feasible side of the critical factor to no uncertainty, or to a set twice as large."""
         if count == 0:
             return ()
         if self.scaling.sense == "largest":

@@ -1,1 +1,1 @@
-"""Components by name: hooks, records, discovery, and the built-in ones."""
+"""Components by name: hooks, records, discovery, and the components of the core."""

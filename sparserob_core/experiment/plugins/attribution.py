@@ -1,5 +1,4 @@
-"""Attributes errors to components: what foreign code raises, or returns in spite of its kind, becomes one error that
-names the component."""
+"""Attribution of errors to components: an error in foreign code becomes one that names the component."""
 
 from __future__ import annotations
 
@@ -12,13 +11,16 @@ from sparserob_core.sip.maximiser import SearchEnded
 
 Answer = TypeVar("Answer")
 SHOWN = 80
-PASSING = (SparseRobError, SearchEnded)  # these say themselves what is wrong
+PASSING = (SparseRobError, SearchEnded)  # errors with a message of their own
 
 
 @contextmanager
 def attributed(origin: str, what: str, but: tuple[type[Exception], ...] = PASSING) -> Iterator[None]:
-    """Whatever is raised inside, `SystemExit` too, becomes a `PluginError` that names the component ``origin`` and what
-    it was doing. The errors ``but`` and Ctrl-C pass."""
+    """Raise every error inside the context, `SystemExit` included, as a `PluginError`.
+
+    It names the component ``origin`` and ``what`` it was doing. The errors ``but`` and an interrupt are raised as they
+    are.
+    """
     passing: tuple[type[BaseException], ...] = (KeyboardInterrupt, *but)
     try:
         yield
@@ -30,7 +32,29 @@ def attributed(origin: str, what: str, but: tuple[type[Exception], ...] = PASSIN
 
 
 def asked(origin: str, what: str, question: Callable[[], object], expected: type[Answer]) -> Answer:
-    """The answer of a component, of the type that its kind must return; anything else is its `PluginError`."""
+    """Return the answer of a component, where it has the type that its kind must return.
+
+    Parameters
+    ----------
+    origin : str
+        The name of the component in messages.
+    what : str
+        The call, in words.
+    question : callable
+        The function that asks the component.
+    expected : type
+        The type of the answer.
+
+    Returns
+    -------
+    object
+        The answer.
+
+    Raises
+    ------
+    PluginError
+        If the component raises an error, or its answer has another type.
+    """
     with attributed(origin, what):
         answer = question()
     if not isinstance(answer, expected):
@@ -39,9 +63,9 @@ def asked(origin: str, what: str, question: Callable[[], object], expected: type
 
 
 def short_repr(value: object) -> str:
-    """A short text of a value that foreign code made, whose ``repr`` may fail too."""
+    """Return a short text of a value from foreign code, whose ``repr`` may fail too."""
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # noqa: BLE001  a foreign repr
+    except Exception:  # noqa: BLE001  a foreign repr may raise anything
         text = f"a {type(value).__name__}"
     return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."

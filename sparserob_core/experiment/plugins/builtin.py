@@ -1,4 +1,4 @@
-"""The framework's own components, registered like anybody else's."""
+"""The components of the core, registered like those of any other plugin."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ RULES = "sparserob_core.sip.rules"
 
 @hookimpl
 def sparserob_methods() -> Iterator[MethodPlugin]:
-    """The exchange method and two baselines."""
+    """Yield the methods of the core: exchange, the paper's algorithm, two for fewer active pieces, and two
+    baselines."""
     yield MethodPlugin(
         name="exchange",
         factory="sparserob_core.sip.methods.exchange:Exchange",
@@ -52,7 +53,7 @@ def sparserob_methods() -> Iterator[MethodPlugin]:
 
 @hookimpl
 def sparserob_solvers() -> Iterator[SolverPlugin]:
-    """Whoever is quickest, and the method that needs nobody else's code."""
+    """Yield the automatic choice of a solver, and the dual Newton method, which needs no other package."""
     yield SolverPlugin(
         name="auto",
         factory="sparserob_core.sip.solver:Auto",
@@ -67,7 +68,7 @@ def sparserob_solvers() -> Iterator[SolverPlugin]:
 
 @hookimpl
 def sparserob_rules() -> Iterator[RulePlugin]:
-    """Those of the paper's loop, and others in their places."""
+    """Yield the rules of the paper's loop, and alternatives to them."""
     yield RulePlugin(name="geometric", factory=f"{RULES}:Geometric", summary="Regu: a constant factor, 1/2 by default.")
     yield RulePlugin(
         name="accelerating", factory=f"{RULES}:Accelerating", summary="Regu: the j-th power of a factor in iteration j."
@@ -109,7 +110,7 @@ def sparserob_rules() -> Iterator[RulePlugin]:
 
 @hookimpl
 def sparserob_problems() -> Iterator[ProblemPlugin]:
-    """The general linear problem."""
+    """Yield the general linear problem."""
     yield ProblemPlugin(
         name="linear",
         factory="sparserob_core.experiment.config.problems:LinearProblem",

@@ -21,7 +21,7 @@ DISABLE = "SPARSEROB_DISABLE_PLUGINS"
 
 @dataclass(frozen=True)
 class Failure:
-    """A plugin that could not be used, and why."""
+    """A plugin that could not be loaded, and the reason."""
 
     plugin: str
     reason: str
@@ -32,14 +32,14 @@ class Failure:
 
 @dataclass(frozen=True)
 class Part:
-    """The ``kind`` of an option that is a component itself, and the class ``of`` those that will do."""
+    """An option that is a component itself: its ``kind``, and the class ``of`` which it must be."""
 
     kind: str
     of: type | None = None
 
 
 def _clash(first: Plugin, second: Plugin) -> str:
-    """Two records of one name: who registered them, and what disables one of them and leaves the other."""
+    """Return the error of two records with one name: their plugins, and the setting that disables one of them."""
     who = [f"by plugin '{one.plugin}'" + (f" ({one.source})" if one.source else "") for one in (first, second)]
     apart = [*sorted(second.switches - first.switches), *sorted(first.switches - second.switches)]
     mend = f"disable one of them, for example {DISABLE}={apart[0]}" if apart else "rename one, or leave one out"
@@ -48,7 +48,7 @@ def _clash(first: Plugin, second: Plugin) -> str:
 
 @cache
 def parts(model: type[Options]) -> dict[str, Part]:
-    """The options that are components themselves, by name, as `sparserob_core.options.part` says."""
+    """Return the options that are components themselves, by name, as `sparserob_core.options.part` marks them."""
     extras = {key: field.json_schema_extra for key, field in model.model_fields.items()}
     return {
         key: Part(str(extra["component"]), _class(str(extra["of"])) if "of" in extra else None)
@@ -65,10 +65,10 @@ def _class(place: str) -> type:
 
 @final
 class Registry:
-    """Every registered component. ``failures``: the plugins that could not be used; ``hint``: what to add where a name
-    is unknown.
+    """All registered components.
 
-    Raises `UnknownPluginError` when two records of one kind share a name.
+    ``failures`` are the plugins that could not be loaded. ``hint`` is added to the error for an unknown name. Raises
+    `UnknownPluginError` where two records of one kind share a name.
     """
 
     def __init__(
@@ -88,19 +88,49 @@ class Registry:
         known[record.name] = record
 
     def names(self, kind: str, of: type | None = None) -> list[str]:
-        """The registered names of a kind, sorted; with a class, of those that may be ``of`` it."""
+        """Return the registered names of a kind, sorted.
+
+        Parameters
+        ----------
+        kind : str
+            The kind.
+        of : type, optional
+            A class. Only components that may be instances of it are named.
+
+        Returns
+        -------
+        list of str
+            The names.
+        """
         known = self._records[record_type(kind).kind]
         return sorted(name for name, record in known.items() if of is None or record.may_be(of))
 
     def records(self) -> Iterator[Plugin]:
-        """Every record, by kind and name."""
+        """Yield every record, by kind and name."""
         for kind in RECORDS:
             for name in self.names(kind):
                 yield self._records[kind][name]
 
     def get(self, kind: str, name: str, of: type | None = None) -> Plugin:
-        """The record of that name, with a class only ``of`` it; raises `UnknownPluginError` with the nearest known
-        names and every plugin that failed."""
+        """Return the record of a name.
+
+        Parameters
+        ----------
+        kind, name : str
+            The component.
+        of : type, optional
+            A class. The component must be one that may be an instance of it.
+
+        Returns
+        -------
+        Plugin
+            The record.
+
+        Raises
+        ------
+        UnknownPluginError
+            If there is none; the message has the most similar names and every plugin that failed.
+        """
         found = self._records[record_type(kind).kind].get(name)
         if found is not None and (of is None or found.may_be(of)):
             return found
@@ -108,8 +138,24 @@ class Registry:
         raise UnknownPluginError(f"no {what} is named '{name}'{nearest(name, self.names(kind, of))}{self.notes()}")
 
     def check(self, kind: str, name: str, options: Mapping[str, object]) -> tuple[Options | None, list[Complaint]]:
-        """The typed options, or what is wrong with them. An option that is itself a component is spelt out with its own
-        options."""
+        """Return the typed options of a component, and the errors in them.
+
+        An option that is a component itself is written out with its own options.
+
+        Parameters
+        ----------
+        kind, name : str
+            The component.
+        options : mapping
+            The options as they stand in a config.
+
+        Returns
+        -------
+        typed : Options or None
+            The options; ``None`` where there is an error.
+        wrong : list of Complaint
+            The errors.
+        """
         from pydantic import ValidationError
 
         record = self.get(kind, name)
@@ -121,7 +167,7 @@ class Registry:
                 given[key], faults = self._spelt_out(part, entry)
                 wrong += [fault.under((key,)) for fault in faults]
                 if faults:
-                    del given[key]  # what is wrong with it is said
+                    del given[key]  # its errors are reported already
         try:
             with attributed(record.origin, "checking its options", but=(SparseRobError, ValidationError)):
                 checked = model.model_validate(given, context={"registry": self})
@@ -130,8 +176,8 @@ class Registry:
         return (None if wrong else checked), wrong
 
     def _spelt_out(self, part: Part, entry: str | Mapping[str, Any]) -> tuple[object, list[Complaint]]:
-        """A component within another one's options as a mapping with its name and all its options, and what is wrong
-        with it."""
+        """Return a component within another one's options as a mapping with its name and all its options, and the
+        errors."""
         name, options = (
             (entry, {})
             if isinstance(entry, str)
@@ -148,7 +194,25 @@ class Registry:
         return (entry if checked is None else {"name": name, **checked.model_dump(mode="json", by_alias=True)}), wrong
 
     def build(self, kind: str, name: str, options: Mapping[str, object] | None = None) -> Any:
-        """The component, built from its options; raises `InputError` that names every option at fault."""
+        """Return a component, built from its options.
+
+        Parameters
+        ----------
+        kind, name : str
+            The component.
+        options : mapping, optional
+            The options as they stand in a config.
+
+        Returns
+        -------
+        object
+            The component.
+
+        Raises
+        ------
+        InputError
+            If options are at fault; the message names each of them.
+        """
         checked, wrong = self.check(kind, name, options or {})
         if checked is None:
             raise InputError("\n".join(f"{kind} {name}: {complaint}" for complaint in wrong))
@@ -160,7 +224,7 @@ class Registry:
         return self.get(kind, name).create(checked.model_copy(update=inner))
 
     def _part(self, part: Part, entry: Mapping[str, Any]) -> object:
-        """A component within another one's options, behind the check of its kind."""
+        """Return a component within another one's options, wrapped in the check of its kind."""
         record = self.get(part.kind, entry["name"], part.of)
         built = self.build(part.kind, entry["name"], {key: entry[key] for key in entry if key != "name"})
         if part.of is not None and not isinstance(built, part.of):
@@ -168,8 +232,10 @@ class Registry:
         return guarded(built, record.origin)
 
     def find(self, name: str) -> list[Plugin]:
-        """The records called ``name``, or ``kind.name``; raises `UnknownPluginError` with the nearest names when there
-        are none."""
+        """Return the records called ``name``, or ``kind.name``.
+
+        Raises `UnknownPluginError` with the most similar names where there are none.
+        """
         found = [record for record in self.records() if name in {record.name, f"{record.kind}.{record.name}"}]
         if not found:
             known = {record.name for record in self.records()}
@@ -179,7 +245,8 @@ class Registry:
         return found
 
     def notes(self) -> str:
-        """Why a name may be missing, a line each: plugins that failed, that are disabled, or that are not loaded."""
+        """Return the reasons why a name may be missing, one line each: plugins that failed, are disabled, or are not
+        loaded."""
         notes = [f"\n  note: {failure}" for failure in self.failures]
         notes += [f"\n  note: plugin '{plugin}' is disabled by {DISABLE}" for plugin in self._disabled]
         return "".join([*notes, f"\n  note: {self._hint}" if self._hint else ""])

@@ -1,7 +1,8 @@
-"""Plugins that are single files, as modules: ``sparserob_core.experiment.plugins.files.<file>``, ``<file>`` being its
-path in hexadecimal digits.
+"""Plugins that are single files, as modules.
 
-A component of such a file can be sent to another process like any other: the name of its module says where it is.
+The name of such a module is ``sparserob_core.experiment.plugins.files.<file>``, where ``<file>`` is ``x`` and the path
+in hexadecimal digits. A component of the file can thus be sent to another process, for the name of its module contains
+the place of the file.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import final
 
-__path__: list[str] = []  # what makes a module have modules below it
+__path__: list[str] = []  # an attribute that makes this module a package, so that modules can be below it
 
 
 def load(file: Path) -> ModuleType:
-    """The module of a file, executed anew."""
+    """Return the module of a file, executed anew."""
     name = f"{__name__}.x{os.fsencode(file).hex()}"
     sys.modules.pop(name, None)
     return importlib.import_module(name)
@@ -31,7 +32,7 @@ class _Finder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """The file that a name of this kind spells."""
+        """Return the specification of the file that the name of such a module contains; ``None`` for other names."""
         parent, _, name = fullname.rpartition(".")
         if parent != __name__:
             return None

@@ -1,4 +1,4 @@
-"""Thin checks around foreign components: what they raise, or return in spite of their kind, becomes an error that names
+"""Checks around foreign components: an error that they raise, or an answer of the wrong type, becomes one that names
 them."""
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ NUMBER = (int, float, np.integer, np.floating)
 
 
 def guarded(component: Component, origin: str) -> Component:
-    """The component behind the check of its kind; itself where its kind has none, or where it is the core's own, whose
-    faults are internal errors.
+    """Return a component wrapped in the check of its kind; messages call it ``origin``.
 
-    ``origin`` is what messages call it.
+    A component is returned as it is where its kind has no check, and where it belongs to the core, whose faults are
+    internal errors.
     """
     module = type(component).__module__
     own = module.startswith("sparserob_core.") and not module.startswith(FILES)
@@ -49,12 +49,15 @@ def guarded(component: Component, origin: str) -> Component:
 
 
 def unguarded(component: object) -> object:
-    """The component behind its check: a policy is part of what was solved, and is asked for its class and options."""
+    """Return the component within its check.
+
+    A policy is part of the problem that was solved, and its own class and options are needed.
+    """
     return component.behind if isinstance(component, _Policy) else component
 
 
 def origin_of(kind: str, component: object) -> str:
-    """What messages call a component that was handed over as an object."""
+    """Return the name in messages of a component that was given as an object."""
     return f"{kind} {type(component).__name__} ({type(component).__module__})"
 
 
@@ -91,7 +94,7 @@ class _Dictionary(DictionaryFactory):
 
 @final
 class _Policy(Policy):
-    """What it answers, `sparserob_core.control.policies.policy.answers_of` checks."""
+    """A checked policy; `sparserob_core.control.policies.policy.answers_of` checks its answers."""
 
     def __init__(self, policy: Policy, origin: str) -> None:
         self.behind, self.origin = policy, origin
@@ -125,7 +128,7 @@ class _Method(Method):
             raise PluginError(
                 f"{self.origin}: solve returned the decision {short_repr(decision)}, expected {program.n} numbers"
             )
-        if result.status in CLAIMS:  # proofs and multipliers are not made anew here, but by `check`
+        if result.status in CLAIMS:  # proofs and multipliers are derived anew by `check`, not here
             name = self.origin.partition(" (")[0]
             return replace(result, message=f"{result.message}; what the {name} claims is believed")
         return result
@@ -183,7 +186,7 @@ class _Solver(Solver):
 
 @final
 class _Maximiser(Maximiser):
-    """`sparserob_core.sip.search.search.maximise` checks what it returns, and calls it by its ``origin``."""
+    """A maximiser with its name in messages; `sparserob_core.sip.search.search.maximise` checks its answer."""
 
     @property
     def scaled(self) -> bool:  # type: ignore[override]
@@ -233,7 +236,7 @@ class _Regulariser(Regulariser):
 
 
 def _rule(kind: type, expected: tuple[type, ...], words: str) -> Callable[[Any, str], object]:
-    """A guard of rules: objects that are called."""
+    """Return the check of a kind of rules, which are functions."""
 
     def guard(rule: Callable[..., object], origin: str) -> object:
         def call(_: object, *arguments: object) -> object:

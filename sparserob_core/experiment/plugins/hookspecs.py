@@ -1,7 +1,6 @@
-"""Every kind of component on one screen: the hook that yields its records, and the class of what they build.
+"""Every kind of component on one screen: the hook that yields its records, and the class of the components.
 
-To add a kind, write its abstract class and three lines here. This module and `registry` are the only ones that know
-pluggy.
+A new kind needs an abstract class and three lines here. This module and `registry` are the only ones that know pluggy.
 """
 
 from __future__ import annotations
@@ -21,34 +20,34 @@ GROUP = "sparserob"
 class ProblemPlugin(
     Plugin, hook="sparserob_problems", component="sparserob_core.control.problem.problem:ProblemFactory"
 ):
-    """A `ProblemFactory`: options in, an optimal control problem or a semi-infinite program out."""
+    """A `ProblemFactory`: it makes an optimal control problem or a semi-infinite program from its options."""
 
 
 @final
 class SetPlugin(Plugin, hook="sparserob_sets", component="sparserob_core.control.sets.sets:SetFactory"):
-    """A `SetFactory`: options in, a convex set out; its name is the key that a config writes it under."""
+    """A `SetFactory`: it makes a convex set from its options; its name is the key in a config."""
 
 
 @final
 class PolicyPlugin(Plugin, hook="sparserob_policies", component="sparserob_core.control.policies.policy:Policy"):
-    """A `Policy`: what the control may know while the system runs."""
+    """A `Policy`: the measurements that the control may use while the system runs."""
 
 
 @final
 class MethodPlugin(Plugin, hook="sparserob_methods", component="sparserob_core.sip.method:Method"):
-    """A `Method`: semi-infinite program in, result out."""
+    """A `Method`: it solves a semi-infinite program and returns a result."""
 
 
 @final
 class DictionaryPlugin(
     Plugin, hook="sparserob_dictionaries", component="sparserob_core.control.problem.dictionary:DictionaryFactory"
 ):
-    """A `DictionaryFactory`: piecewise constant functions."""
+    """A `DictionaryFactory`: it makes a dictionary of piecewise constant functions."""
 
 
 @final
 class RegulariserPlugin(Plugin, hook="sparserob_regularisers", component="sparserob_core.sip.convexity:Regulariser"):
-    """A `Regulariser`: a strictly convex quadratic."""
+    """A `Regulariser`: a strictly convex quadratic term of the cost."""
 
 
 @final
@@ -65,10 +64,10 @@ class MaximiserPlugin(
         *("budget", "polish"),  # a config's keys of every maximiser; the arguments of `maximise` and `ask_tell` follow
         *("f", "box", "seed", "gradient", "notify", "start", "seconds", "callback", "target", "patience", "known"),
         *("state", "minimise", "integer", "logarithmic"),
-        "origin",  # what messages call it
+        "origin",  # its name in messages
     ),
 ):
-    """A `Maximiser` over a box."""
+    """A `Maximiser` of a function over a box."""
 
 
 @final
@@ -79,12 +78,12 @@ class RulePlugin(Plugin, hook="sparserob_rules", component="sparserob_core.sip.r
 
 @final
 class ExecutorPlugin(Plugin, hook="sparserob_executors", component="sparserob_core.sip.method:ExecutorFactory"):
-    """An `ExecutorFactory`: where independent programs are solved."""
+    """An `ExecutorFactory`: it opens the executor on which independent programs are solved."""
 
 
 @final
 class ObserverPlugin(Plugin, hook="sparserob_observers", component="sparserob_core.experiment.run.events:Observer"):
-    """An `Observer`, which receives every event."""
+    """An `Observer`, which receives every event of a run or of a study."""
 
 
 Function = TypeVar("Function", bound=Callable[..., Iterable[Plugin]])
@@ -92,8 +91,10 @@ _implementation = pluggy.HookimplMarker(GROUP)
 
 
 def hookimpl(function: Function) -> Function:
-    """Marks a plugin's function as an implementation of the hook whose name it bears: it takes nothing, and yields
-    records."""
+    """Mark a plugin's function as an implementation of the hook with the same name.
+
+    The function takes no argument and yields records.
+    """
     return _implementation(function)
 
 
@@ -109,8 +110,8 @@ HOOKS: dict[str, type[Plugin]] = {record.hook: record for record in RECORDS.valu
 FORMER: dict[str, type[Plugin]] = dict.fromkeys(
     ("sparserob_schedules", "sparserob_outer_stops", "sparserob_inner_stops", "sparserob_selections"), RulePlugin
 )
-"""Hooks that packages of interface 1 may have: each of the four pieces had its own, and a record, before they were one
-kind."""
+"""Hooks that packages of interface 1 may implement: each of the four kinds of rules once had a hook and a record of its
+own."""
 
 SchedulePlugin = OuterStopPlugin = InnerStopPlugin = SelectionPlugin = RulePlugin
 
@@ -120,7 +121,7 @@ SPECIFICATIONS = type(
 
 
 def record_type(kind: str) -> type[Plugin]:
-    """The record class of a kind; raises `InputError` for an unknown kind."""
+    """Return the record class of a kind; raises `InputError` for an unknown kind."""
     if kind not in RECORDS:
         raise InputError(f"kind: expected one of {', '.join(RECORDS)}, got {kind!r}")
     return RECORDS[kind]

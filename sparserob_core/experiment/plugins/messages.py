@@ -1,4 +1,4 @@
-"""What is wrong with an input, one sentence per key: pydantic's findings in the words of this project."""
+"""Errors of an input, one sentence per key: the errors of pydantic in the words of this project."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ MUST_BE = {
     "finite_number": "a finite number",
 }
 NOT_TEXT = f"must be {MUST_BE['string_type']}"
-NOT_PLAIN = "must be a number, a text, a list or a mapping"  # such as a date
+NOT_PLAIN = "must be a number, a text, a list or a mapping"  # for example where a date is given
 
 
 @dataclass(frozen=True)
 class Complaint:
-    """``path`` of the key at fault, and the sentence about it."""
+    """An error in an input: the ``path`` of the key at fault, and the sentence about it."""
 
     path: Path
     message: str
 
     def under(self, prefix: Path) -> Complaint:
-        """The same complaint about a value that sits at ``prefix``."""
+        """Return the same error for a value that lies below ``prefix``."""
         return replace(self, path=(*prefix, *self.path))
 
     def __str__(self) -> str:
@@ -54,20 +54,23 @@ class Complaint:
 
 
 def shown(value: object) -> str:
-    """A short text of a value, in the words of a config."""
+    """Return a short text of a value, in the words of a config."""
     value = as_utf8(value) if isinstance(value, str) else value
     text = {"None": "null", "True": "true", "False": "false"}.get(repr(value), repr(value))
     return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."
 
 
 def nearest(name: str, known: Iterable[str], below: Iterable[str] = ()) -> str:
-    """``; did you mean 'x'? (known: ...)``, with the nearest of the known names first. ``below``: keys under them, such
-    as ``problem.horizon``, which come before what looks alike where their last step is the name, and after it else."""
+    """Return a hint such as ``; did you mean 'x'? (known: ...)``, with the known names that are similar to ``name``.
+
+    ``below`` are keys of a lower level, such as ``problem.horizon``. One whose last step is the name comes first;
+    otherwise they are used where no known name is similar.
+    """
     names = sorted(known)
     if not names:
         return "; there are none"
     asked = str(name).lower()
-    further = {key.rpartition(".")[2]: key for key in reversed(list(below))}  # the first of those called the same
+    further = {key.rpartition(".")[2]: key for key in reversed(list(below))}  # of equal names the first key
     close = [further[asked]] if asked in further else []
     close += difflib.get_close_matches(asked, names, n=2 - len(close), cutoff=0.6)
     if not close:
@@ -79,14 +82,30 @@ def nearest(name: str, known: Iterable[str], below: Iterable[str] = ()) -> str:
 def complaints(
     error: ValidationError, model: type[BaseModel], data: object, below: Sequence[str] = ()
 ) -> list[Complaint]:
-    """One complaint per key; what several members of a union say of one key is joined by *or*. ``below``: keys further
-    down that may have been meant by an unknown one at the top."""
+    """Return the errors of pydantic, one per key.
+
+    Parameters
+    ----------
+    error : ValidationError
+        The errors.
+    model : type of BaseModel
+        The model that was validated.
+    data : object
+        The input.
+    below : sequence of str, default ()
+        Keys of a lower level, one of which an unknown key at the top may mean.
+
+    Returns
+    -------
+    list of Complaint
+        The errors. Those of several members of a union about one key are joined by *or*.
+    """
     found: dict[Path, list[tuple[str, str]]] = {}
     items = error.errors(include_url=False)
     misspelt = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
     for item in items:
         if item["type"] == "missing" and any(_meant(loc, item["loc"]) for loc in misspelt):
-            continue  # the unknown key beside it says which one was meant
+            continue  # the error of the unknown key with a similar name shows this one
         path = visible(item["loc"], data, missing=item["type"] == "missing")
         path += tuple(item.get("ctx", {}).get("below", ())) if item["type"] == COMPLAINT else ()
         faults = found.setdefault(path, [])
@@ -97,7 +116,7 @@ def complaints(
 
 
 def _joined(faults: list[tuple[str, str]]) -> str:
-    """Faults of one key as one sentence, in which a value that several of them name stands once, at the end."""
+    """Return the errors of one key as one sentence; a value that several of them name stands once, at the end."""
     last = faults[-1][1]
     return " or ".join(
         f"{wrong} (got {got})" if got and (position == len(faults) - 1 or got != last) else wrong
@@ -106,13 +125,13 @@ def _joined(faults: list[tuple[str, str]]) -> str:
 
 
 def _meant(written: Path, missing: Path) -> bool:
-    """Whether an unknown key looks like the missing one beside it."""
+    """Return whether an unknown key is similar to a missing one at the same level."""
     near = difflib.get_close_matches(str(written[-1]).lower(), [str(missing[-1])], n=1, cutoff=0.6)
     return written[:-1] == missing[:-1] and bool(near)
 
 
 def visible(loc: Path, data: object, missing: bool = False) -> Path:
-    """The steps of ``loc`` that exist in the data: pydantic adds the names of union members."""
+    """Return the steps of ``loc`` that exist in the data: pydantic adds the names of union members."""
     path: list[str | int] = []
     for position, step in enumerate(loc):
         last = position == len(loc) - 1
@@ -127,7 +146,10 @@ def visible(loc: Path, data: object, missing: bool = False) -> Path:
 
 
 def _fault(item: dict[str, Any], model: type[BaseModel], below: Sequence[str]) -> tuple[str, str]:
-    """What is wrong, and the value that was given; empty where the sentence names it or there is none."""
+    """Return the error in words, and the value that was given.
+
+    The value is empty where the sentence names it, or there is none.
+    """
     got = shown(item["input"])
     match item["type"]:
         case "missing":
@@ -168,7 +190,7 @@ def _known_keys(model: type[BaseModel], loc: Path) -> set[str]:
 
 
 def models_in(annotation: object) -> Iterator[type[BaseModel]]:
-    """Every pydantic model inside a type such as ``list[Window | None]``."""
+    """Yield every pydantic model inside a type such as ``list[Window | None]``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for argument in get_args(annotation):
@@ -176,7 +198,8 @@ def models_in(annotation: object) -> Iterator[type[BaseModel]]:
 
 
 def malformed(data: object, path: Path = (), above: tuple[int, ...] = ()) -> Iterator[Complaint]:
-    """Numbers that are not finite, keys that are not text, and lists that contain themselves."""
+    """Yield errors for numbers that are not finite, keys that are not text, other values, and lists that contain
+    themselves."""
     if id(data) in above:
         yield Complaint(path, "contains itself; a config is a finite tree")
     elif isinstance(data, float) and not math.isfinite(data):

@@ -1,4 +1,4 @@
-"""What a plugin registers: a typed record of each component."""
+"""The records that a plugin registers, one for each component."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from sparserob_core.experiment.plugins.attribution import asked, attributed
 from sparserob_core.options import Options
 
 INTERFACE = 1
-"""The version of the public interface: what a component may import, and what it is called with. It rises when a
-component that was right would no longer be."""
+"""The version of the public interface: the names that a component may import, and the arguments that it receives. It
+increases when a component that was correct would no longer be so."""
 
 OLDEST = 1
-"""The oldest version whose components run as they are."""
+"""The oldest version whose components run without a change."""
 
 RECORDS: dict[str, type[Plugin]] = {}
 """Every kind of component, by name, in the order of `hookspecs`."""
@@ -29,24 +29,38 @@ RECORDS: dict[str, type[Plugin]] = {}
 
 @dataclass(frozen=True, kw_only=True)
 class Plugin:
-    """A component under a name.
+    """The record of a component.
 
-    ``name``     lower-case letters, digits and underscores, starting with a letter;
-    ``factory``  the component's class, or ``"package.module:attribute"``, which is imported only when it is chosen;
-    ``options``  the class of its options; not needed when the component's class is itself an `Options`;
-    ``summary``  one line for ``sparserob plugins``;
-    ``plugin``   who registered it, and ``source``, its file or distribution (both filled in by the registry);
-    ``needs``    a module that may be missing, and what pip is to install then, such as
-                 ``("rerun", "rerun-sdk")``, or ``""`` where pip cannot; it is looked for where the
-                 component is built, before anything is solved;
-    ``interface``  the version of the public interface that it was written for (`INTERFACE`); without it 1, the first
-                 that records could say;
-    ``open``     its options, or further ones, are those of the package that it needs, which is imported to ask for
-                 them: schema and reference leave them open.
+    ``factory(**options)`` builds the component. A kind of component is a subclass: ``hook`` yields its records,
+    ``component`` is the class of the components, and ``kind`` is its name. ``reserved`` are the names that no option
+    may have, because the framework's own keys and arguments have them.
 
-    ``factory(**options)`` builds the component. Raises `PluginError` when a field is malformed. A kind of component is
-    a subclass: ``hook`` yields its records, ``component`` is the class of what they build, ``kind`` its name, and
-    ``reserved`` holds the names that no option may bear, because the framework's own keys and arguments bear them.
+    Parameters
+    ----------
+    name : str
+        Its name: lower-case letters, digits and underscores, starting with a letter.
+    factory : callable or str
+        The component's class, or ``"package.module:attribute"``, which is imported only when it is chosen.
+    options : type of Options, optional
+        The class of its options; not needed where the component's class is itself an `Options`.
+    summary : str, default ""
+        One line for ``sparserob plugins``.
+    plugin, source : str, default ""
+        The plugin that registered it, and its file or distribution; the registry adds both.
+    needs : tuple of two str, optional
+        A module that may be missing, and the package with it for pip, such as ``("rerun", "rerun-sdk")``, or ``""``
+        where pip cannot install it. The module is searched where the component is built, before anything is solved.
+    open : bool, default False
+        Whether the package that it needs has all or further options of it. The package is imported to ask for them;
+        schema and reference leave them open.
+    interface : int, default 1
+        The version of the public interface that it was written for (`INTERFACE`). The default is the first version that
+        records could name.
+
+    Raises
+    ------
+    PluginError
+        If a field is malformed.
     """
 
     kind: ClassVar[str]
@@ -83,7 +97,7 @@ class Plugin:
         self._check_interface()
 
     def _check_interface(self) -> None:
-        """Refuse a record of an interface that is not here, with the line to change."""
+        """Raise `PluginError` for a record of an interface that is not supported, with the line to change."""
         if not is_whole(self.interface, 1):
             raise PluginError(f"{self}: interface must be a whole number of at least 1, got {self.interface!r}")
         line = f"{type(self).__name__}(name={self.name!r}, ...)"
@@ -104,18 +118,18 @@ class Plugin:
 
     @property
     def origin(self) -> str:
-        """The component with its kind and where it comes from, for messages."""
+        """The component with its kind and its source, for messages."""
         source = f", {self.source}" if self.source else ""
         return f"{self} (plugin '{self.plugin}'{source}, hook {self.hook})"
 
     @property
     def distribution(self) -> str:
-        """The distribution that it comes with, with its version, or its file."""
+        """The distribution of the component with its version, or its file."""
         return self.source.partition(", ")[0] or "sparserob"
 
     @property
     def missing(self) -> str:
-        """The package that is not installed and what brings it, as one sentence; empty where nothing is missing."""
+        """The package that is not installed, and how to install it, as one sentence; empty where nothing is missing."""
         if self.needs is None or find_spec(self.needs[0]) is not None:
             return ""
         package, brings = self.needs
@@ -126,9 +140,10 @@ class Plugin:
             raise UnknownPluginError(self.missing)
 
     def resolved(self) -> Callable[..., object]:
-        """The factory itself; a lazy one is imported now.
+        """Return the factory itself; a lazy one is imported now.
 
-        Raises `UnknownPluginError` where the package that it needs is missing.
+        Raises `UnknownPluginError` where the package that it needs is missing, and `PluginError` where the import
+        fails.
         """
         if not isinstance(self.factory, str):
             return self.factory
@@ -141,8 +156,11 @@ class Plugin:
         return factory  # type: ignore[no-any-return]
 
     def may_be(self, of: type) -> bool:
-        """Whether it builds an instance of a class, or may do so: what a function builds shows when it is called, and
-        what cannot be loaded is an error where it is chosen."""
+        """Return whether the component may be an instance of a class.
+
+        The class of a function's components is known only after a call. A factory that cannot be loaded is an error
+        where it is chosen.
+        """
         try:
             factory = self.resolved()
         except SparseRobError:
@@ -150,9 +168,9 @@ class Plugin:
         return not isinstance(factory, type) or issubclass(factory, of)
 
     def options_type(self) -> type[Options]:
-        """The class of the options: as registered, else the component's own class, else no options at all.
+        """Return the class of the options: the registered one, else the component's own class, else no options at all.
 
-        Raises `PluginError` where an option bears a name that is reserved.
+        Raises `PluginError` where an option has a name that is reserved.
         """
         options = self.options
         if options is None:
@@ -169,13 +187,16 @@ class Plugin:
 
     @classmethod
     def taken(cls, options: type[Options]) -> list[str]:
-        """The options, sorted, that bear a reserved name."""
+        """Return the options, sorted, that have a reserved name."""
         fields = options.model_fields
         return sorted(cls.reserved & {*fields, *(field.alias for field in fields.values() if field.alias)})
 
     def _refuse_hidden(self, options: type[Options], factory: object) -> None:
-        """Raise `PluginError` where an option of a class of its own bears the name of a method or a property of the
-        component's class, or of anything that the framework says of it. A lazy factory is looked at when it builds."""
+        """Raise `PluginError` where an option has the name of a method or a property of the component's class.
+
+        This is so too for anything that the framework's class defines. It is checked where the options have a class of
+        their own, and for a lazy factory when it builds.
+        """
         if not isinstance(factory, type) or factory is options:
             return
         module, _, attribute = self.component.partition(":")
@@ -194,7 +215,7 @@ class Plugin:
         return frozenset({self.plugin, self.distribution.partition(" ")[0]}) - {"?", "sparserob"}
 
     def create(self, options: Options) -> object:
-        """The component for validated options, checked to be of this kind."""
+        """Return the component for validated options; raises `PluginError` where it is not of this kind."""
         self._refuse_missing()
         factory = self.resolved()
         self._refuse_hidden(type(options), factory)

@@ -1,4 +1,4 @@
-"""Finds plugins: installed ones by their entry points, and single files."""
+"""The search for plugins: installed ones by their entry points, and single files."""
 
 from __future__ import annotations
 
@@ -30,33 +30,64 @@ UNTRUSTED = (
 )
 
 Finder: TypeAlias = Callable[[Sequence[str], list[Failure]], list[metadata.EntryPoint]]
-"""Entry points that are not disabled; it adds the distributions that cannot be read to the failures."""
+"""A function that returns the entry points that are not disabled, and adds unreadable distributions to the failures."""
 
 
 OWN = "sparserob"  # the name of this distribution
 
 _free: list[pluggy.PluginManager] = []
-"""Managers that know the hooks, and hold no plugin: to read what the hooks expect takes as long as all the rest."""
+"""Managers that know the hooks and hold no plugin. They are kept, since adding the hooks takes as long as all the rest.
+"""
 
 
 def load_own_registry(extra_paths: Iterable[str | Path] = ()) -> Registry:
-    """The components of this distribution, and of the files that the user himself names (``--plugins FILE``); nobody
-    else's code is imported.
+    """Return the components of this distribution, and of the plugin files that the user names (``--plugins FILE``).
 
-    For whatever judges or reads a directory that someone else may have written (``check``, ``simulate``, ``figures``,
-    ``replay``): a run directory is data, so the plugins that its config names are not loaded, and neither are the entry
-    points of other distributions. A component that is missing for that reason is an unknown name, and the message
-    says how to load it. A file of ``extra_paths`` that fails is a `PluginError`.
+    It is for commands that read a directory which someone else may have written: ``check``, ``simulate``, ``figures``
+    and ``replay``. A run directory is data: neither the plugins that its config names nor the entry points of other
+    distributions are loaded. A component that is missing for this reason is an unknown name, and the message says how
+    to load it.
+
+    Parameters
+    ----------
+    extra_paths : iterable of str or Path, default ()
+        The plugin files.
+
+    Returns
+    -------
+    Registry
+        The components.
+
+    Raises
+    ------
+    PluginError
+        If a plugin file fails.
     """
     return _with_files(_own(_disabled()), extra_paths, UNTRUSTED)
 
 
 def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = True) -> Registry:
-    """The core's own components, the installed plugins, and plugins that are single files.
+    """Return the components of the core, of the installed plugins, and of plugins that are single files.
 
-    An installed plugin that fails to import is noted in ``failures`` and stops nobody; a file of ``extra_paths`` was
-    asked for by name, so its failure is a `PluginError`. Plugins named in the environment variable
-    ``SPARSEROB_DISABLE_PLUGINS`` (entry point or distribution, separated by commas) are not even imported.
+    Plugins named in the environment variable ``SPARSEROB_DISABLE_PLUGINS`` (entry point or distribution, separated by
+    commas) are not imported.
+
+    Parameters
+    ----------
+    extra_paths : iterable of str or Path, default ()
+        The plugin files.
+    entry_points : bool, default True
+        Whether installed plugins are loaded.
+
+    Returns
+    -------
+    Registry
+        The components. An installed plugin that fails to import is listed in ``failures``, and the others are loaded.
+
+    Raises
+    ------
+    PluginError
+        If a plugin file fails, as the user has named it.
     """
     if not entry_points:
         return _with_files(_load(_disabled(), lambda disabled, failures: []), extra_paths)
@@ -84,7 +115,7 @@ def _own(disabled: tuple[str, ...]) -> Registry:
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A plugin's module, its name, and its file or distribution."""
+    """A plugin: its name, its file or distribution, and its module."""
 
     name: str
     source: str
@@ -108,14 +139,17 @@ def _load(disabled: Sequence[str], installed: Finder, hint: str = "") -> Registr
 
 
 def _of_files(paths: Sequence[Path]) -> Iterator[Plugin]:
-    """The records of files, which are executed anew: they were asked for by name, so a failure ends everything."""
+    """Yield the records of plugin files, which are executed anew.
+
+    The user has named these files, so that a failure is an error.
+    """
     for file in paths:
         yield from _records(_Loaded(file.stem, str(file), _module(file)))
 
 
 @contextmanager
 def _noted(failures: list[Failure], plugin: str) -> Iterator[None]:
-    """A stranger's module may raise anything, and must not stop the others."""
+    """Add any error of a plugin inside the context to the ``failures``, so that the other plugins are loaded."""
     try:
         yield
     except KeyboardInterrupt:
@@ -138,11 +172,12 @@ def _own_entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[
 
 
 def _found(failures: list[Failure]) -> Iterator[metadata.EntryPoint]:
-    """The entry points of every distribution that can be read, of those with one name the first on the path, which is
-    the one that is imported.
+    """Yield the entry points of every distribution that can be read.
 
-    `importlib.metadata.entry_points` ends with whatever one broken folder raises. pip writes ``~`` in front of the
-    name while it replaces a distribution: what is left of that is a copy of another.
+    Of distributions with one name it takes the first on the path, which is the one that is imported.
+
+    `importlib.metadata.entry_points` would stop at the first error, which one broken folder can cause. pip writes ``~``
+    in front of the name while it replaces a distribution: such a folder is a copy that was left behind.
     """
     known = set[str]()
     for distribution in metadata.distributions():
@@ -177,7 +212,10 @@ def _source(entry: metadata.EntryPoint) -> str:
 
 @cache
 def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
-    """They are parsed anew whenever they are asked for, and the entry points of a distribution share it."""
+    """Return name and version of a distribution.
+
+    They are kept, as each request parses the metadata anew and all entry points of a distribution need them.
+    """
     return distribution.name, distribution.version
 
 
@@ -193,7 +231,7 @@ def _module(file: Path) -> ModuleType:
 
 
 def _records(plugin: _Loaded) -> Sequence[Plugin]:
-    """What a plugin yields, which is alone with its manager."""
+    """Return the records of a plugin, which is the only one in its manager."""
     who = f"plugin '{plugin.name}'" + (f" ({plugin.source})" if plugin.source else "")
     manager = _free.pop() if _free else _manager()
     with attributed(who, "registering it", but=()):
@@ -225,7 +263,7 @@ def _yielded(plugin: _Loaded, who: str, callers: Sequence[pluggy.HookCaller]) ->
                     f"{who}: {caller.name} yielded {short_repr(record)}, expected records of type {expected.__name__}"
                 )
             known = replace(record, plugin=plugin.name, source=plugin.source)
-            if not isinstance(known.factory, str):  # of a lazy one the options are checked when it is imported
+            if not isinstance(known.factory, str):  # the options of a lazy factory are checked when it is imported
                 known.options_type()
             yield known
 

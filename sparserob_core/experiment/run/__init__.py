@@ -1,1 +1,1 @@
-"""One run: the walk, its events, its journal, and how it is watched and replayed."""
+"""Runs of an experiment: their events, record, figures, outcome and replay."""

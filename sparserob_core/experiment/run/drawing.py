@@ -1,4 +1,4 @@
-"""Every figure of a run, when it is over and when it is drawn again."""
+"""The figures of a run, drawn at its end or again later."""
 
 from __future__ import annotations
 
@@ -46,18 +46,35 @@ Drawing: TypeAlias = Callable[[], list[Path]]
 logger = logging.getLogger("sparserob")
 
 SECONDS = 2.0
-"""What the values of a landscape may take, after those of the coarsest grid, and what the tuples of the search may take
-that are evaluated once more. In a tenth of it the figure is coarse and the walk begins in its middle; ten times of it
-nobody waits for."""
-PAGE = 100  # dots per inch in a notebook: of a tenth nothing can be read, ten times as many make a page of megabytes
-GRID = 65  # lines along each coordinate, of which the coarsest grid has every eighth
+"""Seconds for the values of a landscape, after those of its coarsest grid, and for the tuples of the search that are
+evaluated once more. With a tenth of it the figure is coarse, and the trajectory of the search begins in its middle. Ten
+times as many seconds are more than a user waits for."""
+PAGE = 100  # dots per inch in a notebook: with a tenth nothing is legible, with ten times a page has megabytes
+GRID = 65  # lines along each coordinate; the coarsest grid has every eighth of them
 
 
 def draw_run(directory: Path, plugins: Iterable[str | Path] = (), notify: Notify = ignore) -> list[Path]:
-    """Draw the figures of a run directory again; raises `InputError` when it is none, or there is nothing to draw.
+    """Draw the figures of a run directory again, and return their files.
 
-    ``plugins``: files that offer what the run was made with; the directory itself is data, and no plugin that it names
-    is loaded. ``notify`` receives `StudyProgress`."""
+    Parameters
+    ----------
+    directory : Path
+        The run directory.
+    plugins : iterable of str or Path, default ()
+        Files of plugins that the run was made with. The directory itself is data: no plugin that it names is loaded.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+
+    Returns
+    -------
+    list of Path
+        The files that were written.
+
+    Raises
+    ------
+    InputError
+        If there is no run in the directory, or nothing to draw.
+    """
     run = stored_run(directory)
     worst: Mapping[str, Array] = {}
     if "theta" in run.solution:
@@ -87,9 +104,29 @@ def draw_run(directory: Path, plugins: Iterable[str | Path] = (), notify: Notify
 def drawings(
     experiment: Experiment, result: Result, directory: Path, worst: Mapping[str, Array], notify: Notify = ignore
 ) -> Iterator[Drawing]:
-    """What there is to draw of a result into ``directory/figures``, each as a function that returns its files and
-    raises `InputError` where it cannot: the clash of an infeasible control problem, or the figures of its decision;
-    and those of a search. ``worst``: the arrays of `adversaries`."""
+    """Yield the figures of a result, each as a function that writes into ``directory/figures`` and returns its files.
+
+    The figures are that of the irreducible infeasible subsystem where a control problem is infeasible, those of the
+    decision where there is one, and those of a search.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    result : Result
+        Its result.
+    directory : Path
+        The run directory.
+    worst : mapping
+        The arrays of `adversaries`.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+
+    Yields
+    ------
+    callable
+        A function without arguments; it raises `InputError` where the figure cannot be drawn.
+    """
     from sparserob_core.experiment.figures.clash import draw_clash
     from sparserob_core.experiment.figures.climb_figure import write_climb
     from sparserob_core.experiment.figures.drawing import draw_experiment
@@ -125,7 +162,10 @@ def drawings(
 
 
 def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], Figure | None]]:
-    """The figures that there are of a result, by name; one is ``None`` where nothing can move in it."""
+    """Return the figures of a result by name, each as a function that draws it.
+
+    The function returns ``None`` where nothing can move in the figure.
+    """
     from sparserob_core.experiment.figures.adversary_figure import draw_adversary
     from sparserob_core.experiment.figures.clash import clash_figure
     from sparserob_core.experiment.figures.climb_figure import draw_climb
@@ -158,8 +198,28 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
 
 
 def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
-    """A figure of a result, for matplotlib: the states, or what cannot hold together, where none is named; raises
-    `InputError`, which names those that there are, for another one, and without matplotlib."""
+    """Return a figure of a result, for matplotlib.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    result : Result
+        Its result.
+    name : str or None
+        One of the names of `pictures`. Where it is ``None``, the figure is that of the states, or of the irreducible
+        infeasible subsystem of an infeasible problem.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The figure.
+
+    Raises
+    ------
+    InputError
+        If there is no figure of that name, nothing in it can move, or matplotlib is missing.
+    """
     from sparserob_core.experiment.figures.style import require_matplotlib, style
 
     require_matplotlib()
@@ -172,7 +232,7 @@ def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
         figure = known[name]()
     if figure is None:
         raise InputError(f"name: there is no {name} to draw: nothing can move in it")
-    figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]  # shown by notebooks without pyplot too
+    figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]  # notebooks without pyplot show it as well
     return figure
 
 
@@ -183,7 +243,10 @@ def _png(figure: Figure) -> bytes:
 
 
 def picture(experiment: Experiment, result: Result) -> bytes | None:
-    """The control, or why there is none, as a PNG; ``None`` without matplotlib, and where there is neither."""
+    """Return the figure of the control, or of the irreducible infeasible subsystem, as a PNG.
+
+    Returns ``None`` where matplotlib is missing, and where there is neither figure.
+    """
     from sparserob_core.experiment.figures.style import missing_matplotlib
 
     if missing_matplotlib():
@@ -199,8 +262,11 @@ def _cost_unit(experiment: Experiment) -> str:
 
 
 def switching(experiment: Experiment, result: Result) -> Array | None:
-    """How hard the constraints push the control, ``(m, K)``, as the multipliers of the lower bound say, or those of the
-    imposed constraints; ``None`` where neither is known."""
+    """Return the switching function ``(m, K)`` of a result: the effect of the constraints on the control.
+
+    The multipliers are those of the lower bound, or else those of the imposed constraints. Returns ``None`` where
+    neither are known.
+    """
     if result.status not in ("certified", "verified"):
         return None
     view, dual = Inspection(experiment.loaded, experiment), result.dual
@@ -219,11 +285,33 @@ def _landscape(experiment: Experiment, result: Result, directory: Path, notify: 
 def landscape_of(
     inspection: Inspection, trace: SearchTrace, title: str, notify: Notify = ignore
 ) -> LandscapeData | None:
-    """The landscape through the best tuple of the last epsilon, over the two coordinates of its deciding indices along
-    which g moves most, or along the only coordinate that can move; ``None`` where no tuple with a finite value was
-    kept, or nothing can move.
+    """Return the landscape of g through the best tuple of the last epsilon.
 
-    It ends with the finest grid that is complete after `SECONDS`; ``notify`` receives `StudyProgress`.
+    Parameters
+    ----------
+    inspection : Inspection
+        The run.
+    trace : SearchTrace
+        The evaluations of its search.
+    title : str
+        The title of the figure.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+
+    Returns
+    -------
+    LandscapeData or None
+        The values over the two coordinates of the deciding indices along which g changes most, or along the only
+        coordinate that can move. ``None`` where no tuple with a finite value was kept, or nothing can move.
+
+    Raises
+    ------
+    InputError
+        If the tuples do not fit the config.
+
+    Notes
+    -----
+    The grid is refined until `SECONDS` are over; the finest complete grid is returned.
     """
     mine = np.flatnonzero(trace.epsilon == trace.epsilon[-1]) if trace.epsilon.size else np.empty(0, dtype=int)
     mine = mine[np.isfinite(trace.value[mine])]
@@ -302,7 +390,7 @@ def _fill(landscape: Landscape, notify: Notify) -> None:
 
 
 def _curve(g: RelaxedValue, anchor: Array, c: int) -> tuple[Array, Array]:
-    """g of a tuple of one index along its coordinate ``c``, at `GRID` values and at its own."""
+    """Return the values of g of a tuple with one index along its coordinate ``c``, at `GRID` values and at its own."""
     across = np.union1d(np.linspace(g.slot.lower[c], g.slot.upper[c], GRID), anchor[0, c])
     slots, values = anchor.copy(), list[float]()
     for to in across:
@@ -314,14 +402,34 @@ def _curve(g: RelaxedValue, anchor: Array, c: int) -> tuple[Array, Array]:
 def drawn(
     experiment: Experiment, result: Result, directory: Path, worst: Mapping[str, Array], notify: Notify = ignore
 ) -> tuple[str, ...]:
-    """Draw what there is to draw when a run is over, and return what could not be drawn: the figures are an extra, and
-    whatever goes wrong with one is a remark."""
+    """Draw the figures of a run that is over.
+
+    Figures are an extra: any error in one of them becomes a warning.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment.
+    result : Result
+        Its result.
+    directory : Path
+        The run directory.
+    worst : mapping
+        The arrays of `adversaries`.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+
+    Returns
+    -------
+    tuple of str
+        Warnings about figures that could not be drawn.
+    """
     remarks = []
     for draw in drawings(experiment, result, directory, worst, notify) if result.status != "failed" else ():
         try:
             draw()
         except SparseRobError as error:
             remarks.append(str(error))
-        except Exception as error:  # noqa: BLE001  as said above
+        except Exception as error:  # noqa: BLE001  a figure may not end a run
             remarks.append(f"the figures could not be drawn: {type(error).__name__}: {error}")
     return tuple(dict.fromkeys(remarks))

@@ -1,4 +1,4 @@
-"""The events of a run, and how they reach its observers without disturbing it."""
+"""The events of a run, and their way to the observers, who cannot disturb the run."""
 
 from __future__ import annotations
 
@@ -40,12 +40,24 @@ logger = logging.getLogger("sparserob")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunStarted(Event):
-    """A run begins: its title, its directory, what is to be solved, and whether the terminal is to be left alone
-    (``quiet``).
+    """The first event of a run, with its title, its directory and its problem.
 
-    Always the first event. ``inspection`` answers what an observer wants to know beside the events, on a copy of its
-    own; ``None`` where there is none. ``unprovable`` says why no control can be certified, where that is known before
-    anything is solved.
+    Parameters
+    ----------
+    title : str
+        The title of the run.
+    directory : Path or None
+        Its directory.
+    problem : OptimalControlProblem or None
+        The control problem; ``None`` for another program.
+    program : SemiInfiniteProgram
+        The program that is solved.
+    quiet : bool, default False
+        Whether the terminal must be left alone.
+    inspection : Inspection, optional
+        The answers to an observer's further questions, on a copy of its own.
+    unprovable : str, optional
+        The reason for which no control can be certified, where it is known before anything is solved.
     """
 
     title: str
@@ -59,8 +71,19 @@ class RunStarted(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunFinished(Event):
-    """A run is over, whether well or not; always the last event. ``result`` is ``None`` when an error ended it, or an
-    interrupt before there was a decision; ``pressed``: a key or a signal has ended it."""
+    """The last event of a run, after a success and after an error.
+
+    Parameters
+    ----------
+    status, message : str
+        The status of the result, and its explanation.
+    seconds : float
+        The seconds that the run has taken.
+    result : Result, optional
+        The result. ``None`` where an error ended the run, or an interrupt before there was a decision.
+    pressed : bool, default False
+        Whether a key or a signal ended the run.
+    """
 
     status: str
     message: str
@@ -71,9 +94,21 @@ class RunFinished(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StudyProgress(Event):
-    """A study of many programs or trajectories goes on (a margin, a set of initial states, a simulation): in words, and
-    as ``done`` of ``total`` steps (0: unknown). ``phase``: a run goes on with what comes after its method, which the
-    words name up to a colon; ``result``: what its method has returned, where the phase begins with it."""
+    """The progress of a study of many programs or trajectories, or of the last phases of a run.
+
+    Such a study is a margin, a set of initial states, or a simulation.
+
+    Parameters
+    ----------
+    text : str
+        The progress in words. Of a phase of a run, the part up to a colon is its name.
+    done, total : int, default 0
+        The number of steps that are done, and of all steps; 0 where that is not known.
+    phase : bool, default False
+        Whether a run begins a phase after its method.
+    result : Result, optional
+        The result of the method, where the phase begins with it.
+    """
 
     text: str
     done: int = 0
@@ -84,11 +119,31 @@ class StudyProgress(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SweepProgress(StudyProgress):
-    """A sweep goes on: ``done`` of ``total`` points, of them ``failed`` without an answer; ``running`` now; about
-    ``left`` seconds to go (``None``: not known yet), ``seconds`` since it began. ``row``: the row of the table that has
-    just come, if any; ``axes``: its keys that are axes. Points by their place in `SweepStarted.points`: ``places`` are
-    those of the row (several where configs are equal), ``now`` those that run. ``found``: points that come after those
-    that were known, where a study finds its points on the way (``search``)."""
+    """The progress of a sweep.
+
+    Points are given by their places in `SweepStarted.points`.
+
+    Parameters
+    ----------
+    done, total : int
+        The number of points that are done, and of all points.
+    running, failed : int, default 0
+        The number of points that run, and of those that ended without an answer.
+    left : float, optional
+        The seconds that remain, roughly; ``None`` where they are not known yet.
+    row : mapping, optional
+        The row of the table that was added, if there is one.
+    axes : sequence of str
+        The keys of the row that are axes.
+    places : sequence of int
+        The points of the row; several where configs are equal.
+    now : sequence of int
+        The points that run.
+    found : sequence
+        New points, of a study that finds its points as it proceeds (``search``). They follow those that are known.
+    seconds : float
+        The seconds since the sweep began.
+    """
 
     running: int = 0
     failed: int = 0
@@ -103,17 +158,34 @@ class SweepProgress(StudyProgress):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SweepStarted(Event):
-    """A sweep begins: its title, its directory, the keys of its ``axes``, which of them are ``logarithmic``, and the
-    values of all ``points`` on them, in the order of the table.
+    """The first event for an observer of a study.
 
-    The first event for an observer of a study. ``rows``: what was finished before, by the place of the point.
-    ``arrangement``: how the points were chosen (``grid``, ``zip``, ``random``, ``sobol``; ``search``: a margin, whose
-    points are told as they are found, `SweepProgress`; ``runs``: finished runs of one problem, which are compared).
-    ``runs``: the folder in which the rows name the directories of their runs (``run``), where these are kept.
-    ``parallel``: the runs are
-    made elsewhere, and nothing is heard of them (`PointProgress`) before they end. ``sense``: the *largest* or the
-    *smallest* value of the only axis is sought at which something is feasible, and what is proven infeasible at one
-    value is so beyond it; empty where nothing is."""
+    Parameters
+    ----------
+    title : str
+        The title of the study.
+    directory : Path
+        Its directory.
+    axes : sequence of str
+        The keys of the axes.
+    logarithmic : sequence of bool
+        The axes that are logarithmic.
+    points : sequence
+        The values of all points on the axes, in the order of the table.
+    arrangement : str
+        The choice of the points. ``grid``, ``zip``, ``random`` or ``sobol``: as in `sweep`. ``search``: a margin, whose
+        points come with `SweepProgress` when they are found. ``runs``: finished runs of one problem, which are
+        compared.
+    rows : mapping
+        The rows that were finished before, by the place of the point.
+    parallel : bool, default False
+        Whether the runs are made elsewhere, so that no `PointProgress` comes before they end.
+    sense : {"", "largest", "smallest"}, default ""
+        Where the largest or the smallest feasible value of the only axis is sought, and a value that is proven
+        infeasible excludes all values beyond it. Empty otherwise.
+    runs : Path, optional
+        The folder with the directories of the runs, which the rows name (``run``); ``None`` where these are not kept.
+    """
 
     title: str
     directory: Path
@@ -129,8 +201,19 @@ class SweepStarted(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointProgress(Event):
-    """A point of a study that runs in this process has begun (``round`` 0), or has moved its bounds in some round:
-    ``-inf`` and ``inf`` while unknown, in the units of the config. ``seconds`` since the study began."""
+    """The progress of one point of a study that runs in this process: it has begun, or its bounds have changed.
+
+    Parameters
+    ----------
+    point : int
+        The place of the point.
+    round : int, default 0
+        The round of its method; 0 at its beginning.
+    lower_bound, upper_bound : float
+        The bounds, in the units of the config; ``-inf`` and ``inf`` where they are unknown.
+    seconds : float
+        The seconds since the study began.
+    """
 
     point: int
     round: int = 0
@@ -141,9 +224,21 @@ class PointProgress(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SweepFinished(Event):
-    """A sweep is over; the last event for an observer of a study. ``rows``: all rows of the table by the place of the
-    point; ``stopped``: what ended the study early, if anything did; ``pressed``: it was a key or a signal. ``answer``:
-    what a search found, in words."""
+    """The last event for an observer of a study.
+
+    Parameters
+    ----------
+    rows : mapping
+        All rows of the table, by the place of the point.
+    seconds : float
+        The seconds that the study has taken.
+    stopped : str, default ""
+        The reason for which the study ended early, if it did.
+    pressed : bool, default False
+        Whether that reason was a key or a signal.
+    answer : str, default ""
+        The answer of a search, in words.
+    """
 
     rows: Mapping[int, Mapping[str, Any]]
     seconds: float
@@ -153,37 +248,47 @@ class SweepFinished(Event):
 
 
 FIRST, LAST = (RunStarted, SweepStarted), (RunFinished, SweepFinished)
-"""What an observer hears first, and last."""
+"""The events that an observer receives first and last."""
 
 
 class Observer(ABC):
-    """Watches a run. It receives `RunStarted` first and `RunFinished` last, each once, and in between whatever happens,
-    on the solver's thread: what takes long belongs into a thread or a process of its own, begun at `RunStarted`.
+    """An object that receives the events of a run: `RunStarted` first, `RunFinished` last, each of them once.
 
-    One that is given to a sweep watches the study: it receives `SweepStarted` first, `SweepProgress` and
-    `PointProgress`, and `SweepFinished` last, and no event of the runs themselves."""
+    The events come on the thread of the solver. Work that takes long belongs in a thread or a process of its own, which
+    is started at `RunStarted`.
+
+    An observer of a sweep receives the events of the study: `SweepStarted` first, then `SweepProgress` and
+    `PointProgress`, and `SweepFinished` last. It receives no event of the runs themselves.
+    """
 
     @property
     def incomplete(self) -> str:
-        """Why what it was to leave is not complete, in words; empty as long as it is."""
+        """The reason for which the record of the observer is not complete; empty as long as it is."""
         return ""
 
     @abstractmethod
     def receive(self, event: Event) -> None:
-        """Take note of an event; ignore those of unknown type. Whatever this raises only detaches the observer."""
+        """Receive an event, and ignore it where its type is unknown.
+
+        An exception that is raised here detaches the observer and has no other effect.
+        """
 
     def close(self) -> None:  # noqa: B027  most hold nothing
-        """Let go of files, threads and the terminal: called once, after the last event, or when the observer is
-        detached before it."""
+        """Release files, threads and the terminal.
+
+        This is called once: after the last event, or when the observer is detached before it.
+        """
 
 
 @final
 class Broadcast:
-    """Passes every event on to every observer; one that raises is detached with one warning, and the run goes on.
+    """A sender of events to all observers.
 
-    Every observer that received the first event receives the last one, once, and is closed; nothing is sent after that.
-    An interrupt from the keyboard is not the observer's failure: it is raised, at the end of a run only after all
-    observers have received the last event.
+    An observer that raises an exception is detached with one warning, and the run goes on. Every observer that received
+    the first event receives the last one, once, and is closed; it receives nothing after that.
+
+    An interrupt from the keyboard is no failure of the observer, and it is raised again. With the last event it is
+    raised only after all observers have received that event.
     """
 
     def __init__(self, observers: Iterable[tuple[str, Observer]]) -> None:
@@ -191,7 +296,7 @@ class Broadcast:
 
     @property
     def heard(self) -> bool:
-        """Whether anybody listens."""
+        """True where there is an observer."""
         return bool(self._observers)
 
     def __call__(self, event: Event) -> None:
@@ -212,19 +317,19 @@ class Broadcast:
 
 @final
 class _Listener:
-    """One observer of one run, or of one study."""
+    """The connection to one observer of one run, or of one study."""
 
     def __init__(self, name: str, observer: Observer) -> None:
         self.name, self.observer, self.began = name, observer, False
 
     def receive(self, event: Event) -> bool:
-        """Pass an event on; returns whether the observer takes further events."""
+        """Send an event to the observer; returns whether it takes further events."""
         last = isinstance(event, LAST)
         self.began |= isinstance(event, FIRST)
         try:
             if self.began or not last:
                 self.observer.receive(event)
-        except (Exception, SystemExit) as error:  # noqa: BLE001  an observer must not hurt the run
+        except (Exception, SystemExit) as error:  # noqa: BLE001  an observer must not end the run
             self._warn(error)
             self._close(quietly=True)
             return False
@@ -237,7 +342,7 @@ class _Listener:
         observer, self.observer = self.observer, _DETACHED
         try:
             observer.close()
-        except (Exception, SystemExit) as error:  # noqa: BLE001  as above
+        except (Exception, SystemExit) as error:  # noqa: BLE001  an observer must not end the run
             if not quietly:
                 self._warn(error)
 
@@ -247,10 +352,10 @@ class _Listener:
 
 @final
 class _Detached(Observer):
-    """Stands for an observer that was closed."""
+    """The substitute for an observer that was closed."""
 
     def receive(self, event: Event) -> None:
-        """Nothing."""
+        """Ignore the event."""
 
 
 _DETACHED = _Detached()

@@ -1,6 +1,7 @@
-"""What a study of a run or of a problem may be given: files, mappings and directories, or what Python has in hand.
+"""Inputs of a study: files, mappings and run directories, or problems, results and outcomes from Python.
 
-The one place that turns problems, results and outcomes into configs and run directories."""
+This is the only module that turns problems, results and outcomes into configs and run directories.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +23,26 @@ GivenConfig: TypeAlias = str | Path | Mapping[str, Any] | Source | OptimalContro
 
 
 def as_run(run: object) -> tuple[Path, Experiment | None]:
-    """The directory of a run, and its experiment where that is at hand: of a directory, of what ``sr.run`` returned, or
-    of what ``sr.solve`` returned for a problem, which is written into a temporary directory unless it was saved.
+    """Return the directory of a run and, where it is in memory, its experiment.
 
-    Raises `InputError` for anything else."""
+    Parameters
+    ----------
+    run : str, Path, Outcome or SolvedProblem
+        The directory of a run, an outcome of `run`, or a result of `solve` for a problem. A result that was not saved
+        is written into a temporary directory.
+
+    Returns
+    -------
+    directory : Path
+        The run directory.
+    experiment : Experiment or None
+        The experiment; ``None`` where only a directory was given.
+
+    Raises
+    ------
+    InputError
+        If ``run`` is anything else.
+    """
     if isinstance(run, Outcome | SolvedProblem):
         return run.directory, run.experiment
     if isinstance(run, str | Path):
@@ -37,10 +54,28 @@ def as_run(run: object) -> tuple[Path, Experiment | None]:
 
 
 def as_config(config: object) -> str | Path | Mapping[str, Any] | Source:
-    """What `load_config` reads: files and mappings as they are, a problem as the config that states it, and of a run,
-    its result or its directory the config that it is of, which is data: no plugin file that it names is loaded.
+    """Return the config of anything that describes an experiment, in a form that `load_config` reads.
 
-    Raises `InputError` for anything else, and for a problem that no config can say."""
+    Parameters
+    ----------
+    config : str, Path, mapping, Source, OptimalControlProblem, Outcome or SolvedProblem
+        Files and mappings are returned as they are. A problem becomes a config that describes it. A run, its result or
+        its directory gives the config of that run.
+
+    Returns
+    -------
+    str, Path, mapping or Source
+        The config.
+
+    Raises
+    ------
+    InputError
+        If ``config`` is anything else, or a problem that no config can describe.
+
+    Notes
+    -----
+    A run directory is data: no plugin file that its config names is loaded.
+    """
     if isinstance(config, OptimalControlProblem):
         return source_of(config)
     if isinstance(config, Outcome | SolvedProblem):

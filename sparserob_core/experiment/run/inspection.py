@@ -1,4 +1,4 @@
-"""What an observer may ask about the run that it watches, answered from objects of its own."""
+"""Questions of an observer about the run that it watches, answered from objects of their own."""
 
 from __future__ import annotations
 
@@ -40,16 +40,29 @@ LETTERS: Mapping[str, str] = {
 @final
 @dataclass(frozen=True, eq=False)
 class RelaxedValue:
-    """``g`` over tuples of indices: ``at`` maps ``slots (D, width)`` to a number, ``+inf`` where the relaxed program is
-    infeasible. NaN in the place of every coefficient of a disturbance stands for the worst one of each constraint.
+    """The function ``g`` of tuples of indices: the value of the relaxed program that imposes their constraints.
 
-    ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation, ``gradient()``
-    the slopes ``(D, width)`` of ``g`` there, as far as it has some (`TupleValue.gradient`); ``deciding()`` are the
-    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``optimum()`` is the decision ``(n,)`` of
-    that evaluation with the constraints that carry its multipliers, or ``None`` where there is none.
-    ``interchangeable``: every index is imposed as every other one, so that two beside one another say the same; those
-    of a policy have a deviation each. ``slot`` is the box ``(width,)`` of one index, ``names`` and ``kinds`` say what
-    its coordinates are: see `Inspection.names`, `Inspection.kinds`.
+    Parameters
+    ----------
+    at : callable
+        The value at the tuple ``slots (D, width)``; ``+inf`` where the relaxed program is infeasible. NaN in place of
+        every coefficient of a disturbance stands for the worst disturbance of each constraint.
+    weights : callable
+        The multipliers ``(D,)`` of the constraints at every index in the last evaluation.
+    gradient : callable
+        The slopes ``(D, width)`` of ``g`` in the last evaluation, as far as it has some (`TupleValue.gradient`).
+    deciding : callable
+        The indices ``(4,)`` with the largest multipliers (`TupleValue.deciding`).
+    slot : Box
+        The box ``(width,)`` of one index.
+    names, kinds : tuple
+        The names and the kinds of the coordinates of an index (`Inspection.names`, `Inspection.kinds`).
+    interchangeable : bool, default True
+        Whether every index is imposed in the same way as every other one, so that two close indices have the same
+        effect. The indices of a policy have a deviation each.
+    optimum : callable
+        The decision ``(n,)`` of the last evaluation with the constraints that have its multipliers; ``None`` where
+        there is none.
     """
 
     at: Callable[[Array], float]
@@ -64,23 +77,25 @@ class RelaxedValue:
 
     @property
     def coordinates(self) -> tuple[int, ...]:
-        """The coordinates of an index that can move and are no disturbance, such as its time."""
+        """The coordinates of an index that can move and belong to no disturbance, such as its time."""
         moves = self.slot.upper > self.slot.lower
         return tuple(k for k, kind in enumerate(self.kinds) if moves[k] and kind != "disturbance")
 
 
 @final
 class Inspection:
-    """Questions about an experiment. Every answer comes from a program that was built anew, so that asking cannot
-    change what the method does; nothing is built before the first question."""
+    """Answers to questions about an experiment, each from a program that was built anew.
+
+    A question therefore cannot change the method. Nothing is built before the first question.
+    """
 
     def __init__(self, loaded: Loaded, experiment: Experiment | None = None) -> None:
-        """``experiment``: what the config describes, where it is built already and no method is at work on it."""
+        """Keep the config, and the ``experiment`` where it is built already and no method works on it."""
         self._loaded, self._built = loaded, experiment
 
     @staticmethod
     def read(directory: Path) -> Inspection:
-        """The same from the directory of a run, finished or not; raises `InputError` when it is none."""
+        """Return the inspection of a run directory, finished or not; raises `InputError` when it is none."""
         from sparserob_core.experiment.directory.finished import read_config
 
         return Inspection(read_config(directory))
@@ -102,20 +117,38 @@ class Inspection:
 
     @property
     def literal(self) -> bool:
-        """Whether an index of the method's tuples carries the coefficients of the disturbance."""
+        """True where an index of the method's tuples contains the coefficients of the disturbance."""
         return self.searches and self._loaded.config.method.options.get("formulation") == "literal"
 
     @cached_property
     def searches(self) -> bool:
-        """Whether the method maximises ``g`` over tuples of indices."""
+        """True where the method maximises ``g`` over tuples of indices."""
         method = self._loaded.config.method
         built: Method = self._loaded.registry.build("method", method.name, method.options)
         return bool(built.searches)
 
     def picture(self, decision: Array, cuts: Sequence[Cut] = (), draws: int = 0) -> FigureData:
-        """Control, nominal states, worst-case tube and walls at a decision ``(m N,)``, and when and on which states the
-        constraints ``cuts`` are active; under feedback also the effort under so many random ``draws``, and what moves
-        the control in the worst case. Raises `InputError` for a program that is no control problem."""
+        """Return the data of a figure at a decision: control, nominal states, worst-case tube and walls.
+
+        Parameters
+        ----------
+        decision : array (m N,)
+            The coefficients of the control.
+        cuts : sequence of Cut, default ()
+            Constraints whose active times and states are marked.
+        draws : int, default 0
+            Under feedback the number of random disturbances for which the effort is computed.
+
+        Returns
+        -------
+        FigureData
+            The data; under feedback also the effort, and the signals that move the control in the worst case.
+
+        Raises
+        ------
+        InputError
+            If the program is no control problem.
+        """
         from sparserob_core.experiment.figures.active import marks_of
         from sparserob_core.experiment.figures.drawing import figure_data
 
@@ -124,22 +157,41 @@ class Inspection:
         return figure_data(experiment, theta, active, (), None, draws)
 
     def clash(self, result: Result) -> list[Strip]:
-        """Of an infeasible result the quantities that clash: what is allowed, where the control can bring them, and
-        what the disturbance makes of that; none for a program that is no control problem."""
+        """Return the quantities of an infeasible result that cannot satisfy their constraints together.
+
+        Each has the allowed range, the range to which the control can bring it, and the effect of the disturbance on
+        that. The list is empty for a program that is no control problem, and for a result that is not infeasible.
+        """
         from sparserob_core.experiment.figures.clash import clash_strips
 
         infeasible = self.problem is not None and result.status == "infeasible"
         return clash_strips(self.program, result) if infeasible else []
 
     def tolerance(self, family: str, row: int = 0) -> float:
-        """What counts as no violation of a row, in the user's units (decision 16)."""
+        """Return the largest violation of a row that counts as none, in the user's units (decision 16).
+
+        Parameters
+        ----------
+        family : str
+            The name of the constraint family.
+        row : int, default 0
+            The row of the family.
+
+        Returns
+        -------
+        float
+            The violation.
+        """
         own = self.program.own_units
         program = self.program if own is None else own.program
         return TOLERANCE * program.family(family).row_unit(row)
 
     def row(self, cut: Cut) -> Array | None:
-        """The left-hand side ``(n,)`` of a constraint that the method has imposed: of a sampled one at its sample, of a
-        policy's at its deviation; ``None`` where the cut does not say which deviation that is."""
+        """Return the left-hand side ``(n,)`` of a constraint that the method has imposed.
+
+        It is that at the sample of a sampled constraint, and at the deviation of a policy's constraint; ``None`` where
+        the cut does not contain its deviation.
+        """
         family, index = self.program.family(cut.family), np.asarray(cut.index, dtype=float)
         if family.uncertain is not None:
             size = family.index_set.dimension
@@ -153,7 +205,7 @@ class Inspection:
 
     @cached_property
     def _sampled(self) -> Mapping[str, ConstraintFamily]:
-        """The families of the method ``scenario`` by name: those of its own samples."""
+        """The constraint families of the method ``scenario`` by name, at its own samples."""
         method = self._loaded.config.method
         built: Method = self._loaded.registry.build("method", method.name, method.options)
         if not isinstance(built, Scenario):
@@ -162,20 +214,37 @@ class Inspection:
         return {family.name: family for family in families}
 
     def worst_cases(self, decision: Array) -> dict[str, Array]:
-        """The worst parameter and disturbance of every state constraint at a decision, and the states that they cause,
-        as ``adversary.npz`` has them: ``names (f,)``, ``violations (f,)``, ``times (f,)``, ``state_times (T,)``,
-        ``states (f, d, T)``, ...; ``{}`` without any.
+        """Return the worst parameter and disturbance of every state constraint at a decision, and the states that they
+        cause.
+
+        The arrays are those of ``adversary.npz``: ``names (f,)``, ``violations (f,)``, ``times (f,)``, ``state_times
+        (T,)``, ``states (f, d, T)``, and so on. The mapping is empty where there is no such constraint.
         """
         from sparserob_core.experiment.directory.adversary import adversaries
 
         return adversaries(self._experiment, decision)
 
     def relaxed_value(self, count: int, epsilon: float) -> RelaxedValue:
-        """``g(epsilon; .)`` over tuples of ``count`` indices in the method's formulation, by a relaxed program of its
-        own.
+        """Return the function ``g(epsilon; .)`` of tuples of indices in the method's formulation, from a relaxed
+        program of its own.
 
-        Of a policy the indices are literal, ``(t, w)`` with a deviation ``w``, and ``epsilon`` is 0. Raises
-        `InputError` when there is no constraint family."""
+        Parameters
+        ----------
+        count : int
+            The number of indices of a tuple.
+        epsilon : float
+            The weight of the regulariser.
+
+        Returns
+        -------
+        RelaxedValue
+            The function. For a policy the indices are literal, ``(t, w)`` with a deviation ``w``, and ``epsilon`` is 0.
+
+        Raises
+        ------
+        InputError
+            If the program has no constraint family.
+        """
         from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
         from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
         from sparserob_core.sip.solver import quickest
@@ -186,7 +255,7 @@ class Inspection:
         users, tools = imposed_program(self.program, formulation), tools_of(self._loaded)
         if not users.families:
             raise InputError("families: expected at least one constraint family, got none")
-        # as methods see it: the weight epsilon is in the program's own units (decision 16)
+        # in the units in which methods solve: the weight epsilon is in the program's own units (decision 16)
         own = self.program.own_units
         program = users if own is None else imposed_program(own.program, formulation)
         if self.literal:
@@ -227,7 +296,7 @@ class Inspection:
         from sparserob_core.sip.relaxed.policy_value import PolicyValue
 
         assert self.program.spread is not None
-        # as methods see it: in the program's own units (decision 16)
+        # in the units in which methods solve, the program's own (decision 16)
         own = self.program.own_units
         program = self.program if own is None else own.program
         value, deviations = PolicyValue(program), self.program.spread.size
@@ -236,7 +305,7 @@ class Inspection:
         times = [family.index_set for family in self.program.families if not family.defines]
         lower, upper = min(float(box.lower[0]) for box in times), max(float(box.upper[0]) for box in times)
         kinds: tuple[CoordinateKind, ...] = ("time", *_repeated("disturbance", deviations))
-        far = np.full(deviations, 1.0 / TOLERANCE)  # no coefficient of a deviation is an axis: any box holds them
+        far = np.full(deviations, 1.0 / TOLERANCE)  # no coefficient of a deviation is an axis: any large box will do
 
         def deciding() -> np.ndarray:
             weights = value.weights()
@@ -256,15 +325,18 @@ class Inspection:
 
     @property
     def width(self) -> int:
-        """How many coordinates one index of the method's tuples has."""
+        """The number of coordinates of one index of the method's tuples."""
         from sparserob_core.sip.relaxed.tuples import TupleLayout, imposed_program
 
         program = imposed_program(self.program, "literal" if self.literal else "reduced")
         return TupleLayout(program.families, 1).slot.dimension
 
     def names(self, width: int) -> tuple[str, ...]:
-        """What the ``width`` coordinates of one index are called: ``t``, ``w1`` ... (coefficients of the disturbance),
-        the parameters as in the config, ``z1`` ... (a direction), or ``xi1`` ... where there is no control problem."""
+        """Return the names of the ``width`` coordinates of one index.
+
+        They are ``t``, ``w1``, ... (coefficients of the disturbance), the parameters as in the config, and ``z1``, ...
+        (a direction). They are ``xi1``, ... where there is no control problem.
+        """
         kinds, problem = self.kinds(width), self.problem
         given = iter(() if problem is None else problem.system.names)
         return tuple(
@@ -275,13 +347,13 @@ class Inspection:
         )
 
     def kinds(self, width: int) -> tuple[CoordinateKind, ...]:
-        """What the ``width`` coordinates of one index are; ``index`` where there is no control problem."""
+        """Return the kinds of the ``width`` coordinates of one index; ``index`` where there is no control problem."""
         problem = self.problem
         if problem is None:
             return tuple(_repeated("index", width))
         parameters = _repeated("parameter", problem.system.parameter_count)
         rest = width - 1 - len(parameters)
-        if self.literal:  # as LiteralConstraint has them: time, coefficients, then the rest of the reduced index
+        if self.literal:  # in the order of LiteralConstraint: time, coefficients, then the rest of the reduced index
             return ("time", *_repeated("disturbance", rest), *parameters)
         return ("time", *parameters, *_repeated("direction", rest))
 
@@ -291,8 +363,11 @@ class Inspection:
 
 
 def _with_the_worst(family: ConstraintFamily, coefficients: np.ndarray) -> ConstraintFamily:
-    """A literal family that takes NaN in the place of all ``coefficients (width,)`` of a disturbance for the worst one
-    of each row: those rows are then the reduced ones, at the other coordinates of the index."""
+    """Return a literal family in which NaN in place of all ``coefficients (width,)`` of a disturbance means the worst
+    one.
+
+    The rows are then the reduced ones, at the other coordinates of the index.
+    """
     reduced, literal, mine = family.reduced, family.rows, coefficients[: family.index_set.dimension]
     if reduced is None:  # no uncertainty acts on it
         return family

@@ -1,4 +1,4 @@
-"""What a run writes down: its rounds as they come, and the outcome, or how far it got."""
+"""The record of a run in its directory: its rounds as they come, and its outcome or the point at which it ended."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ STOPPED = "no figures: the run was stopped; sparserob figures draws them"
 
 @final
 class Journal(Observer):
-    """Keeps the rounds, so that a run that ends early leaves them, and writes everything down."""
+    """The observer that keeps the rounds of a run and writes its files.
+
+    A run that ends early leaves the rounds that it has finished.
+    """
 
     def __init__(self, directory: RunDirectory, experiment: Experiment, origin: Mapping[str, Any]) -> None:
         self.directory, self.experiment, self.origin = directory, experiment, origin
@@ -40,13 +43,13 @@ class Journal(Observer):
         self.asked = False
 
     def receive(self, event: Event) -> None:
-        """Keep every round, and whether the maximiser was asked."""
+        """Keep every round, and the fact that the maximiser was called."""
         self.asked |= isinstance(event, EvaluationsFinished)
         if isinstance(event, RoundFinished):
             self.rounds.append(event)
 
     def record(self, result: Result) -> tuple[Array | None, dict[str, Any]]:
-        """Write ``result.json``; returns the control ``(m, K)`` and the contents."""
+        """Write ``result.json``; returns the control ``(m, K)`` and the contents of the file."""
         control = control_of(result, self.experiment.program, self._dictionary)
         config = self.experiment.loaded.config
         summary = {
@@ -64,7 +67,7 @@ class Journal(Observer):
         return control, summary
 
     def _added_up(self, result: Result) -> dict[str, str]:
-        """What the cost is made of, where that is not the L1 norm alone."""
+        """Return the terms of the cost in words, where it is not the L1 norm alone."""
         problem = self.experiment.problem
         if problem is None or result.sparsest is not None:
             return {}
@@ -72,8 +75,11 @@ class Journal(Observer):
         return {"cost_of": words} if words else {}
 
     def _causal(self, result: Result) -> dict[str, Any]:
-        """Under feedback what no causal policy costs less than; ``null`` where nothing is proven, or none exists, and
-        why no more was sought."""
+        """Return the entries of ``result.json`` about causal policies; there are none without feedback.
+
+        They are the least cost of any causal policy, whether none exists, and the reason for which the search ended.
+        The cost is ``null`` where nothing is proven or no policy exists.
+        """
         model = self.experiment.model
         if model is None or model.feedback is None:
             return {}
@@ -91,8 +97,20 @@ class Journal(Observer):
         return None if model is None else model.control
 
     def known(self, said: str, seconds: float) -> Result | None:
-        """What is known of a run whose method was interrupted: the decision of the last round, undecided; ``None``
-        where no round had one."""
+        """Return the result of a run whose method was interrupted: the decision of the last round, undecided.
+
+        Parameters
+        ----------
+        said : str
+            The reason of the interrupt, in words.
+        seconds : float
+            The seconds since the run began.
+
+        Returns
+        -------
+        Result or None
+            The result; ``None`` where no round had a decision.
+        """
         last = next((entry for entry in reversed(self.rounds) if entry.decision is not None), None)
         if last is None:
             return None
@@ -108,7 +126,7 @@ class Journal(Observer):
         )
 
     def record_unfinished(self, said: str, seconds: float) -> None:
-        """Write how far a run got that ended early."""
+        """Write the results of a run that ended early, with the reason ``said``."""
         try:
             self.record(self._unfinished(said, seconds))
             self.directory.write_arrays("trace.npz", trace_columns(self.rounds))
@@ -130,9 +148,28 @@ class Journal(Observer):
         notify: Notify = ignore,
         deadline: Deadline | None = None,
     ) -> tuple[Array | None, dict[str, Any], Sequence[str]]:
-        """Write the outcome and its certificate; returns the control ``(m, K)``, what ``result.json`` holds, and what
-        could not be drawn. ``notify`` receives `StudyProgress` where a figure takes longer. Past the ``deadline``
-        nothing is drawn."""
+        """Write the outcome of a run, its certificate and its figures.
+
+        Parameters
+        ----------
+        result : Result
+            The result.
+        figures : bool
+            Whether figures are drawn. A result that was stopped is not drawn.
+        notify : callable, optional
+            A function that receives `StudyProgress`, for each phase and where a figure takes longer.
+        deadline : Deadline, optional
+            The time after which nothing is drawn.
+
+        Returns
+        -------
+        control : array (m, K) or None
+            The control on its pieces.
+        summary : dict
+            The contents of ``result.json``.
+        drawn : sequence of str
+            Warnings about figures that could not be drawn.
+        """
         experiment, write, time_left = self.experiment, self.directory, deadline or Deadline()
         control, summary = self.record(result)
         model = self.experiment.model
@@ -157,7 +194,7 @@ class Journal(Observer):
         return control, summary, drawn
 
     def _illustrated(self, result: Result, control: Array | None, figures: bool, notify: Notify) -> tuple[str, ...]:
-        """Write the worst cases, and the figures; returns what could not be drawn."""
+        """Write the worst cases and the figures; returns warnings about figures that could not be drawn."""
         worst = adversaries(self.experiment, np.asarray(result.decision)) if control is not None else {}
         if worst:
             self.directory.write_arrays(ADVERSARY, worst)
@@ -169,11 +206,14 @@ class Journal(Observer):
 
 
 def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str, str]]:
-    """Notes on the components that a config names, of a run: the key, its place and what is to be known, where one had
-    nothing to do, or a solver left programs to another. ``asked``: whether the maximiser was."""
+    """Yield notes on components that the config of a run names: the key, its place and the note.
+
+    There is a note where a component had nothing to do, or where a solver left programs to another. ``asked`` says
+    whether the maximiser was called.
+    """
     yield from _on_solver(loaded, result)
     if not result.history:
-        return  # it came to an end before anybody had something to do
+        return  # the run ended before any component was needed
     if not asked:
         said = "it was never asked: the worst cases of this problem are known in closed form, or nothing can be moved"
         yield from _of(loaded, ("maximiser",), said)
@@ -189,7 +229,7 @@ def _on_solver(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
     reasons: dict[tuple[str, str], list[Unanswered]] = {}
     for missed in result.unanswered:
         reasons.setdefault((missed.kind, missed.by), []).append(missed)
-    for (kind, by), found in reasons.items():  # as many as the table says, whatever the reasons
+    for (kind, by), found in reasons.items():  # one note, whose number is that of the table, for all reasons together
         why = found[0].reason if len(found) == 1 else "; ".join(f"{one.count} of them: {one.reason}" for one in found)
         said = f"{name} did not answer {sum(one.count for one in found)} of the {kind} programs, {by} did: {why}"
         yield from _of(loaded, ("solver",), said)
@@ -198,8 +238,11 @@ def _on_solver(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
 
 
 def _of(loaded: Loaded, slot: Path, note: str) -> Iterator[Mapping[str, str]]:
-    """A note on a component, where the config or an override names it: where everything is written, as in the config
-    that a run leaves, what is not the default."""
+    """Yield a note on a component, where the config or an override names it.
+
+    A complete config, such as that of a run directory, names every component. A note is then given only for one that is
+    not the default.
+    """
     place, written = loaded.place(slot), loaded.config.plain()
     if set(written) <= set(loaded.source.data) and written[str(slot[0])]["name"] == _default(slot):
         place = None
@@ -208,5 +251,5 @@ def _of(loaded: Loaded, slot: Path, note: str) -> Iterator[Mapping[str, str]]:
 
 
 def _default(slot: Path) -> str:
-    """The name of a component by default."""
+    """Return the name of the component that is the default of a slot."""
     return str(RunConfig.model_fields[str(slot[0])].default.name)

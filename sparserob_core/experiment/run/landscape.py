@@ -1,8 +1,10 @@
-"""The landscape of ``g`` over two coordinates of the two indices that decide most, the others held where the best
-tuple has them: which indices these are in a tuple, which coordinates move g most, and the values of the map.
+"""The landscape of ``g`` over two coordinates of the two indices that decide most.
 
-It is filled from coarse to fine by evaluations of its own, of another program with another solver, on lines that only
-the options and the tuple decide; some of these lines go through the tuple itself.
+The other coordinates are those of the best tuple. The module finds these two indices of a tuple and the coordinates
+along which g changes most, and it computes the values of the map.
+
+A program and a solver of its own evaluate the map from coarse to fine. Its grid lines depend only on the options and on
+the tuple; some of them go through the tuple itself.
 """
 
 from __future__ import annotations
@@ -21,37 +23,61 @@ from sparserob_core.sip.events import DECIDING
 
 STRIDES = (8, 4, 2, 1)
 COARSEST = 16
-"""The stride before them where one value is a robust program of its own: sixteen values, which come within a second.
-With twice as large a one there is hardly more than the corners; with half of it 36 are not there when a run of two
-seconds ends on a busy machine."""
-FLAT = 1e-9  # of g: smaller differences are the solver's
+"""The stride before those of `STRIDES` where each value is a robust program of its own. It gives sixteen values, which
+take a second. With twice as large a stride there is hardly more than the corners. With half of it 36 values are not
+complete when a run of two seconds ends on a busy machine."""
+FLAT = 1e-9  # relative to g: smaller differences are errors of the solver
 CLOSE = 0.01  # of the distance of two lines of the grid
 
 PROBES = 5
-"""Values of a coordinate at which g is asked how far it moves along it. With two of them a ridge between the ends is
-not seen; with fifty the choice of the axes takes as long as a map."""
+"""Values of a coordinate at which the change of g along it is measured. With two of them a ridge between the ends stays
+hidden; with fifty the choice of the axes takes as long as a map."""
 
 Place: TypeAlias = tuple[int, int]
-"""Of a coordinate of a tuple: ``(slot, coordinate)``."""
+"""The place of a coordinate in a tuple: ``(slot, coordinate)``."""
 Axis: TypeAlias = tuple[int, int]
-"""Of an axis of a map: ``(rank, coordinate)`` of the index that decides most (rank 0) or of the other (1)."""
+"""The axis of a map: ``(rank, coordinate)`` of the index that decides most (rank 0) or of the other one (rank 1)."""
 Reach: TypeAlias = tuple[float, float]
-"""How far g moves along an axis: on which share of it g is infinite, and the range of its finite values."""
+"""The change of g along an axis: the share of the axis on which g is infinite, and the range of its finite values."""
 NEAR = 0.05
-"""Indices that are nearer to one another, in widths of the box, stand for one constraint and move together. A tenth of
-it, and two that a search has put beside one another hide that g depends on them; ten times, and all of them are one."""
+"""Indices that are nearer to one another, in widths of the box, stand for one constraint and move together. With a
+tenth of it, two close indices of a search hide that g depends on them. With ten times it, all indices are one."""
 
 
 @final
 @dataclass(eq=False)
 class Landscape:
-    """One slice through an ``anchor (D, width)``: ``values (a, b)`` over ``first`` and ``second``, coordinates
-    ``(slot, coordinate)``. Indices that are `NEAR` to one of these two stand for the same constraint and move with it;
-    of all that move the disturbance is at its worst.
+    """A map of g on a plane through a tuple, over two of its coordinates.
 
-    ``values[i, j]`` belongs to ``axes[0][i]`` and ``axes[1][j]``; NaN where nothing was evaluated, ``inf`` where the
-    relaxed program is infeasible. ``axes[k][at[k]]`` is the anchor's coordinate. ``level`` is the stride of the finest
-    grid that is complete, 0 before the first.
+    An index that is `NEAR` to one of the two that move stands for the same constraint and moves with it. The
+    disturbance of every index that moves is the worst one.
+
+    Parameters
+    ----------
+    g : RelaxedValue
+        The function.
+    anchor : array (D, width)
+        The tuple.
+    first, second : tuple of int
+        The coordinates ``(slot, coordinate)`` of the axes.
+    grid : int
+        The number of even values along an axis.
+    epsilon : float, default 0.0
+        The weight of the regulariser.
+    seen : LandscapeAxes, optional
+        The axes by the ranks of their indices.
+
+    Attributes
+    ----------
+    values : array (a, b)
+        The values; ``values[i, j]`` belongs to ``axes[0][i]`` and ``axes[1][j]``. NaN where nothing was evaluated,
+        ``inf`` where the relaxed program is infeasible.
+    axes : tuple of two arrays
+        The coordinates along the axes; ``axes[k][at[k]]`` is that of the anchor.
+    level : int
+        The stride of the finest grid that is complete; 0 before the first.
+    spent : int
+        The number of evaluations.
     """
 
     g: RelaxedValue
@@ -72,7 +98,7 @@ class Landscape:
         heads = (self.first[0], self.second[0])
         plain = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
         alike = bool((self.anchor[heads[0], plain] == self.anchor[heads[1], plain]).all())
-        # one coordinate of two indices of which each may be the other: a value belongs to both of their orders
+        # the axes are one coordinate of two indices that can be exchanged: each value holds for both orders
         self._mirrored = self.first[1] == self.second[1] and alike and self.g.interchangeable
         one, other = self._axis(self.first), self._axis(self.second)
         self.axes, self._bases, self._always = (one[0], other[0]), (one[1], other[1]), (one[2], other[2])
@@ -85,7 +111,7 @@ class Landscape:
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
 
     def _beside(self, slot: int, heads: tuple[int, int]) -> int:
-        """The head that an index is `NEAR` to, and moves with; -1 where there is none."""
+        """Return the head to which an index is `NEAR` and with which it moves; -1 where there is none."""
         widths = np.where(self.g.slot.upper > self.g.slot.lower, self.g.slot.upper - self.g.slot.lower, np.inf)
         away = {head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._open].max() for head in heads}
         if not self.g.interchangeable:
@@ -94,9 +120,11 @@ class Landscape:
         return nearest if away[nearest] < NEAR else -1
 
     def _axis(self, place: Place) -> tuple[Array, np.ndarray, np.ndarray]:
-        """Return the values along an axis, which of them are those of the even grid, and which are the anchor's: of a
-        symmetric map those of both indices, since a ridge through either is on both axes. Where one of the even grid is
-        close to the anchor, it moves there."""
+        """Return the values along an axis, those of them in the even grid, and those of the anchor.
+
+        On a symmetric map the axis has the values of both indices, since a ridge through either is on both axes. A
+        value of the even grid that is close to the anchor is moved onto it.
+        """
         even = np.linspace(self.g.slot.lower[place[1]], self.g.slot.upper[place[1]], self.grid)
         through = np.unique([self.anchor[at] for at in ((self.first, self.second) if self._mirrored else (place,))])
         for value in through:
@@ -108,11 +136,12 @@ class Landscape:
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """From coarse to fine: those of a policy begin with `COARSEST`."""
+        """The strides from coarse to fine; those of a policy begin with `COARSEST`."""
         return STRIDES if self.g.interchangeable else (COARSEST, *STRIDES)
 
     def lines(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
-        """Which values of either axis belong to the grid of a stride: its ends and the anchor's always do."""
+        """Return the positions on either axis of the grid with a stride; the ends and the anchor always belong
+        to it."""
         one, other = (
             np.union1d(base[np.union1d(np.arange(0, self.grid, stride), [self.grid - 1])], always)
             for base, always in zip(self._bases, self._always, strict=True)
@@ -120,13 +149,13 @@ class Landscape:
         return one, other
 
     def evaluate(self) -> Iterator[bool]:
-        """Evaluate one point at each step, the anchor first; ``True`` where a level has become complete."""
+        """Evaluate one point at each step, the anchor first; yields ``True`` where a level has become complete."""
         self._fill(*self.at)
         yield False
         for stride in self.strides:
             across, up = self.lines(stride)
             for turn, i in enumerate(across):
-                # neighbours follow one another: the last optimum is a good start
+                # the next point is a neighbour of the last one, whose optimum is a good start
                 for j in up if turn % 2 == 0 else up[::-1]:
                     if np.isnan(self.values[i, j]):
                         self._fill(int(i), int(j))
@@ -142,7 +171,7 @@ class Landscape:
 
     @property
     def reach(self) -> Reach:
-        """How far g moves along ``first``, of what `cross` has evaluated."""
+        """The change of g along ``first``, from the values that `cross` has evaluated."""
         values = self.values[:, self.at[1]]
         known = values[np.isfinite(values)]
         return float(np.mean(values == np.inf)), float(np.ptp(known)) if known.size else 0.0
@@ -156,16 +185,18 @@ class Landscape:
         self.values[i, j] = value if not np.isnan(value) else -np.inf
 
     def _order(self, one: float, other: float) -> tuple[float, float]:
-        """Return where the first and the second index are at a point: where g knows no order of the two, in that of the
-        anchor."""
+        """Return the coordinates of the first and the second index at a point.
+
+        Where g does not depend on their order, they are in the order of the anchor.
+        """
         ordered = (one <= other) == bool(self.anchor[self.first] <= self.anchor[self.second])
         return (other, one) if self._mirrored and not ordered else (one, other)
 
     def _tuple(self, to: tuple[float, float]) -> Array:
-        """Return the tuple ``(D, width)`` whose two indices are where they are to be."""
+        """Return the tuple ``(D, width)`` whose two indices have the coordinates ``to``."""
         slots = self.anchor.copy()
         for place, moving, end in zip((self.first, self.second), self._moving, to, strict=True):
-            # they keep their distance: at the anchor the tuple is the anchor's own, whose value none may lie below
+            # indices that move together keep their distance: at the anchor the tuple must be the anchor itself
             c, shift = place[1], end - self.anchor[place]
             slots[moving, c] = np.clip(self.anchor[moving, c] + shift, self.g.slot.lower[c], self.g.slot.upper[c])
             slots[place] = end
@@ -174,31 +205,34 @@ class Landscape:
 
     @property
     def value(self) -> float:
-        """``g`` at the anchor; NaN before the first evaluation."""
+        """The value of ``g`` at the anchor; NaN before the first evaluation."""
         return float(self.values[self.at])
 
     @property
     def shown(self) -> tuple[Array, Array, Array]:
-        """The finest grid that is complete: its values along both axes, and those of ``g (a, b)`` there."""
+        """The finest grid that is complete: its values along both axes, and those of ``g (a, b)`` on it."""
         across, up = self.lines(self.level or self.strides[0])
         return self.axes[0][across], self.axes[1][up], self.values[np.ix_(across, up)]
 
     @property
     def limits(self) -> tuple[float, float]:
-        """The least and the largest finite value that is shown; both NaN where there is none."""
+        """The smallest and the largest finite value of the complete grid; both NaN where there is none."""
         values = self.shown[2]
         known = values[np.isfinite(values)]
         return (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
 
     @property
     def flat(self) -> bool:
-        """Whether ``g`` is the same everywhere on the grid."""
+        """True where ``g`` is the same everywhere on the complete grid."""
         low, high = self.limits
         return bool(np.isfinite(self.shown[2]).all() and high - low <= FLAT * max(1.0, abs(high)))
 
     def picture(self, size: int) -> Array:
-        """The values ``(size, size)`` in the middles of even cells, between those that are known in straight lines;
-        beside an infinite value as the nearest of them."""
+        """Return the values ``(size, size)`` at the centres of even cells, by linear interpolation of those that are
+        known.
+
+        Where a neighbour is infinite it is the value of the nearest neighbour.
+        """
         across, up, values = self.shown
         shares = []
         for axis in (across, up):
@@ -215,8 +249,11 @@ class Landscape:
         return np.asarray(np.where(finite, mixed, nearest))
 
     def names(self, unit: str = "") -> tuple[str, str]:
-        """The two coordinates in words: ``t of the earlier``; just ``t`` where a tuple has a single index. Behind a
-        time its ``unit``, where one is given: ``t of the earlier, in s``."""
+        """Return the two coordinates in words, such as ``t of the earlier``.
+
+        It is only ``t`` where a tuple has a single index. A time is followed by its ``unit``, where one is given: ``t
+        of the earlier, in s``.
+        """
         (one, c), (other, k) = self.first, self.second
         in_unit = [f", in {unit}" if unit and self.g.kinds[place] == "time" else "" for place in (c, k)]
         if len(self.anchor) == 1:
@@ -231,15 +268,17 @@ class Landscape:
 @final
 @dataclass(frozen=True)
 class LandscapeAxes:
-    """The two axes of a map: each is a coordinate of an index, of that which decides most (``ranks`` 0) or of the other
-    (1). ``orders``: both are the same coordinate of two indices, of which the lesser is across."""
+    """The two axes of a map: each is a coordinate of one of the two indices that decide most.
+
+    ``ranks`` says which index it is: 0 for the one that decides most, 1 for the other.
+    """
 
     ranks: tuple[int, int]
     coordinates: tuple[int, int]
 
     @property
     def orders(self) -> bool:
-        """Whether the axes are the same coordinate of two indices."""
+        """True where the axes are the same coordinate of two indices; the smaller one is then across."""
         return self.coordinates[0] == self.coordinates[1]
 
     @classmethod
@@ -250,10 +289,31 @@ class LandscapeAxes:
         named: tuple[str, str] | None = None,
         reach: Mapping[Axis, Reach] | None = None,
     ) -> LandscapeAxes | None:
-        """The axes of the map of tuples of ``count`` indices: those ``named``, or else the two along which g moves most
-        as the ``reach`` says (`measure`). Of equals, and where nothing is known, the first coordinate of an index,
-        such as its time, of two of them, or two coordinates of the only one; ``None`` where fewer than two can move.
-        Raises `InputError` for a name that there is not."""
+        """Return the axes of the map of tuples of ``count`` indices.
+
+        Parameters
+        ----------
+        g : RelaxedValue
+            The function.
+        count : int
+            The number of indices of a tuple.
+        named : tuple of two str, optional
+            The names of the axes.
+        reach : mapping, optional
+            The changes of g along the axes (`measure`). Unless names are given, the axes are the two of the largest
+            change. Equal ones, and those of which nothing is known, come in the order of `axes_of`: first a coordinate
+            such as the time, of one or of two indices.
+
+        Returns
+        -------
+        LandscapeAxes or None
+            The axes; ``None`` where fewer than two coordinates can move.
+
+        Raises
+        ------
+        InputError
+            If there is no coordinate of that name, or one is named twice.
+        """
         if named is not None:
             one, other = (coordinate(name, g) for name in named)
             if one == other:
@@ -268,9 +328,21 @@ class LandscapeAxes:
 
     @staticmethod
     def measure(g: RelaxedValue, anchor: Array, pair: tuple[int, int], reach: dict[Axis, Reach]) -> Iterator[None]:
-        """Evaluate g of the tuple ``anchor (D, width)``, of which the indices ``pair`` decide most, along every
-        possible axis, one point at each step, and note the ``reach`` of each; where there is no choice, nothing is
-        evaluated."""
+        """Evaluate g along every possible axis, one point at each step, and write the changes into ``reach``.
+
+        Nothing is evaluated where there is no choice of axes.
+
+        Parameters
+        ----------
+        g : RelaxedValue
+            The function.
+        anchor : array (D, width)
+            The tuple through which the axes go.
+        pair : tuple of int
+            The two indices that decide most.
+        reach : dict
+            The changes of g along the axes, which are added here.
+        """
         axes = axes_of(g, 1 if pair[0] == pair[1] else 2)
         for rank, c in axes if len(axes) > 2 else ():
             other = next((r, k) for r, k in axes if (r, k) != (rank, c))
@@ -279,13 +351,39 @@ class LandscapeAxes:
             reach[rank, c] = line.reach
 
     def places(self, pair: tuple[int, int], anchor: Array) -> tuple[Place, Place]:
-        """The places of the axes in a tuple ``(D, width)`` of which the indices ``pair`` decide most."""
+        """Return the places of the axes in a tuple.
+
+        Parameters
+        ----------
+        pair : tuple of int
+            The two indices that decide most.
+        anchor : array (D, width)
+            The tuple.
+
+        Returns
+        -------
+        tuple of two places
+            The places of the axis to the right and of the axis upwards. Where both are the same coordinate, the index
+            with the smaller value is to the right.
+        """
         one, other = ((pair[rank], c) for rank, c in zip(self.ranks, self.coordinates, strict=True))
         return (other, one) if self.orders and anchor[other] < anchor[one] else (one, other)
 
     def of(self, told: tuple[int, ...], places: Array) -> Array | None:
-        """The points ``(n, 2)`` of places ``(n, 2, c)`` whose coordinates are those ``told (c,)``; ``None`` where these
-        have not come along."""
+        """Return the points of the map at the places of two indices.
+
+        Parameters
+        ----------
+        told : tuple of int
+            The coordinates ``(c,)`` that the places contain.
+        places : array (n, 2, c)
+            The places of the two indices.
+
+        Returns
+        -------
+        array (n, 2) or None
+            The points; ``None`` where the coordinates of the axes are not among those that the places contain.
+        """
         if not set(self.coordinates) <= set(told):
             return None
         points = np.stack(
@@ -295,19 +393,24 @@ class LandscapeAxes:
 
 
 def axes_of(g: RelaxedValue, count: int) -> list[Axis]:
-    """What a map of tuples of ``count`` indices may be over: every coordinate that can move, of one index or of two."""
+    """Return every possible axis of a map of tuples of ``count`` indices: each coordinate that can move, of one or two
+    indices."""
     return [(rank, c) for c in moving_of(g) for rank in range(min(2, count))]
 
 
 def moving_of(g: RelaxedValue) -> list[int]:
-    """The coordinates of an index that a map may be over: those that can move, disturbances left out, and directions
-    last, which say least to a reader."""
+    """Return the coordinates of an index that a map may be over.
+
+    They are those that can move and belong to no disturbance. Directions come last, as they mean least to a reader.
+    """
     return sorted(g.coordinates, key=lambda k: g.kinds[k] == "direction")
 
 
 def coordinate(name: str, g: RelaxedValue) -> tuple[int, int]:
-    """The rank and the coordinate of a name such as ``t``, ``p1`` or ``t[2]``, that of the index that decides second;
-    raises `InputError`."""
+    """Return the rank and the coordinate of a name such as ``t``, ``p1`` or ``t[2]``.
+
+    A name with ``[2]`` is that of the index that decides second. Raises `InputError` where there is no such name.
+    """
     letter, bracket, rest = name.partition("[")
     number = rest.removesuffix("]") if bracket else "1"
     if letter not in g.names or number not in ("1", "2"):
@@ -320,15 +423,44 @@ def coordinate(name: str, g: RelaxedValue) -> tuple[int, int]:
 
 
 def deciding_pair(g: RelaxedValue, anchor: Array) -> tuple[int, int]:
-    """The two indices that decide most at the tuple ``(D, width)`` at which g was evaluated last."""
+    """Return the two indices that decide most at the tuple at which g was evaluated last.
+
+    Parameters
+    ----------
+    g : RelaxedValue
+        The function.
+    anchor : array (D, width)
+        The tuple.
+
+    Returns
+    -------
+    tuple of int
+        The two indices; the same one twice where there is only one.
+    """
     plain = list(g.coordinates)
     widths = g.slot.upper[plain] - g.slot.lower[plain]
     return two_of(g.deciding(), anchor[:, plain], widths, (0, min(1, len(anchor) - 1)))
 
 
 def two_of(ranked: Sequence[int] | np.ndarray, slots: Array, widths: Array, others: Sequence[int]) -> tuple[int, int]:
-    """The two indices of a tuple ``(D, c)`` that decide most and do not stand for the same constraint: of those
-    ``ranked`` by their multipliers, -1 for none, then of the ``others``, then any; one twice where there is one."""
+    """Return the two indices of a tuple that decide most and do not stand for the same constraint.
+
+    Parameters
+    ----------
+    ranked : sequence of int
+        Indices by their multipliers, the largest first; -1 for none.
+    slots : array (D, c)
+        The tuple.
+    widths : array (c,)
+        The widths of the box.
+    others : sequence of int
+        The indices that are taken after those that are ranked; any other index comes last.
+
+    Returns
+    -------
+    tuple of int
+        The two indices; the same one twice where there is only one.
+    """
     first, *rest = [int(k) for k in ranked if k >= 0] or [int(others[0])]
     apart = [k for k in rest if np.abs((slots[k] - slots[first]) / widths).max() > NEAR]
     second = next((k for k in (*apart, *others, *rest, *range(len(slots))) if k != first), first)
@@ -336,8 +468,24 @@ def two_of(ranked: Sequence[int] | np.ndarray, slots: Array, widths: Array, othe
 
 
 def deciding_slots(deciding: np.ndarray, tuples: Array, widths: Array, pair: tuple[int, int]) -> np.ndarray:
-    """The two indices ``(n, 2)`` that decide most in each of the tuples ``(n, D, c)``, of which ``deciding (n, 4)``
-    ranks some, -1 for none; those of the tuple before, at first ``pair``, where fewer decide."""
+    """Return the two indices that decide most in each of the tuples of a search.
+
+    Parameters
+    ----------
+    deciding : array of int (n, 4)
+        The indices of every tuple by their multipliers, the largest first; -1 for none.
+    tuples : array (n, D, c)
+        The tuples.
+    widths : array (c,)
+        The widths of the box.
+    pair : tuple of int
+        The two indices before the first tuple.
+
+    Returns
+    -------
+    array of int (n, 2)
+        The two indices of every tuple. Where fewer than two decide, the others are those of the tuple before.
+    """
     rows, first = np.arange(len(tuples)), deciding[:, 0]
     heads = tuples[rows, first]  # of a row in which nothing decides it is any index, and not used
     apart = np.abs((tuples[rows[:, np.newaxis], deciding] - heads[:, np.newaxis]) / widths).max(axis=2) > NEAR
@@ -345,7 +493,7 @@ def deciding_slots(deciding: np.ndarray, tuples: Array, widths: Array, pair: tup
     second = np.where(apart.any(axis=1), deciding[rows, apart.argmax(axis=1)], -1)
     found = list[tuple[int, int]]()
     for row, (most, next_most) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        if most >= 0 and next_most < 0:  # one decides alone, beside those that stand for the same constraint
+        if most >= 0 and next_most < 0:  # one decides alone, or all that decide stand for the same constraint
             next_most = next((k for k in pair if k != most), -1)
         if most >= 0 and next_most < 0:
             most, next_most = two_of(deciding[row], tuples[row], widths, pair)
@@ -355,8 +503,12 @@ def deciding_slots(deciding: np.ndarray, tuples: Array, widths: Array, pair: tup
 
 
 def deciding_again(g: RelaxedValue, points: Array, notes: Mapping[str, Array], seconds: float) -> np.ndarray:
-    """The indices ``(n, 4)`` that decide most in each tuple ``(n, D width)`` of a search, which no directory keeps: by
-    evaluating those once more that the walk went to, the last ones first, for some ``seconds``; -1 of the others."""
+    """Return the indices ``(n, 4)`` that decide most in each tuple ``(n, D width)`` of a search; -1 where it is not
+    known.
+
+    No run directory keeps them. The tuples that the search accepted are evaluated once more for some ``seconds``, the
+    last ones first.
+    """
     found = np.full((len(points), DECIDING), -1)
     accepted = notes.get("accepted", np.ones(len(points))) > 0.0
     end = time.monotonic() + seconds

@@ -1,5 +1,4 @@
-"""What a run, or `solve` for a problem, returned: an answer that saves itself, draws itself, and is taken wherever a
-run directory is."""
+"""The outcome of a run or of `solve`: it saves and draws itself, and stands wherever a run directory does."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
 
     from sparserob_core.control.studies.causal import CausalBound
 
-ROWS = 4  # of a table, in a line each of what `repr` says
+ROWS = 4  # of the table of a run, which `repr` shows
 HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"
 COMPONENTS = ("method", "maximiser", "solver", "regulariser", "policy")
 
@@ -56,8 +55,10 @@ COMPONENTS = ("method", "maximiser", "solver", "regulariser", "policy")
 @final
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """How `solve` was asked for a problem: components by name, by mapping or as objects (``choices``), dictionaries,
-    and the other keys of a config (``rest``)."""
+    """The arguments of `solve` for a problem.
+
+    ``choices`` are the components, by name, by mapping or as objects. ``rest`` holds the other keys of a config.
+    """
 
     problem: OptimalControlProblem
     choices: Mapping[str, Any]
@@ -65,7 +66,7 @@ class Asked:
     rest: Mapping[str, Any]
 
     def source(self) -> Source:
-        """The config that says the same; raises `InputError` where none can."""
+        """Return the config with the same meaning; raises `InputError` where there is none."""
         registry, beside = load_registry(), dict(self.rest)
         for kind, choice in self.choices.items():
             beside[kind] = None if choice is None else component_keys(registry, kind, choice)
@@ -79,15 +80,41 @@ class Asked:
 @final
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class SolvedProblem(ControlResult):
-    """The `ControlResult` of `solve` or of a run, which is a run itself: it is saved, drawn, and taken by `check`,
-    `simulate`, `margin`, `controller`, `loop` and `compare`. ``origin``: the config that it is of, or how it was asked
-    for, which becomes one when it is needed."""
+    """The result of `solve` for a control problem, or of a run, with its control, tube and worst cases.
+
+    It stands for a run: it can be saved and drawn, and `check`, `simulate`, `margin`, `controller`, `loop` and
+    `compare` take it.
+
+    Parameters
+    ----------
+    origin : Source or Asked
+        The config of the result, or the arguments of `solve`, which become a config when one is needed.
+
+    Notes
+    -----
+    The other fields are those of `ControlResult`.
+    """
 
     origin: Source | Asked = field(repr=False)
 
     @staticmethod
     def run(result: Result, experiment: ControlExperiment, causal: CausalBound | None = None) -> SolvedProblem:
-        """The result of a run, with its experiment."""
+        """Return the result of a run, together with its experiment.
+
+        Parameters
+        ----------
+        result : Result
+            The result.
+        experiment : ControlExperiment
+            The experiment that was run.
+        causal : CausalBound, optional
+            The bound for every causal policy.
+
+        Returns
+        -------
+        SolvedProblem
+            The result.
+        """
         loaded = experiment.loaded
         stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
         made = SolvedProblem.asked(result, experiment.transcription, stated, causal)
@@ -98,7 +125,24 @@ class SolvedProblem(ControlResult):
     def asked(
         result: Result, model: Transcription, origin: Source | Asked, causal: CausalBound | None = None
     ) -> SolvedProblem:
-        """The result of a problem that was transcribed."""
+        """Return the result of a problem that was transcribed.
+
+        Parameters
+        ----------
+        result : Result
+            The result.
+        model : Transcription
+            The problem on its dictionaries.
+        origin : Source or Asked
+            The config of the result, or the arguments of `solve`.
+        causal : CausalBound, optional
+            The bound for every causal policy.
+
+        Returns
+        -------
+        SolvedProblem
+            The result.
+        """
         known = {one.name: getattr(result, one.name) for one in fields(Result)}
         return SolvedProblem(**known, model=model, causal=causal, origin=origin)
 
@@ -109,27 +153,60 @@ class SolvedProblem(ControlResult):
 
     @cached_property
     def directory(self) -> Path:
-        """The directory of the run: where it was saved last, or else a temporary one that goes with the result."""
+        """The run directory: the last one that was saved, else a temporary one that is removed with the result."""
         path = Path(tempfile.mkdtemp(prefix="sparserob-"))
         weakref.finalize(self, shutil.rmtree, path, ignore_errors=True)
         return self._saved(path / "run", figures=False).directory
 
     def save(self, directory: str | Path, *, figures: bool = True) -> Outcome:
-        """Write a run directory like any other into ``directory``, new or empty, and return its outcome.
+        """Write a run directory like that of `run`.
 
-        What a run adds to a result is added here too: a lower bound without rounding, what is proven of the time of
-        action, and under feedback a bound for every causal policy. Raises `InputError` where no config can say the
-        problem, such as a function of the parameters that is no arithmetic, and where the directory cannot be made.
+        The bounds that a run adds to the result of its method are added here too. They are a lower bound without
+        rounding errors, bounds of the time of action, and under feedback a bound for every causal policy.
+
+        Parameters
+        ----------
+        directory : str or Path
+            The directory, new or empty.
+        figures : bool, default True
+            Whether the figures are drawn.
+
+        Returns
+        -------
+        Outcome
+            The run.
+
+        Raises
+        ------
+        InputError
+            If no config can describe the problem, for example one with a function of the parameters that is no
+            arithmetic. Also if the directory cannot be made.
         """
         outcome = self._saved(Path(directory), figures)
         self.__dict__["directory"] = outcome.directory
         return outcome
 
     def plot(self, name: str | None = None) -> Figure:
-        """A figure of the run, for matplotlib: ``control``, ``states``, ``plane`` where the problem names one,
-        ``convergence``, ``adversary``, under feedback ``gains``, ``effort`` and ``answers``, of a search ``climb`` and
-        ``landscape``, and ``clash`` of what is infeasible; without a name the
-        states, or the clash. Raises `InputError`, which names those that there are, for another one."""
+        """Return a figure of the run, for matplotlib.
+
+        Parameters
+        ----------
+        name : str, optional
+            The figure. With a control: ``control``, ``states``, ``convergence``, ``adversary``, ``plane`` where the
+            problem names one, and under feedback ``gains``, ``effort`` and ``answers``. Of a search: ``climb`` and
+            ``landscape``. Of an infeasible problem: ``clash``. Unless given it is ``states``, or ``clash`` where the
+            problem is infeasible.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            The figure.
+
+        Raises
+        ------
+        InputError
+            If there is no such figure; the message names those that there are.
+        """
         from sparserob_core.experiment.run.drawing import plot
 
         return plot(self.experiment, self, name)
@@ -142,7 +219,7 @@ class SolvedProblem(ControlResult):
     def _saved(self, path: Path, figures: bool) -> Outcome:
         experiment = self.experiment
         loaded, tools = experiment.loaded, tools_of(experiment.loaded)
-        if isinstance(tools.solver, Named):  # the account goes on where it was
+        if isinstance(tools.solver, Named):  # the counts of solver calls go on from those of the result
             tools.solver.failures.resume(self.counts.get("solver_calls", 0), self.unanswered)
         plain = loaded.config.plain()
         text = write_yaml(plain, HEADING)
@@ -151,12 +228,15 @@ class SolvedProblem(ControlResult):
         with create_directory(path, name_of(loaded), loaded.config.digest()) as directory:
             directory.write_text("config.yaml", text)
             journal = Journal(directory, experiment, provenance(plain, git_revision(loaded.source.folder)))
-            journal.asked = True  # nobody listened, so that nothing is said of a maximiser that had nothing to do
+            journal.asked = True  # nothing listened to the search: no note may claim that the maximiser was idle
             control, summary, remarks = journal.finish(result, figures)
         return Outcome(result, directory.path, experiment, control, summary, remarks)
 
     def _repr_html_(self) -> str:
-        """The table of the result and its control, for notebooks; a problem that no config can say has no figure."""
+        """Return the table of the result and the figure of its control, for notebooks.
+
+        There is no figure where no config can describe the problem.
+        """
         from sparserob_core.experiment.directory.record import control_of, summary_of
         from sparserob_core.experiment.run.drawing import picture
         from sparserob_core.experiment.terminal.notebook import page
@@ -177,9 +257,27 @@ class SolvedProblem(ControlResult):
 
 
 def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Notify = ignore) -> Result:
-    """What a run makes of the result of a method before it is written down: bounds that are proven without rounding,
-    what is known of the time of action, and of causal policies. Each of these is left out where the time of the tools
-    is over before it is known. ``notify`` receives `StudyProgress`, one a phase."""
+    """Add to the result of a method the bounds that a run proves before it writes its result.
+
+    They are lower bounds without rounding errors, bounds of the time of action, and bounds for causal policies. A bound
+    is left out where the time of the tools is over before it is known.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        The experiment of the result.
+    result : Result
+        The result of the method.
+    tools : Tools
+        The solver and the deadline.
+    notify : callable, optional
+        A function that receives `StudyProgress`, once at the beginning of each phase.
+
+    Returns
+    -------
+    Result
+        For a control problem a `SolvedProblem`; for another program the result as `remarked` returns it.
+    """
     if not isinstance(experiment, ControlExperiment):
         return remarked(experiment.program, result)
     attempt = tools.deadline.attempt
@@ -209,7 +307,7 @@ def _reread(
     causal: CausalBound | None,
     origin: Source | Asked,
 ) -> SolvedProblem:
-    """A pickled result; its program is built anew."""
+    """Return a result that was pickled; its program is built anew."""
     from sparserob_core.control.transcription.transcribe import prepare
 
     return SolvedProblem.asked(result, prepare(problem, control, disturbance, form, policy), origin, causal)
@@ -218,11 +316,27 @@ def _reread(
 @final
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """A finished run. ``control (m, K)`` is ``None`` without a decision or for a program that is no control problem;
-    the ``result`` of a control problem is a `ControlResult`; ``summary`` is what ``result.json`` holds; ``remarks`` say
-    what could not be done beside the result; ``interrupted``: a key or a signal ended it, or came while it ended.
+    """A finished run.
 
-    It can be pickled: the experiment is built anew from its config where it is read."""
+    It can be pickled; the experiment is then built anew from its config where the outcome is read.
+
+    Parameters
+    ----------
+    result : Result
+        The result; for a control problem a `SolvedProblem`.
+    directory : Path
+        The run directory.
+    experiment : Experiment
+        The experiment that was run.
+    control : array (m, K) or None
+        The control on its pieces. ``None`` without a decision, or for a program that is no control problem.
+    summary : mapping
+        The contents of ``result.json``.
+    remarks : sequence of str, default ()
+        Warnings about anything that could not be done in addition to the result.
+    interrupted : bool, default False
+        Whether a key or a signal ended the run, or came while it ended.
+    """
 
     result: Result
     directory: Path
@@ -243,7 +357,7 @@ class Outcome:
 
     @property
     def problem(self) -> OptimalControlProblem | None:
-        """The control problem."""
+        """The control problem; ``None`` for a program of another kind."""
         return self.experiment.problem
 
     @property
@@ -252,15 +366,20 @@ class Outcome:
         return self.experiment.program
 
     def tube(self, times: npt.ArrayLike) -> Tube:
-        """The states at times ``(T,)`` and how far the disturbance may bring them: `ControlResult.tube`."""
+        """Return the states at ``times (T,)`` with the bounds that the disturbance can bring them to
+        (`ControlResult.tube`)."""
         return self._of_control().tube(times)
 
     def worst(self, constraint: str) -> Adversary:
-        """The worst case of the constraint of that name: `ControlResult.adversary`."""
+        """Return the worst case of the ``constraint`` of that name (`ControlResult.adversary`)."""
         return self._of_control().adversary(constraint)
 
     def plot(self, name: str | None = None) -> Figure:
-        """A figure of the run, for matplotlib: `SolvedProblem.plot`."""
+        """Return a figure of the run, for matplotlib.
+
+        ``name`` is one of those of `SolvedProblem.plot`; unless given it is ``states``, or ``clash`` where the problem
+        is infeasible. Raises `InputError` if there is no such figure.
+        """
         from sparserob_core.experiment.run.drawing import plot
 
         return plot(self.experiment, self.result, name)
@@ -275,7 +394,7 @@ class Outcome:
         return "\n".join([f"Outcome of {self.experiment.title!r} in {self.directory}", *said])
 
     def _repr_html_(self) -> str:
-        """The table of the run and the figure of its control, for notebooks."""
+        """Return the table of the run and the figure of its control, for notebooks."""
         from sparserob_core.experiment.terminal.notebook import page
 
         file = self.directory / "figures" / "control.png"
@@ -291,10 +410,26 @@ class Outcome:
         return _read, (stated, plain, *kept, causal)
 
     def show(self, save: str | Path | None = None, *, serve: bool = False, connect: str | None = None) -> None:
-        """Show the run in the viewer of Rerun: a new one, one that listens at ``connect``, a browser (``serve``), or
-        later (``save``, a file).
+        """Show the run in the viewer of Rerun.
 
-        Raises `InputError` where there is none, or no display."""
+        Parameters
+        ----------
+        save : str or Path, optional
+            A file in which the run is recorded, to be shown later.
+        serve : bool, default False
+            Whether the run is shown in a browser.
+        connect : str, optional
+            The address of a viewer that is open.
+
+        Raises
+        ------
+        InputError
+            If there is no viewer, or no display.
+
+        Notes
+        -----
+        A new viewer is opened where none of the three is given.
+        """
         from sparserob_core.experiment.run.replay import events, play
 
         inspection = Inspection(self.experiment.loaded)
@@ -316,7 +451,7 @@ def _read(
     interrupted: bool,
     causal: CausalBound | None = None,
 ) -> Outcome:
-    """A pickled outcome; its experiment is built anew from its config."""
+    """Return an outcome that was pickled; its experiment is built anew from its config."""
     experiment = assemble(load_config(stated))
     if isinstance(experiment, ControlExperiment):
         result = SolvedProblem.run(result, experiment, causal)

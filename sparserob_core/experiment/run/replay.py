@@ -1,4 +1,4 @@
-"""A finished run as events once more, for whoever was not there: nothing is solved again."""
+"""The replay of a finished run as events, for observers that were not there; nothing is solved again."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from sparserob_core.sip.program import WorstConstraint
 from sparserob_core.sip.result import Result, SearchTrace
 from sparserob_core.sip.scenario_bound import ScenarioBound
 
-BATCHES = 100  # of the evaluations of a run
+BATCHES = 100  # into which the evaluations of a run are divided
 DECIDING_SECONDS = 10.0
-"""Seconds in which the tuples of one search are evaluated once more. In a tenth of it the walk of a search of some
-thousand evaluations would begin in its middle; ten times of it nobody waits for."""
+"""Seconds in which the tuples of one search are evaluated once more. With a tenth of it the trajectory of a search of
+some thousand evaluations would begin in its middle. Ten times as many seconds are more than a user waits for."""
 PATIENCE = 60.0  # seconds that the landscape may take
 
 
@@ -39,15 +39,38 @@ def replay(
     plugins: Iterable[str | Path] = (),
     remark: Callable[[str], object] = lambda line: None,
 ) -> Path:
-    """Send a finished run to the viewer of Rerun, as `watch` does: what ``sparserob replay RUN`` does. Returns the
-    run's directory.
+    """Send a finished run to the viewer of Rerun, as ``sparserob replay RUN`` does.
 
-    The controls of all rounds come from ``rounds.npz``, the evaluations of g, with their tuples and with what the
-    maximiser noted, from ``evaluations.npz``; of the searches for violated constraints, and of what a maximiser shows
-    beside its points, a run directory keeps nothing. ``plugins``: files that offer what the run was made with;
-    the directory itself is data, and no plugin that it names is loaded.
-    ``remark`` is told what was recorded into ``save``. Raises `InputError` for a directory that holds
-    no finished run.
+    Parameters
+    ----------
+    directory : str or Path
+        The run directory.
+    save : str or Path, optional
+        A file in which the run is recorded, to be shown later.
+    serve : bool, default False
+        Whether the run is shown in a browser.
+    connect : str, optional
+        The address of a viewer that is open. A new viewer is opened where neither this nor the two above are given.
+    plugins : iterable of str or Path, default ()
+        Files of plugins that the run was made with. The directory itself is data: no plugin that it names is loaded.
+    remark : callable, optional
+        A function that receives the sentence that says what was recorded into ``save``.
+
+    Returns
+    -------
+    Path
+        The run directory.
+
+    Raises
+    ------
+    InputError
+        If the directory holds no finished run.
+
+    Notes
+    -----
+    The controls of all rounds come from ``rounds.npz``. The evaluations of g, with their tuples and the notes of the
+    maximiser, come from ``evaluations.npz``. A run directory keeps neither the searches for violated constraints nor
+    what a maximiser shows in addition to its points.
     """
     run = stored_run(directory)
     if run.summary["message"] == UNFINISHED:
@@ -61,7 +84,7 @@ def replay(
 
 
 def play(told: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None) -> tuple[str, ...]:
-    """Hand events to a recorder; returns what was recorded, in words."""
+    """Send events to a recorder, and return the sentence that says what was recorded."""
     observer = recorder(save, serve, connect, PATIENCE)
     try:
         for event in told:
@@ -72,8 +95,24 @@ def play(told: Iterator[Event], *, save: str | Path | None, serve: bool, connect
 
 
 def events(inspection: Inspection, title: str, directory: Path | None, result: Result) -> Iterator[Event]:
-    """The events that observers of a run with this result received, as far as the result knows: searches and rounds in
-    the order of their seconds."""
+    """Yield the events that the observers of a run with this result received, as far as the result knows them.
+
+    Parameters
+    ----------
+    inspection : Inspection
+        The run.
+    title : str
+        Its title.
+    directory : Path or None
+        Its directory.
+    result : Result
+        Its result.
+
+    Yields
+    ------
+    Event
+        The events; searches and rounds come in the order of their rounds.
+    """
     yield RunStarted(
         title=title,
         directory=directory,
@@ -92,7 +131,7 @@ def events(inspection: Inspection, title: str, directory: Path | None, result: R
 
 
 def stored_result(run: StoredRun) -> Result:
-    """The result that a run directory holds."""
+    """Return the result that a run directory holds; raises `InputError` if its files do not fit together."""
     summary, solution = run.summary, run.solution
     decision = solution.get("decision", np.zeros(0))
     try:
@@ -129,7 +168,7 @@ def stored_result(run: StoredRun) -> Result:
 
 
 def _worst(said: Mapping[str, Any], solution: Mapping[str, Array]) -> WorstConstraint | None:
-    """The worst constraint; its index is empty, for no file keeps it."""
+    """Return the worst constraint; its index is empty, since no file keeps it."""
     if said.get("violation") is None:
         return None
     violation, constraint, nowhere = float(said["violation"]), str(said["constraint"]), np.empty(0)
@@ -152,7 +191,10 @@ def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> f
 
 
 def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int, EvaluationsFinished]]:
-    """Every search in batches, each with the number of its round; the tuples of indices as far as they were kept."""
+    """Yield every search in batches, each with the number of its round.
+
+    The events have the tuples of indices as far as these were kept.
+    """
     size, width = trace.points.shape[1], inspection.width
     whole = bool(size) and size % width == 0 and inspection.program.spread is None
     for outer in np.unique(trace.outer):
@@ -211,7 +253,10 @@ def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int,
 
 
 def _standing(notes: Mapping[str, np.ndarray], done: int) -> int:
-    """At which evaluation the walk stood after ``done`` evaluations of a search: as in `Batch`."""
+    """Return the evaluation at which the search stood after ``done`` evaluations (`Batch`).
+
+    It is the last one that was accepted or, where none was, the last one of all.
+    """
     accepted = notes.get("accepted")
     taken = np.zeros(0, dtype=int) if accepted is None else np.flatnonzero(accepted[:done] > 0.0)
     return int(taken[-1]) if taken.size else done - 1

@@ -1,4 +1,4 @@
-"""The whole walk of an experiment, from a config to a directory that says what was proven."""
+"""The run of an experiment, from its config to a directory that says what was proven."""
 
 from __future__ import annotations
 
@@ -39,16 +39,42 @@ def run(
     figures: bool = True,
     observers: Iterable[Observer] = (),
 ) -> Outcome:
-    """Run an experiment: what ``sparserob run CONFIG key=value ... --out OUT`` does.
+    """Run an experiment and write its run directory, as ``sparserob run CONFIG key=value ... --out OUT`` does.
 
-    ``config`` is a file, a mapping or a problem (`as_config`), ``overrides`` a mapping such as
-    ``{"solver.name": "clarabel"}`` or texts ``key=value``. ``observers`` watch beside those that the config names.
-    ``limits.seconds`` of the config bounds its time: the method then ends as at an interrupt.
-    Raises `ConfigError` or another `InputError` before anything is solved, and `TimeLimitError` when the limit comes
-    before the problem is read. An interrupt ends the method with what it
-    knows by then: the outcome is that of the last round, ``undecided`` unless more was proven. An error, or an
-    interrupt before there was a decision, leaves a directory with the config, the rounds so far and the status
-    ``failed``.
+    Parameters
+    ----------
+    config : str, Path, mapping, OptimalControlProblem or finished run
+        The config: a file, a mapping, a problem, or a run or its directory, whose config is taken (`as_config`).
+    overrides : mapping or iterable of str, optional
+        Changes of the config: ``{"solver.name": "clarabel"}``, or texts ``key=value``.
+    out : str or Path, optional
+        The run directory, new or empty. A new one below ``runs/`` unless given.
+    quiet : bool, default False
+        Whether the terminal is left alone.
+    figures : bool, default True
+        Whether the figures of the run are drawn.
+    observers : iterable of Observer, default ()
+        Observers of the run, in addition to those that the config names.
+
+    Returns
+    -------
+    Outcome
+        The finished run.
+
+    Raises
+    ------
+    ConfigError
+        If a key of the config is at fault.
+    InputError
+        If another argument is at fault. This and `ConfigError` are raised before anything is solved.
+    TimeLimitError
+        If ``limits.seconds`` of the config is over before the problem is read.
+
+    Notes
+    -----
+    ``limits.seconds`` of the config bounds the time; at the limit the method ends as at an interrupt. An interrupt ends
+    the method with its last round: the status is ``undecided`` unless more was proven. An error, or an interrupt before
+    the first decision, leaves a directory with the config, the rounds so far and the status ``failed``.
     """
     loaded = load_config(as_config(config), overrides)
     git = git_revision(loaded.source.folder)
@@ -64,10 +90,25 @@ def run_loaded(
     figures: bool = True,
     observers: Iterable[Observer] = (),
 ) -> Outcome:
-    """`run`, of a config that was loaded; ``git``: the revision of its folder, as `git_revision` has it."""
+    """Run an experiment whose config is loaded already.
+
+    Parameters
+    ----------
+    loaded : Loaded
+        The checked config.
+    git : mapping or None
+        The revision of the config's folder, as `git_revision` returns it.
+    out, quiet, figures, observers
+        As for `run`.
+
+    Returns
+    -------
+    Outcome
+        The finished run.
+    """
     origin = provenance(loaded.config.plain(), git)
     executors: ExecutorFactory = build(loaded, "executor", loaded.config.executor)
-    with executors.open() as executor:  # first: what is added up from here on is added up as on the workers
+    with executors.open() as executor:  # opened first, so that sums are rounded here as they are on the workers
         rebuild = Anew.of(loaded) if executors.parallel else None
         tools = replace(tools_of(loaded), executor=executor, rebuild=rebuild)
         return _run(loaded, tools, origin, out, quiet=quiet, figures=figures, observers=observers)
@@ -83,7 +124,7 @@ def _run(
     figures: bool,
     observers: Iterable[Observer],
 ) -> Outcome:
-    deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
+    deadline = Deadline(loaded.config.limits.seconds)  # the time of the transcription is part of the limit
     experiment = assemble_in_time(loaded, deadline)
     if isinstance(experiment, UntranscribedExperiment):
         return _untranscribed(experiment, origin, out)
@@ -121,7 +162,7 @@ def _run(
                 with deadline.enforced():
                     result = solve_in_own_units(method, experiment.program, _notifying(tools, broadcast))
                     result = result.accounted(tools.solver)
-            except KeyboardInterrupt as pressed:  # a method that does not return what it knows
+            except KeyboardInterrupt as pressed:  # a method that returns no result when it is interrupted
                 said = deadline.interrupt(pressed)
                 result = journal.known(said, time.perf_counter() - started)
                 if result is None and not isinstance(pressed, OutOfTime):
@@ -138,7 +179,7 @@ def _run(
             control, summary, remarks = journal.finish(result, figures, broadcast, deadline)
             return Outcome(result, directory.path, experiment, control, summary, remarks, deadline.pressed)
         except BaseException as error:
-            if result is not None and isinstance(error, SparseRobError):  # found, and not to be written down
+            if result is not None and isinstance(error, SparseRobError):  # a result that could not be written
                 error.add_note(f"the run itself came to its end, {result.status}: {result.message}")
             error.add_note(f"what was done until then is in {directory.path}")
             if result is None or not isinstance(error, KeyboardInterrupt):
@@ -152,7 +193,7 @@ def _run(
 
 
 def _untranscribed(experiment: UntranscribedExperiment, origin: Mapping[str, Any], out: str | Path | None) -> Outcome:
-    """The outcome of a problem that was not transcribed in time, and its directory."""
+    """Write the directory of a problem that was not transcribed in time, and return its outcome."""
     loaded = experiment.loaded
     result = Result(status="undecided", message=experiment.reason, lower_bound=0.0, stopped=experiment.reason)
     with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
@@ -162,7 +203,10 @@ def _untranscribed(experiment: UntranscribedExperiment, origin: Mapping[str, Any
 
 
 def _said(error: BaseException) -> str:
-    """What ended a run that its method did not end; an interrupt says what it was, unless it is from the keyboard."""
+    """Return the reason for which a run ended without its method.
+
+    The text of an interrupt is its own; one from the keyboard has none and is named here.
+    """
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted from the keyboard"
     return named(error)

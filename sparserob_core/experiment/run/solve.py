@@ -1,4 +1,4 @@
-"""Solve a problem that is stated in Python, without a config and without files."""
+"""Solution of a problem that is written in Python, without a config and without files."""
 
 from __future__ import annotations
 
@@ -93,25 +93,61 @@ def solve(
     seconds: float | None = None,
     notify: Notify = ignore,
 ) -> Result:
-    """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without
-    files.
+    """Solve an optimal control problem or a semi-infinite program, as ``sparserob run`` does, but without files.
 
-    ``solver``: one that is named answers every finite program; `Result.unanswered` says which it did not, and then
-    others did. ``auto`` is whoever is quickest.
-    A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself.
-    ``tolerance`` is the relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces,
-    and ``disturbance`` one indicator function on each piece of the control; both are for control problems only, as is
-    the ``policy``, such as `AffinePolicy`: under feedback the decision begins with the nominal control.
-    ``regulariser`` is by default the ridge for control problems, whose optimisers are to be unique, and none for other
-    programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
-    ``polish`` goes to a local method at its end, unless given as in a config: the maximiser's own share where ``g``
-    has a gradient or literal tuples, nothing elsewhere. ``seconds``: the time after which it returns what it knows,
-    as it does at an interrupt from the keyboard; ``Result.stopped`` then says so; where no control can ever be
-    certified it is 30 unless given. The result of a control problem knows its control, tube and worst cases as
-    functions of time (`ControlResult`), and is a run: it can be saved, drawn, and given to whatever takes one
-    (`SolvedProblem`). So is that of a program that `transcribe` made; of any other program it is a `Result`, which
-    nothing could check.
-    Raises `InputError` when an argument is at fault.
+    A component is given by its name, by a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or as an object.
+
+    Parameters
+    ----------
+    problem : OptimalControlProblem or SemiInfiniteProgram
+        The problem. A control problem is solved on its dictionaries.
+    method : str, mapping or Method, default "exchange"
+        The method for the semi-infinite program.
+    solver : str, mapping or Solver, default "auto"
+        The solver of the finite programs. ``auto`` takes the quickest one. A solver that is named is asked for every
+        finite program; `Result.unanswered` lists those that others had to solve.
+    maximiser : str, mapping or Maximiser, default "direct"
+        The global search for violated constraints.
+    regulariser : str, mapping, Regulariser or None, default "default"
+        The strictly convex term. By default it is the ridge for a control problem, so that its optimiser is unique. It
+        is none for another program, so that ``value`` is the cost.
+    tolerance : float or None
+        The relative gap, for a method that has such an option.
+    seed : int, default 0
+        The seed of random numbers.
+    control : str, mapping, DictionaryFactory or Dictionary, optional
+        The dictionary of the control, for a control problem only; 100 equal pieces unless given.
+    disturbance : str, mapping, DictionaryFactory or Dictionary, optional
+        The dictionary of the disturbance, for a control problem only. Unless given it has one indicator function on
+        each piece of the control.
+    policy : str, mapping or Policy, default "open_loop"
+        The policy, such as `AffinePolicy`, for a control problem only. Under feedback the decision begins with the
+        nominal control.
+    continuation : Continuation or mapping, optional
+        The decrease of the regulariser's weight.
+    budget : int, default 2000
+        The number of evaluations of one search of the maximiser.
+    polish : float, optional
+        The last share of the budget, which a local method spends. Unless given it is as in a config: the maximiser's
+        own share where ``g`` has a gradient or tuples are literal, and nothing elsewhere.
+    seconds : float, optional
+        The time after which the best known result is returned, as at an interrupt from the keyboard; `Result.stopped`
+        then says so. Unless given there is no limit. It is 30 for a problem of which no control can ever be certified.
+    notify : callable, optional
+        A function that receives the events of the method. It is not called again after it has raised an exception,
+        which becomes a warning.
+
+    Returns
+    -------
+    SolvedProblem or Result
+        For a control problem, and for a program that `transcribe` made, a `SolvedProblem`. It knows its control, tube
+        and worst cases as functions of time (`ControlResult`), and it can be saved, drawn and used as a run. For any
+        other program a `Result`, which nothing could check.
+
+    Raises
+    ------
+    InputError
+        If an argument is at fault.
     """
     deadline, registry = Deadline(as_seconds(seconds)), load_registry()
     stated = problem.origin if isinstance(problem, SemiInfiniteProgram) else problem
@@ -173,8 +209,10 @@ def solve(
 
 
 def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
-    """Warn at once where no control of a problem can ever be certified, before anything is solved; the search for a
-    witness then has an end."""
+    """Log a warning before anything is solved if no control of a problem can ever be certified.
+
+    Returns the deadline, which is then bounded, so that the search for a witness ends.
+    """
     from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 
     why = unprovable(problem)
@@ -185,13 +223,16 @@ def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
 
 
 def _named(choice: object) -> str:
-    """What a component is called: the name in a choice, or its class."""
+    """Return the name of a component that was chosen: the name in the choice, or its class."""
     named = choice.get("name") if isinstance(choice, Mapping) else choice
     return named if isinstance(named, str) else type(choice).__name__
 
 
 def _solver(registry: Registry, choice: object) -> Solver:
-    """The solver of a choice: one that is named answers every program, and `Auto` where it does not."""
+    """Return the chosen solver.
+
+    A solver that is named is asked for every program; `Auto` answers those that it does not solve.
+    """
     solver: Solver = component(registry, "solver", choice, Solver)
     return solver if isinstance(solver, Auto) else named_solver(solver, _named(choice), registry.build("solver", AUTO))
 

@@ -1,4 +1,4 @@
-"""The recorder that a run is shown with: in a viewer, in a browser, or into a file for later."""
+"""The recorder of a run: it shows the run in a viewer or in a browser, or writes it into a file for later."""
 
 from __future__ import annotations
 
@@ -15,12 +15,33 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.run.events import Observer
 
 KEEP = 24 * 3600.0
-"""Seconds that a browser is served, unless somebody ends it."""
+"""Seconds for which a browser is served, unless the user ends it."""
 
 
 def recorder(save: str | Path | None, serve: bool, connect: str | None, patience: float | None = None) -> Observer:
-    """The observer that records to a viewer, to a browser, to a listener or into a file. ``patience``: of a run that is
-    over, the seconds that its landscapes may take. Raises `InputError` where that cannot be had."""
+    """Return the observer that records a run for the viewer of Rerun.
+
+    Parameters
+    ----------
+    save : str, Path or None
+        A file in which the run is recorded.
+    serve : bool
+        Whether the run is shown in a browser.
+    connect : str or None
+        The address of a viewer that is open. A new viewer is opened where neither this nor the two above are given.
+    patience : float, optional
+        For a run that is over, the seconds that its landscapes may take.
+
+    Returns
+    -------
+    Observer
+        The observer.
+
+    Raises
+    ------
+    InputError
+        If Rerun is not installed, if there is no display for a viewer, or if the file cannot be written.
+    """
     if find_spec("rerun_bindings") is None:
         raise InputError(f"rerun: {not_installed('rerun-sdk')}")
     spawn = save is None and not serve and connect is None
@@ -42,7 +63,8 @@ def recorder(save: str | Path | None, serve: bool, connect: str | None, patience
 
 
 def recorded(observer: Observer, save: str | Path | None) -> tuple[str, ...]:
-    """What the file holds that was to be recorded into, in words; nothing where there was to be none."""
+    """Return the sentence that says whether the file ``save`` holds the complete run; nothing where no file was asked
+    for."""
     if save is None:
         return ()
     why = observer.incomplete.partition(" is not a complete recording: ")[2] or observer.incomplete
@@ -50,7 +72,10 @@ def recorded(observer: Observer, save: str | Path | None) -> tuple[str, ...]:
 
 
 def _writable(file: Path) -> Path:
-    """The absolute path of a file that can be written, in a folder that is there; no recording is written over."""
+    """Return the absolute path of a file that can be written, in a folder that exists.
+
+    A recording that exists is never overwritten: raises `InputError`.
+    """
     path = file.absolute()
     if path.is_dir():
         raise InputError(f"save: expected a file, got the directory {file}")
@@ -60,7 +85,7 @@ def _writable(file: Path) -> Path:
     try:
         with path.open("ab"):
             pass
-        if not there:  # a command that ends with an error of its config leaves nothing behind
+        if not there:  # a command that fails at its config must leave no file behind
             path.unlink()
     except OSError as error:
         raise InputError(f"save: {file} cannot be written to: {error.strerror}") from error

@@ -1,4 +1,4 @@
-"""A run before one's eyes: with the viewer of Rerun, in a browser, or into a file for later."""
+"""A run that is shown while it goes on: in the viewer of Rerun, in a browser, or in a file for later."""
 
 from __future__ import annotations
 
@@ -23,12 +23,30 @@ def watch(
     quiet: bool = False,
     figures: bool = True,
 ) -> Outcome:
-    """Run an experiment as `sparserob_core.run` does, and record it: what ``sparserob watch CONFIG key=value ...``
-    does.
+    """Run an experiment and record it, as ``sparserob watch CONFIG key=value ...`` does.
 
-    A viewer is started, unless it is to be recorded into the file ``save``, shown in a browser of this machine
-    (``serve``), or sent to a viewer that listens at ``connect``. Raises `InputError` before anything is solved where
-    that cannot be had. The outcome's ``remarks`` say whether all of it was recorded.
+    A viewer is opened unless one of ``save``, ``serve`` and ``connect`` is given.
+
+    Parameters
+    ----------
+    config, overrides, out, quiet, figures
+        As for `run`.
+    save : str or Path, optional
+        A file in which the run is recorded, to be shown later.
+    serve : bool, default False
+        Whether the run is shown in a browser of this machine.
+    connect : str, optional
+        The address of a viewer that is open.
+
+    Returns
+    -------
+    Outcome
+        The finished run; its ``remarks`` say whether the recording is complete.
+
+    Raises
+    ------
+    InputError
+        If the viewer, the browser or the file cannot be had; it is raised before anything is solved.
     """
     watching = recorder(save, serve, connect)
     outcome = run(config, overrides, out, quiet=quiet, figures=figures, observers=[watching])

@@ -1,1 +1,1 @@
-"""Sampled trajectories of a finished run beside its worst case."""
+"""Simulations of finished runs: sampled trajectories and replayed worst cases."""

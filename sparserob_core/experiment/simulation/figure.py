@@ -1,4 +1,4 @@
-"""The figure of a simulation: sampled states inside the worst case."""
+"""The figure of a simulation: sampled states within the worst case."""
 
 from __future__ import annotations
 
@@ -24,10 +24,23 @@ if TYPE_CHECKING:
 def write_simulation(
     file: Path, simulation: Simulation, finished: FinishedRun, worst: Mapping[str, Array] | None = None
 ) -> None:
-    """Draw a simulation over the worst case of its run into a file (.png, .pdf, .svg); ``worst``, adversaries, are
-    drawn instead when given.
+    """Draw a simulation over the worst case of its run into a file (.png, .pdf, .svg).
 
-    Raises `InputError` when the file cannot be written.
+    Parameters
+    ----------
+    file : Path
+        The file.
+    simulation : Simulation
+        The simulation.
+    finished : FinishedRun
+        The run.
+    worst : mapping, optional
+        Adversaries, which are drawn instead of the simulation.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
     """
     active = stored_active(finished.experiment.transcription, finished.solution)
     status = str(finished.summary["status"])
@@ -40,8 +53,10 @@ def write_simulation(
 
 
 def draw_simulation(simulation: Simulation, data: FigureData) -> Figure:
-    """Every state: some sampled trajectories, the envelope of all of them, and around it the worst case that no sample
-    reached."""
+    """Return the figure of a simulation.
+
+    For every state it has some sampled trajectories, the envelope of all of them, and the worst-case tube around it.
+    """
     figure, axes = panels(len(data.drawn_states), 1.9, extra=0.35)
     for component, ax in zip(data.drawn_states, axes, strict=True):
         draw_tube(ax, data, component)

@@ -1,4 +1,4 @@
-"""Simulate a finished run: random trajectories beside the worst case, or the worst cases themselves."""
+"""The simulation of a finished run: random trajectories together with the worst case, or the worst cases themselves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
@@ -44,11 +44,8 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.program import TOLERANCE
 
-if TYPE_CHECKING:
-    pass
-
 TRAJECTORIES = 10_000
-FAN, SHOWN = 120, 400  # trajectories and times that are kept for drawing
+FAN, SHOWN = 120, 400  # numbers of trajectories and of times that are kept for the figure
 
 
 def simulate(
@@ -61,15 +58,38 @@ def simulate(
     plugins: Iterable[str | Path] = (),
     notify: Notify = ignore,
 ) -> Simulation:
-    """Propagate sampled trajectories of a finished run (`as_run`) exactly: what ``sparserob simulate RUN`` does.
+    """Propagate trajectories of a finished run exactly, as ``sparserob simulate RUN`` does.
 
-    ``law`` is one of ``iid``, ``vertices``, ``slow``, ``neighbours``, or ``adversary``, which replays the worst case of
-    every constraint and takes no number of ``trajectories`` (10 000 otherwise). The result is written to
-    ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given; where matplotlib is
-    missing it is not, and its ``remarks`` say so. ``notify`` receives
-    `StudyProgress`. ``plugins``: files that offer what the run was made with; the directory itself
-    is data, and no plugin that it names is loaded. Raises `InputError` for a directory that is no finished run with a
-    control, or another argument at fault, before anything is written.
+    The result is written to ``simulation-<law>.json`` in the run's directory.
+
+    Parameters
+    ----------
+    run : str, Path, Outcome or SolvedProblem
+        The run (`as_run`).
+    trajectories : int, optional
+        The number of trajectories; 10 000 unless given. The law ``adversary`` takes no number.
+    law : str, default "iid"
+        The law of the uncertainty: ``iid``, ``vertices``, ``slow`` or ``neighbours``; or ``adversary``, which replays
+        the worst case of every constraint.
+    seed : int, default 0
+        The seed of random numbers.
+    out : str or Path, optional
+        The file of a figure. Where matplotlib is missing there is no figure, and the ``remarks`` of the result say so.
+    plugins : iterable of str or Path, default ()
+        Files of plugins that the run was made with. The directory itself is data: no plugin that it names is loaded.
+    notify : callable, optional
+        A function that receives `StudyProgress`.
+
+    Returns
+    -------
+    Simulation
+        The shares of trajectories that violate each constraint, and the largest violations.
+
+    Raises
+    ------
+    InputError
+        If the directory is no finished run with a control, or another argument is at fault. It is raised before
+        anything is written.
     """
     from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
     from sparserob_core.experiment.simulation.figure import write_simulation
@@ -176,13 +196,13 @@ def _sampled(
 
 
 class _Acting:
-    """What acts at the moment, where it answers the states."""
+    """The control of each trajectory at a moment, where it answers the states."""
 
     def __init__(self) -> None:
         self._now: Array | None = None
 
     def of(self, control: Callable[[int, Array], Array]) -> Callable[[int, Array], Array]:
-        """The same control, which is listened to."""
+        """Return the same control as a function whose last value is kept."""
 
         def answered(piece: int, state: Array) -> Array:
             self._now = control(piece, state)
@@ -191,12 +211,13 @@ class _Acting:
         return answered
 
     def now(self, position: int, channels: int) -> Array | None:
-        """What acted until a position, ``(m, n)``; nothing at the beginning."""
+        """Return the control ``(m, n)`` that acted until a position; ``None`` at the beginning, and without
+        feedback."""
         return None if self._now is None or position == 0 else self._now[:channels]
 
 
 class _Envelope:
-    """What is drawn of many trajectories: the first few, and the envelope of all, at some of the times."""
+    """The part of many trajectories that is drawn: the first few, and the envelope of all, at some of the times."""
 
     def __init__(self, shown: np.ndarray, states: int) -> None:
         self._column = {int(position): column for column, position in enumerate(shown)}
@@ -204,7 +225,7 @@ class _Envelope:
         self._first: list[Array] = []
 
     def add(self, position: int, state: Array) -> None:
-        """The states ``(d, n)`` at one of the times."""
+        """Add the states ``(d, n)`` at one of the times."""
         column = self._column.get(position)
         if column is None:
             return
@@ -214,7 +235,7 @@ class _Envelope:
         np.maximum(self.upper[:, column], state.max(axis=1), out=self.upper[:, column])
 
     def fan(self) -> Array:
-        """The first few trajectories ``(n, d, S)``."""
+        """Return the first few trajectories ``(n, d, S)``."""
         return np.ascontiguousarray(np.stack(self._first).transpose(2, 1, 0))
 
 
@@ -289,12 +310,12 @@ def _shares(counts: Sequence[ViolationCount], worst: Mapping[str, Array], count:
 
 
 def _measured(constraint: StateConstraint) -> dict[str, str]:
-    """What the violations of a constraint, and its times, are measured in."""
+    """Return the unit of a constraint's violations, and that of times."""
     return {"unit": joined(constraint.measured).strip(), "time_unit": constraint.functionals.names.time}
 
 
 def _together(shares: Sequence[ConstraintShare], violated: int) -> ConstraintShare:
-    """All constraints as one: a trajectory violates it when it violates any."""
+    """Return all constraints as one, which a trajectory violates when it violates any of them."""
     seen, worst = max(shares, key=lambda one: one.largest), max(shares, key=lambda one: one.worst)
     lower, upper = clopper_pearson(violated, seen.trajectories)
     return ConstraintShare(

@@ -1,4 +1,4 @@
-"""What a simulation of a finished run found: one record per constraint, and the words that go with it."""
+"""The result of a simulation: one record per constraint, and the words for it."""
 
 from __future__ import annotations
 
@@ -28,13 +28,30 @@ LAWS = {
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ConstraintShare:
-    """One constraint: how many of the trajectories violate it by more than ``tolerance``, and the interval
-    ``[lower, upper]`` that holds the probability of it under the law with confidence `CONFIDENCE` (Clopper and Pearson
-    1934).
+    """The violations of one constraint among simulated trajectories.
 
-    ``largest`` is the largest violation seen (negative: a margin), at ``time``; ``worst`` is the largest that any
-    admissible disturbance and parameter was found to cause, at ``worst_time`` and ``worst_parameter (nu,)``: nan where
-    nothing is known. ``unit``: of the violations, ``m or m/s`` where rows differ; ``time_unit``: of the times.
+    Parameters
+    ----------
+    name : str
+        The constraint.
+    violated, trajectories : int
+        The number of trajectories that violate it by more than ``tolerance``, and that of all trajectories.
+    lower, upper : float
+        The interval that contains the probability of a violation under the law, with confidence `CONFIDENCE` (Clopper
+        and Pearson 1934).
+    tolerance : float
+        The largest violation that counts as none.
+    largest, time : float
+        The largest violation among the trajectories (negative: a margin), and its time.
+    worst, worst_time : float
+        The largest violation that any admissible disturbance and parameter was found to cause, and its time; nan where
+        nothing is known.
+    worst_parameter : sequence (nu,)
+        Its parameter.
+    unit : str, default ""
+        The unit of violations, such as ``m or m/s`` where rows have different ones.
+    time_unit : str, default ""
+        The unit of times.
     """
 
     name: str
@@ -62,13 +79,41 @@ class ConstraintShare:
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Simulation:
-    """Sampled trajectories of a finished run. A sample proves nothing.
+    """Sampled trajectories of a finished run; a sample proves nothing.
 
-    ``constraints`` in the order of the program's families, and ``any_violated`` for all of them together. Every
-    trajectory was looked at at ``times`` instants, at least ``inside`` of them inside every piece. ``shown (S,)`` are
-    times for drawing, ``fan (n, d, S)`` the first few trajectories there, ``lower``, ``upper (d, S)`` the envelope of
-    all. For the law ``adversary`` a trajectory is the worst case of one constraint, and ``largest`` is what the replay
-    attains.
+    For the law ``adversary`` each trajectory is the worst case of one constraint, and ``largest`` is the violation that
+    the replay attains.
+
+    Parameters
+    ----------
+    title : str
+        The title of the run.
+    directory : Path
+        Its directory.
+    status : str
+        Its status.
+    law : str
+        The law of the uncertainty.
+    trajectories, seed : int
+        The number of trajectories, and the seed.
+    times : int
+        The number of times at which every trajectory was checked.
+    inside : int
+        The least number of these times within each piece, where there are fewer than 10 000 pieces.
+    constraints : sequence of ConstraintShare
+        The violations of each constraint, in the order of the program's families.
+    any_violated : ConstraintShare or None
+        The violations of all constraints together.
+    shown : array (S,)
+        The times of the figure.
+    fan : array (n, d, S)
+        The first few trajectories at these times.
+    lower, upper : array (d, S)
+        The envelope of all trajectories.
+    seconds : float
+        The seconds that the simulation has taken.
+    undrawn : str, default ""
+        The reason why there is no figure, where one was asked for.
     """
 
     title: str
@@ -89,17 +134,15 @@ class Simulation:
     undrawn: str = ""
 
     __repr__ = brief
-    """Why there is no figure, where one was asked for."""
 
     @property
     def contradicts(self) -> bool:
-        """Whether a trajectory does what the run claims to have proven impossible, or is worse than the worst case that
-        was found."""
+        """True where a trajectory contradicts a proof of the run, or is worse than the worst case that was found."""
         worse = any(one.largest > one.worst + one.tolerance for one in self.constraints if np.isfinite(one.worst))
         return worse or (self.status in PROVEN and any(one.violated for one in self.constraints))
 
     def summary(self) -> dict[str, Any]:
-        """What ``simulation-<law>.json`` holds."""
+        """Return the contents of ``simulation-<law>.json``."""
         rows = [*self.constraints, *([] if self.any_violated is None else [self.any_violated])]
         return {
             "title": self.title,
@@ -118,7 +161,7 @@ class Simulation:
         }
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """Column names, and one row per constraint."""
+        """Return the names of the columns, and one row per constraint."""
         if self.law == ADVERSARY:
             names = ["constraint", "time", "parameter", "predicted violation", "attained", "difference"]
             return names, [
@@ -156,7 +199,7 @@ class Simulation:
         ]
 
     def remarks(self) -> Iterator[str]:
-        """What is to be said beside the table: what a sample is worth, and what is proven."""
+        """Yield the notes below the table: the value of a sample, and what is proven."""
         if self.law == ADVERSARY:
             yield (
                 "each row is one trajectory: the worst disturbance, parameter and initial state of that constraint,"
@@ -192,8 +235,21 @@ class Simulation:
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """The exact interval of a probability from ``successes`` in ``trials`` independent trials (Clopper and Pearson
-    1934): quantiles of beta distributions, each tail at most ``(1 - confidence) / 2``."""
+    """Return the exact interval of a probability from independent trials (Clopper and Pearson 1934).
+
+    Parameters
+    ----------
+    successes, trials : int
+        The numbers of successes and of trials.
+    confidence : float
+        The confidence.
+
+    Returns
+    -------
+    lower, upper : float
+        The ends of the interval: quantiles of beta distributions, such that each tail is at most ``(1 - confidence) /
+        2``.
+    """
     from scipy.special import betaincinv
 
     tail = (1.0 - confidence) / 2

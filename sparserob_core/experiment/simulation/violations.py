@@ -1,4 +1,4 @@
-"""How often, how much and when many trajectories violate one constraint."""
+"""The number, the size and the time of violations of one constraint by many trajectories."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from sparserob_core.sip.program import TOLERANCE
 class ViolationCount:
     """The largest violation of one constraint along every trajectory of a block, and over all blocks.
 
-    With flat sides: the largest ``H x(t) - h`` over the sides and the times, which counts as a violation where one is
-    above `TOLERANCE` of its own unit (``units (r,)``), for a decision ``x (n,)``. A curved set: the gauge less 1, at
-    the time at which the trajectory is furthest out; its unit is 1.
+    With flat sides it is the largest ``H x(t) - h`` over the sides and the times. It counts as a violation where one is
+    above `TOLERANCE` of its own unit (``units (r,)``). For a curved set it is the gauge less 1, at the time at which
+    the trajectory is furthest outwards; its unit is 1. ``x (n,)`` is the decision.
     """
 
     def __init__(self, constraint: StateConstraint, times: Array, units: Array, x: Array) -> None:
@@ -33,18 +33,20 @@ class ViolationCount:
 
     @property
     def tolerance(self) -> float:
-        """What counts as no violation of any row, in the rows' unit."""
+        """The largest violation of any row that counts as none, in the row's unit."""
         return TOLERANCE * float(self.units.min())
 
     def begin(self, count: int) -> None:
-        """A new block of ``count`` trajectories."""
+        """Begin a new block of ``count`` trajectories."""
         self._best, self._when = np.full(count, -np.inf), np.zeros(count, dtype=int)
         self._own = np.full(count, -np.inf)
         self._states = np.zeros((self.constraint.functionals.response.initial_state.size, count))
 
     def add(self, position: int, state: Array, control: Array | None = None) -> None:
-        """The states ``(d, n)`` at one of the times; ``control (m, n)``: what acted until then, where it differs from
-        one trajectory to another."""
+        """Add the states ``(d, n)`` at one of the times.
+
+        ``control (m, n)`` is the control that acted until then, where it differs from one trajectory to another.
+        """
         gains = self.constraint.gains
         if control is None or gains is None:
             if self._inside[position]:
@@ -70,9 +72,9 @@ class ViolationCount:
                 np.copyto(self._states, state + self._beside[position][:, None], where=better)
 
     def close(self) -> np.ndarray:
-        """Which trajectories of the block violate the constraint, ``(n,)``."""
+        """End the block, and return which of its trajectories ``(n,)`` violate the constraint."""
         found = self._best
-        if self._is_curved:  # outwardness grows outwards, but is no distance
+        if self._is_curved:  # outwardness increases outwards, but it is no distance
             found = self.constraint.excess(self._states)
             self._own = found / self.units.max()
         out = self._own > TOLERANCE
@@ -84,7 +86,7 @@ class ViolationCount:
 
 
 def _mixed(constraint: StateConstraint, state: Array, control: Array) -> Array:
-    """The largest ``H x + G u - h`` of a mixed constraint, ``(n,)``."""
+    """Return the largest ``H x + G u - h`` of a mixed constraint, ``(n,)``."""
     assert constraint.sides is not None and constraint.gains is not None
     H, h = constraint.sides
     return np.asarray((H @ state + constraint.gains @ control - h[:, None]).max(axis=0))

@@ -1,1 +1,1 @@
-"""Studies: one config, axes along which it is changed, and a run for every point."""
+"""Studies: a config is run at every point of some axes."""

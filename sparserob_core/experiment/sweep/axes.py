@@ -1,4 +1,4 @@
-"""The axes of a study: a key of the config, and the values that it takes, as they are written in one line."""
+"""The axes of a study: keys of the config with their values, as they are written in one line."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from sparserob_core.experiment.config.run_config import SLOTS
 from sparserob_core.experiment.plugins.messages import shown
 
 MOST = 100_000
-"""Values of an axis, and points of a study, at most."""
+"""Largest number of values of an axis, and of points of a study."""
 FIXED = (*BESIDE, "plugins")
-"""Keys that all points of a study have in common: they decide no result, and a list of them is one value."""
+"""Keys that all points of a study have in common, and whose lists are single values."""
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 RANGE = re.compile(rf"(log:)?({NUMBER}):({NUMBER})(?::({NUMBER}))?")
 WHOLE = re.compile(r"[-+]?\d+")
@@ -30,8 +30,10 @@ AS_WRITTEN = "values such as 1,2,3, start:stop:count such as 0:1:11, or log:star
 @final
 @dataclass(frozen=True)
 class Span:
-    """An interval to draw from, ``low`` to ``high``: evenly, or evenly in the logarithm (``log``); ``whole``: whole
-    numbers only, which both ends are."""
+    """An interval from ``low`` to ``high`` from which values are drawn.
+
+    They are drawn evenly, or evenly in the logarithm (``log``); ``whole`` numbers only where both ends are whole.
+    """
 
     low: float
     high: float
@@ -39,7 +41,7 @@ class Span:
     whole: bool = False
 
     def at(self, share: float) -> float | int:
-        """The value at that share of the way, in [0, 1)."""
+        """Return the value at a ``share`` of the interval, in [0, 1)."""
         if self.whole:
             return int(self.low) + int(share * (int(self.high) - int(self.low) + 1))
         if self.log:
@@ -50,9 +52,24 @@ class Span:
 @final
 @dataclass(frozen=True)
 class Axis:
-    """A key of the config and its ``values``, or the ``span`` that they are drawn from. ``log``: they are spread evenly
-    in the logarithm. ``written`` is what stands in ``sweep.yaml``. ``paired``: the keys, itself among them, whose
-    values are taken together with its own, the first of each, then the second; none where it stands for itself."""
+    """An axis of a study: a key of the config and its values.
+
+    Parameters
+    ----------
+    key : str
+        The key.
+    values : tuple
+        Its values.
+    written : object
+        The axis as it stands in ``sweep.yaml``.
+    span : Span, optional
+        The interval from which the values are drawn.
+    log : bool, default False
+        Whether the values are even in the logarithm.
+    paired : tuple of str, default ()
+        The keys, itself among them, whose values are taken together: the first of each, then the second, and so on.
+        Empty for an axis by itself.
+    """
 
     key: str
     values: tuple[Any, ...]
@@ -63,7 +80,7 @@ class Axis:
 
     @property
     def follows(self) -> bool:
-        """Whether its value is known where that of another one is, with which it is paired."""
+        """True where the axis is paired with an earlier one, which decides its value."""
         return bool(self.paired) and self.paired[0] != self.key
 
     @property
@@ -73,27 +90,41 @@ class Axis:
 
     @property
     def single(self) -> bool:
-        """Whether there is only one value: a change of the config, and no axis."""
+        """True where there is only one value, so that the axis is a change of the config."""
         return self.span is None and len(self.values) == 1
 
     @property
     def numeric(self) -> bool:
-        """Whether all values are numbers."""
+        """True where all values are numbers."""
         return self.span is not None or all(
             isinstance(value, int | float) and not isinstance(value, bool) for value in self.values
         )
 
 
 def path_of(key: str) -> Path:
-    """A key, step by step; raises `InputError` when it is none."""
+    """Return a key, step by step; raises `InputError` where it is none."""
     return parse_overrides({key: None}, read_value)[0].path
 
 
 def parse_axes(given: Mapping[str, object] | Sequence[str] | None) -> list[Axis]:
-    """Axes from texts ``key=values``, or from a mapping of keys to texts, to lists of values, or to single values.
+    """Return the axes that a user has given.
+
     Several keys with commas between them are paired: each of their values is a list with one entry for each key.
 
-    Raises `InputError` that names the key, also for a key that is there twice.
+    Parameters
+    ----------
+    given : mapping or sequence of str, optional
+        Texts ``key=values``, or a mapping of keys to texts, to lists of values, or to single values.
+
+    Returns
+    -------
+    list of Axis
+        The axes.
+
+    Raises
+    ------
+    InputError
+        If a key is at fault or is given twice; the error names it.
     """
     if isinstance(given, str):
         raise InputError(f"axes: expected a list of texts or a mapping, got {shown(given)}")
@@ -114,7 +145,7 @@ def parse_axes(given: Mapping[str, object] | Sequence[str] | None) -> list[Axis]
 
 
 def _axes(key: str, value: Any) -> list[Axis]:
-    """The axis of a key, or those of several keys that are paired."""
+    """Return the axis of a key, or the axes of several keys that are paired."""
     keys = [one.strip() for one in key.split(",")]
     if len(keys) == 1:
         return [_axis(key, value)]
@@ -137,7 +168,7 @@ def _axes(key: str, value: Any) -> list[Axis]:
 
 
 def require_whole(axes: Sequence[Axis]) -> None:
-    """Raise `InputError` where one of several keys that are paired was changed, and the others were not."""
+    """Raise `InputError` where one of several paired keys was changed, and the others were not."""
     groups = {axis.key: axis.paired for axis in axes}
     for axis in axes:
         for other in axis.paired:
@@ -164,7 +195,7 @@ def _axis(key: str, value: object) -> Axis:
 
 
 def _rows(key: str, text: str) -> list[Any]:
-    """The values of keys that are paired, from one line of text."""
+    """Return the values of paired keys from one line of text."""
     parts = list(split(text))
     rows = [_value(key.partition(",")[0], part, len(parts)) for part in parts]
     within = rows[0] if len(rows) == 1 and isinstance(rows[0], list) else []
@@ -172,7 +203,7 @@ def _rows(key: str, text: str) -> list[Any]:
 
 
 def _written(key: str, text: str) -> Axis:
-    """An axis from one line of text."""
+    """Return the axis of a key from one line of text."""
     values, logs, span = list[Any](), list[bool](), None
     parts = list(split(text))
     for part in parts:
@@ -190,13 +221,13 @@ def _written(key: str, text: str) -> Axis:
         else:
             raise InputError(path=key, expected=f"one range, or {AS_WRITTEN}", got=shown(text))
     if len(values) == 1 and span is None and isinstance(values[0], list) and _of_components(key):
-        values = values[0]  # a component is never a list: these are its values
+        values = values[0]  # a component is never a list, so that the list holds the values
     log = all(logs) if logs else _geometric(values)
     return Axis(key, () if span else _counted(key, tuple(values)), text.strip(), span, log)
 
 
 def split(text: str) -> Iterator[str]:
-    """The parts of a text between commas; commas inside brackets, braces and quotes do not count."""
+    """Yield the parts of a text between commas; commas inside brackets, braces and quotes do not count."""
     depth, quote, start, before = 0, "", 0, ","
     for position, letter in enumerate(text):
         if quote:
@@ -239,7 +270,7 @@ def _range(key: str, part: str, found: re.Match[str]) -> list[float] | list[int]
         if WHOLE.fullmatch(found[2]) and WHOLE.fullmatch(found[3]) and (int(found[3]) - int(found[2])) % steps == 0:
             step = (int(found[3]) - int(found[2])) // steps
             return [int(found[2]) + k * step for k in range(count)]
-    # to 15 digits, so that the third of ten steps to 1 is 0.3
+    # rounded to 15 digits, so that the third of ten steps to 1 is 0.3
     return [low, *(float(f"{value:.15g}") for value in values[1:-1]), *([high] if count > 1 else [])]
 
 
@@ -270,7 +301,7 @@ def _counted(key: str, values: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def _geometric(values: Sequence[Any]) -> bool:
-    """Whether listed numbers are meant on a logarithmic axis: at least three, over at least two decades."""
+    """Return whether listed numbers are meant for a logarithmic axis: at least three, over at least two decades."""
     numbers = [float(one) for one in values if isinstance(one, int | float) and not isinstance(one, bool) and one > 0]
     return len(numbers) == len(values) >= 3 and max(numbers) >= 100.0 * min(numbers)
 
@@ -280,7 +311,7 @@ def _of_components(key: str) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """A value from Python as a config has it."""
+    """Return a value from Python as a config has it."""
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, Mapping):

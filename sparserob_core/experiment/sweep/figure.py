@@ -1,4 +1,4 @@
-"""The figure of a study: curves along one numeric axis, a map over two, otherwise costs and seconds side by side."""
+"""The figure of a study: curves along one numeric axis, a map over two, otherwise costs and seconds in two panels."""
 
 from __future__ import annotations
 
@@ -34,29 +34,35 @@ MARKS: Mapping[str, str] = {
     "infeasible": "x",
     "failed": "X",
 }
-"""How a status is marked."""
+"""Marker of each status."""
 FILLED = "osDvX"
-LETTERS = 44  # of a label
-CELLS = 5  # values of each axis from which on a map says more than curves
-SEVERAL = 5  # seeds from which on a box says more than the points
+LETTERS = 44  # largest length of a label
+CELLS = 5  # number of values of each axis from which a map is clearer than curves
+SEVERAL = 5  # number of seeds from which a box is clearer than points
 
 
 def write_study_figure(study: Study) -> list[Path]:
-    """Draw a study into ``sweep.pdf`` and ``sweep.png`` of its directory; raises `InputError` when there is nothing to
-    draw, or matplotlib is missing."""
+    """Draw a study into ``sweep.pdf`` and ``sweep.png`` of its directory.
+
+    Raises `InputError` where there is nothing to draw, or matplotlib is missing.
+    """
     look.require_matplotlib()
     with look.style():
         return look.write_figure(study.directory / NAME, draw_study(study))
 
 
 def draw_study(study: Study) -> Figure:
-    """The figure; seeds are no axis of it but samples, of which the median and the quartiles are shown."""
+    """Return the figure of a study.
+
+    Seeds are no axis of the figure but samples, whose median and quartiles are shown. Raises `InputError` where no
+    point has a cost.
+    """
     if not any(row.get("cost") is not None for row in study.table):
         raise InputError("no figure of the study: no point has a cost")
     leading = [axis for axis in study.axes if not axis.follows]
     numeric = [axis for axis in leading if axis.numeric and not _is_seed(axis)]
     others = [axis for axis in leading if not axis.numeric]
-    if study.arrangement == "zip":  # one line through the values, told by its first axis
+    if study.arrangement == "zip":  # one line through the values, drawn over the first axis
         numeric, others = numeric[:1], others[:1] if not numeric else []
     drawn = study.arrangement in ("random", "sobol")
     if len(numeric) == 2 and not others and (drawn or min(_size(study, axis) for axis in numeric) >= CELLS):
@@ -70,7 +76,7 @@ def draw_study(study: Study) -> Figure:
 @final
 @dataclass(frozen=True)
 class _Spread:
-    """Numbers of rows that differ in the seed only: the median and the quartiles, nan where there are none."""
+    """The median and the quartiles of rows that differ in the seed only; nan where there are none."""
 
     middle: float
     low: float
@@ -86,7 +92,7 @@ def _spread(values: Sequence[float | None]) -> _Spread:
 
 
 def _grouped(rows: Sequence[Row], axes: Sequence[Axis]) -> dict[str, list[Row]]:
-    """Rows by the values of axes, in words."""
+    """Return rows by the values of axes, in words."""
     found: dict[str, list[Row]] = {}
     for row in rows:
         alone = len(axes) == 1 and not axes[0].numeric
@@ -101,7 +107,7 @@ def _named(axis: Axis, value: object) -> str:
 
 
 def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
-    """The cost and the lower bound along an axis, one pair of lines for each combination of the others."""
+    """Return curves of the cost and of the lower bound along an axis, one pair for each combination of the others."""
     groups = _grouped(study.table, others)
     legend_rows = -(-(len(groups) + 2) // 2) if len(groups) <= len(COLOURS) * len(DASHES) else 1
     figure, (ax,) = look.panels(1, 2.9, extra=0.2 * legend_rows)
@@ -132,7 +138,7 @@ def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
 
 
 def _marks(ax: Axes, x: Array, y: Array, statuses: Sequence[str], colour: str) -> None:
-    """The status of every point: on its cost, or where there is none at the lower edge."""
+    """Draw the status of every point: on its cost, or at the lower edge where there is none."""
     edge = ax.get_xaxis_transform()
     for status in dict.fromkeys(statuses):
         here = np.array([one == status for one in statuses])
@@ -157,7 +163,7 @@ def _marks(ax: Axes, x: Array, y: Array, statuses: Sequence[str], colour: str) -
 
 
 def _map(study: Study, axes: Sequence[Axis]) -> Figure:
-    """The cost as colour over two axes: cells of a grid, or points that were drawn."""
+    """Return a map of the cost over two axes: cells of a grid, or points that were drawn."""
     from matplotlib.figure import Figure
 
     first, second = axes
@@ -198,8 +204,10 @@ def _map(study: Study, axes: Sequence[Axis]) -> Figure:
 
 
 def _categories(study: Study, axes: Sequence[Axis]) -> Figure:
-    """Costs down to their lower bounds, and seconds, one line for each combination of values; of several seeds a
-    box."""
+    """Return the costs down to their lower bounds, and the seconds, one line for each combination of values.
+
+    Several seeds are shown as a box.
+    """
     from matplotlib.figure import Figure
 
     groups = _grouped(study.table, axes)
@@ -255,7 +263,7 @@ _BOX: dict[str, Any] = {
 
 
 def _finish(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable[str] = MARKS) -> None:
-    """The title, and below the figure what the marks mean, of those that occur."""
+    """Add the title, and below the figure a legend of the markers that occur."""
     from matplotlib.lines import Line2D
 
     ax.set_title(plain(study.title))
@@ -279,7 +287,7 @@ def _finish(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable
 
 
 def _worst_status(rows: Sequence[Row]) -> str:
-    """Of several seeds the status that proves least is marked."""
+    """Return the status of several seeds that proves least."""
     return max((str(row["status"]) for row in rows), key=list(MARKS).index)
 
 
@@ -288,7 +296,7 @@ def _values(spreads: Sequence[_Spread], name: str) -> Array:
 
 
 def _edges(values: Array, log: bool) -> Array:
-    """The edges of cells about values, half-way between them."""
+    """Return the edges of cells about values, half-way between them."""
     at = np.log(values) if log else values
     if at.size == 1:
         edges = np.array([at[0] - 0.5, at[0] + 0.5])
@@ -304,14 +312,14 @@ def _scale(set_scale: Any, axis: Axis, values: Sequence[float] | Array) -> None:
 
 
 def _cost_scale(set_scale: Any, rows: Sequence[Row]) -> None:
-    """A logarithmic axis for costs over three decades and more."""
+    """Use a logarithmic axis for costs over three decades and more."""
     costs = [float(row["cost"]) for row in rows if row.get("cost") is not None]
     if costs and min(costs) > 0.0 and max(costs) >= 1000.0 * min(costs):
         set_scale("log")
 
 
 def _size(study: Study, axis: Axis) -> int:
-    """How many values of an axis occur."""
+    """Return the number of values of an axis that occur."""
     return len({float(row[axis.key]) for row in study.table})
 
 

@@ -1,4 +1,4 @@
-"""What a study consists of: a base config, what is changed in it for all points, and the axes; and its file."""
+"""The plan of a study: a base config, the changes of it for all points, and the axes; and its file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sparserob_core.sip.events import Notify, ignore
 FILE = "sweep.yaml"
 HEADING = "A study. To go on with it, or to repeat it elsewhere: sparserob sweep sweep.yaml --out DIRECTORY"
 KEYS = ("base", "overrides", "axes", "points", "number", "seed")
-OFTEN = 100  # configs between two words about their check
+OFTEN = 100  # number of configs between two reports of their check
 Arrangement = Literal["grid", "zip", "random", "sobol"]
 ARRANGEMENTS: tuple[Arrangement, ...] = ("grid", "zip", "random", "sobol")
 
@@ -36,8 +36,10 @@ ARRANGEMENTS: tuple[Arrangement, ...] = ("grid", "zip", "random", "sobol")
 @final
 @dataclass(frozen=True)
 class Point:
-    """One point: a value for every axis, its checked config (as JSON: there may be very many points), and the ``hash``
-    of what decides its result."""
+    """A point of a study: a value for every axis, its checked config, and the ``hash`` of all that decides its result.
+
+    The config is kept as JSON, since there may be very many points.
+    """
 
     values: tuple[Any, ...]
     resolved: str
@@ -53,12 +55,22 @@ class Point:
 @final
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A study before anything is run. ``changes`` of the base are made in this order; one with several values is an
-    axis, one with a single value holds for all points.
+    """A study before anything is run.
 
-    ``points``: all combinations of values (``grid``), the first values together, then the second, ... (``zip``), or
-    ``number`` points drawn at ``random`` or along a sequence of ``sobol``, by the ``seed``. ``file``: the study's own
-    file, where it has one.
+    Parameters
+    ----------
+    base : Source
+        The base config.
+    changes : tuple of Axis
+        The changes of the base, in their order. One with several values is an axis; one with a single value holds for
+        all points.
+    points : {"grid", "zip", "random", "sobol"}, default "grid"
+        The choice of the points: all combinations of values; the first values together, then the second, and so on; or
+        points that are drawn at random or along a sequence of Sobol.
+    number, seed : int, optional
+        The number of points that are drawn, and the seed.
+    file : str, default ""
+        The study's own file, where it has one.
     """
 
     base: Source
@@ -70,22 +82,25 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """The name of the base config: its file's, without the ending."""
+        """The name of the base config: that of its file, without the ending."""
         return Path(self.base.name).stem
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """What has several values."""
+        """The changes with several values."""
         return tuple(axis for axis in self.changes if not axis.single)
 
     def loaded(self, values: Sequence[Any]) -> Loaded:
-        """The checked config of a point."""
+        """Return the checked config of a point."""
         rest = iter(values)
         changes = {axis.key: axis.values[0] if axis.single else next(rest) for axis in self.changes}
         return load_config(self.base, changes)
 
     def values(self) -> list[tuple[Any, ...]]:
-        """The values of every point, in the order of the rows of the table: the last axis changes first."""
+        """Return the values of every point in the order of the table: the last axis changes first.
+
+        Raises `InputError` where the axes do not fit the arrangement, or have too many combinations.
+        """
         if self.points in ("random", "sobol"):
             return self._drawn()
         for axis in self.axes:
@@ -105,8 +120,8 @@ class Plan:
         return [self._values_at(row) for row in places]
 
     def _leading(self, most: float = np.inf) -> list[Axis]:
-        """The axes but for those whose values go with those of another one; raises `InputError` where they have more
-        than ``most`` combinations."""
+        """Return the axes without those that follow another one; raises `InputError` for more than ``most``
+        combinations."""
         leading = [axis for axis in self.axes if not axis.follows]
         count = int(np.prod([len(axis.values) for axis in leading], dtype=float))
         if count > most:
@@ -114,7 +129,7 @@ class Plan:
         return leading
 
     def _values_at(self, places: Sequence[int]) -> tuple[Any, ...]:
-        """The values of all axes where those of the leading ones are at these ``places``."""
+        """Return the values of all axes, where the leading ones are at these ``places``."""
         known = dict(zip((axis.key for axis in self._leading()), places, strict=True))
         return tuple(axis.values[known[axis.paired[0] if axis.paired else axis.key]] for axis in self.axes)
 
@@ -139,8 +154,10 @@ class Plan:
         return list(zip(*drawn, strict=True))
 
     def checked(self, notify: Notify = ignore) -> list[Point]:
-        """Every point with its checked config; raises `ConfigError` for the first one that is at fault. ``notify``
-        receives `StudyProgress`."""
+        """Return every point with its checked config.
+
+        ``notify`` receives `StudyProgress`. Raises `ConfigError` for the first point that is at fault.
+        """
         points = []
         try:
             rows = self.values()
@@ -155,7 +172,7 @@ class Plan:
         return points
 
     def written(self) -> str:
-        """The contents of ``sweep.yaml``."""
+        """Return the contents of ``sweep.yaml``."""
         axes: dict[str, Any] = {}
         for axis in self.changes:
             if not axis.paired:
@@ -169,7 +186,7 @@ class Plan:
         return write_yaml(data, HEADING)
 
     def apart_from(self, other: Plan) -> str:
-        """How the base differs from another study's in what decides results; empty where it does not."""
+        """Return the difference of the base from another study's in what decides results; empty where there is none."""
         here, there = (
             {key: value for key, value in plan.base.data.items() if key not in BESIDE} for plan in (self, other)
         )
@@ -185,9 +202,30 @@ def make_plan(
     points: Arrangement | None = None,
     number: int | None = None,
 ) -> Plan:
-    """The study of a config, or of a study's own file, with further axes, which replace those of the same key.
+    """Return the study of a config, or of a study's own file.
 
-    Raises `InputError` when one of them is at fault.
+    Parameters
+    ----------
+    config : str, Path, mapping or Source
+        The config, or the file of a study.
+    axes : mapping or sequence of str, optional
+        Further axes, which replace those with the same key.
+    overrides : mapping or iterable of str, optional
+        Changes for all points.
+    points : {"grid", "zip", "random", "sobol"}, optional
+        The choice of the points.
+    number : int, optional
+        The number of points that are drawn.
+
+    Returns
+    -------
+    Plan
+        The study.
+
+    Raises
+    ------
+    InputError
+        If an argument is at fault.
     """
     source = read_source(config)
     plan = _stored(source) if {"base", "axes"} & set(source.data) else Plan(_based(source), ())
@@ -213,18 +251,21 @@ def make_plan(
 
 
 def _changes(overrides: Mapping[str, object] | Iterable[str] | None) -> list[Axis]:
-    """Overrides as `sparserob_core.run` takes them: every one is one value, lists and texts with commas too."""
+    """Return overrides as changes with a single value each, lists and texts with commas included."""
     found = parse_overrides(overrides, read_value)
     return [Axis(".".join(map(str, one.path)), (one.value,), one.value) for one in found]
 
 
 def _listed(axis: Axis) -> object:
-    """An axis as it stands in ``sweep.yaml``; a single value is a list of one, unless its key is never an axis."""
+    """Return an axis as it stands in ``sweep.yaml``.
+
+    A single value is a list of one, unless its key is never an axis.
+    """
     return [axis.values[0]] if axis.single and axis.path[0] not in FIXED else axis.written
 
 
 def read_plan(file: Path) -> Plan:
-    """The study in a ``sweep.yaml``; raises `InputError` when it is none."""
+    """Return the study in a ``sweep.yaml``; raises `InputError` where it is none."""
     source = read_source(file)
     if not {"base", "axes"} & set(source.data):
         raise ConfigError(f"{file}: expected a study, with the keys base and axes, got {', '.join(source.data)}")
@@ -232,7 +273,7 @@ def read_plan(file: Path) -> Plan:
 
 
 def _stored(source: Source) -> Plan:
-    """The study in a file, its keys checked."""
+    """Return the study in a file, with its keys checked."""
     data = source.data
     for key in data:
         if key not in KEYS:
@@ -257,7 +298,7 @@ def _stored(source: Source) -> Plan:
 
 
 def _arrangement(source: Source) -> tuple[Arrangement, int | None, int | None]:
-    """How the points of a study's file are arranged, how many are drawn, and with which seed."""
+    """Return how the points of a study's file are chosen, how many are drawn, and with which seed."""
     points = source.data.get("points", "grid")
     if points not in ARRANGEMENTS:
         raise _fault(source, "points", f"must be one of {', '.join(ARRANGEMENTS)} (got {shown(points)})")
@@ -278,10 +319,13 @@ def _fault(source: Source, key: str, said: str) -> ConfigError:
 
 
 def _based(source: Source) -> Source:
-    """The base of a study, which can be moved: the files of its plugins by their whole names, the numbers of matrices
-    instead of their files, its own name as title."""
+    """Return the base of a study in a form that holds in any folder.
+
+    Files of plugins have their absolute names, the numbers of matrices replace their files, and its own name is the
+    title where it has none.
+    """
     source = extended(source)
-    data, _ = movable(source)  # what is wrong with a matrix is said where a config is checked
+    data, _ = movable(source)  # errors of matrices are reported where a config is checked
     if not data.get("title"):
         data["title"] = Path(source.name).stem
     return replace(source, data=data)
@@ -295,14 +339,15 @@ def _absolute(axis: Axis) -> Axis:
 
 
 def _seed(plan: Plan) -> int:
-    """The seed of the base config, with which points are drawn."""
+    """Return the seed of the base config, with which points are drawn."""
     fixed = (axis.values[0] for axis in plan.changes if axis.single and axis.path == ("seed",))
     changed = next(fixed, plan.base.data.get("seed", 0))
     return changed if is_whole(changed, 0) else 0
 
 
 def _sobol(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """The first points ``(count, dimension)`` of a scrambled sequence; more points begin with the same ones."""
+    """Return the first points ``(count, dimension)`` of a scrambled sequence; a larger number begins with the same
+    points."""
     from scipy.stats import qmc
 
     # scipy renamed the argument in 1.15

@@ -1,4 +1,4 @@
-"""One point of a study, run wherever the executor likes: from plain data to a run directory, and plain data back."""
+"""A point of a study, run on any executor: from plain data to a run directory, and back to plain data."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from sparserob_core.experiment.run.run import run_loaded
 from sparserob_core.sip.limits.deadline import OutOfTime
 from sparserob_core.sip.solver import QuadraticProgram
 
-ACCURACY = 1e-6  # of a program that is solved for nothing but its imports
-TRIES = 5  # to give a directory a name that somebody else gives another one at the same moment
+ACCURACY = 1e-6  # of a program that is solved only so that its imports are made
+TRIES = 5  # attempts to rename a directory while another process may give the same name to another one
 
 
 _solved_with = set[tuple[str, str]]()  # in this process
@@ -31,9 +31,19 @@ _solved_with = set[tuple[str, str]]()  # in this process
 @final
 @dataclass(frozen=True)
 class Task:
-    """What a worker is to do: run the resolved ``config`` into the directory ``partial``, and move it to ``final`` when
-    it is over, both absolute paths. ``git``: the revision of the base's folder; ``figures``: whether to draw the
-    run."""
+    """The run of one point.
+
+    Parameters
+    ----------
+    config : mapping
+        The resolved config.
+    partial, final : str
+        The directory that is written, and its name when the run is over; both are absolute paths.
+    git : mapping or None
+        The revision of the base's folder.
+    figures : bool
+        Whether the figures are drawn.
+    """
 
     config: Mapping[str, Any]
     partial: str
@@ -45,8 +55,10 @@ class Task:
 @final
 @dataclass(frozen=True)
 class Answer:
-    """What came of a task: what ``result.json`` says, or why there is none (``failure``). ``interrupted``: a key or a
-    signal came while it ended."""
+    """The result of a task: the contents of ``result.json``, or the reason why there are none (``failure``).
+
+    ``interrupted`` says that a key or a signal came while it ended.
+    """
 
     summary: Mapping[str, Any] | None = None
     failure: str = ""
@@ -54,20 +66,22 @@ class Answer:
 
     @property
     def failed(self) -> bool:
-        """Whether there is no checked answer."""
+        """True where there is no checked answer."""
         return self.summary is None or self.summary["status"] == "failed"
 
 
 @final
 class Bounds(Observer):
-    """Watches the run of a point in this process: calls ``tell(round, lower, upper)`` at its first event, and whenever
-    its bounds have moved."""
+    """An observer of the run of a point in this process.
+
+    It calls ``tell(round, lower, upper)`` at its first event, and whenever the bounds have changed.
+    """
 
     def __init__(self, tell: Callable[[int, float, float], object]) -> None:
         self.tell, self.told = tell, (-1, -math.inf, math.inf)
 
     def receive(self, event: Event) -> None:
-        """See `Observer`."""
+        """Take the bounds of an event, and report them where they have changed."""
         number, lower, upper = self.told
         number = max(number, 0)
         if isinstance(event, RoundFinished):
@@ -81,10 +95,25 @@ class Bounds(Observer):
 
 
 def run_point(task: Task, observers: Iterable[Observer] = ()) -> Answer:
-    """Run a point. What it leaves stands under its final name only when it is complete, so that a process that dies
-    loses nothing but the points that it was about to finish. Nothing is raised but an interrupt."""
+    """Run a point of a study.
+
+    The directory has its final name only when it is complete. A process that dies therefore loses only the points on
+    which it worked. Every error becomes an answer; only an interrupt is raised.
+
+    Parameters
+    ----------
+    task : Task
+        The run.
+    observers : iterable of Observer, default ()
+        Observers of the run.
+
+    Returns
+    -------
+    Answer
+        The result.
+    """
     partial, ends = Path(task.partial), Path(task.final)
-    while partial.exists():  # of a worker that died, on a cluster that gave its call to another one
+    while partial.exists():  # a worker has died, and the cluster gave its call to another one
         partial = partial.with_name(f"{partial.name}+")
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
@@ -105,8 +134,10 @@ def run_point(task: Task, observers: Iterable[Observer] = ()) -> Answer:
 
 
 def _import_what_runs(loaded: Loaded) -> None:
-    """Import now what a run imports where it needs it, the solver's package too: or the column ``seconds`` would say of
-    the first run of every process that it took half a second more."""
+    """Import the packages that a run imports when it needs them, the solver's included.
+
+    Otherwise the column ``seconds`` of the first run in every process would be half a second larger.
+    """
     import scipy.optimize
     from scipy.sparse import csc_array
 
@@ -117,12 +148,13 @@ def _import_what_runs(loaded: Loaded) -> None:
     _solved_with.add((entry.name, repr(entry.options)))
     one, none = csc_array(np.ones((1, 1))), csc_array((0, 1))
     smallest = QuadraticProgram(one, -np.ones(1), one, np.ones(1), none, np.zeros(0), np.zeros(1), np.ones(1))
-    with suppress(SparseRobError):  # the run will say so
+    with suppress(SparseRobError):  # the run itself reports the error
         build(loaded, "solver", entry).solve(smallest, ACCURACY)
 
 
 def keep(partial: Path, ends: Path) -> None:
-    """Give a complete run directory its final name; one that has it already, of a run that was cut short, goes."""
+    """Give a complete run directory its final name; a directory with that name, of a run that ended early, is
+    removed."""
     for attempt in range(TRIES):
         old = partial.with_name(f"{partial.name}.old{attempt}")
         try:
@@ -139,7 +171,7 @@ def keep(partial: Path, ends: Path) -> None:
 
 
 def _failed(partial: Path, ends: Path, said: str) -> Answer:
-    """Keep what a run left that ended in an error, and say which."""
+    """Keep the directory of a run that ended in an error, and return an answer with the reason."""
     if (partial / "result.json").is_file():
         keep(partial, ends)
     else:

@@ -22,20 +22,35 @@ from sparserob_core.experiment.sweep.plan import FILE, Arrangement, read_plan
 from sparserob_core.experiment.sweep.table import Row, read_table, shared_unit
 
 RUNS = "runs"
-COLUMNS = ("status", "cost", "relative gap", "active", "seconds")  # beside the axes, on a terminal
-LINES = 50  # rows of a table that a terminal shows
-NAMED = 5  # failures that are told one by one
+COLUMNS = ("status", "cost", "relative gap", "active", "seconds")  # columns on a terminal, after those of the axes
+LINES = 50  # largest number of rows of a table on a terminal
+NAMED = 5  # largest number of failures that are reported one by one
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A study: the ``directory`` that holds it, its ``axes``, and its ``table``, one row (a mapping) for every point
-    that has an answer or an error: the keys of the axes, then what ``result.json`` says, ``None`` where nothing is
-    known. ``pandas.DataFrame(study.table)`` makes a data frame.
+    """A study that was run.
 
-    ``points`` is the number of all points, ``arrangement`` how they were chosen; ``stopped`` says why some have no
-    row; ``remarks`` say what could not be done beside them.
+    Parameters
+    ----------
+    directory : Path
+        Its directory.
+    title : str
+        Its title.
+    axes : sequence of Axis
+        Its axes.
+    table : list of dict
+        One row for every point that has an answer or an error: the keys of the axes, then the entries of
+        ``result.json``, with ``None`` where nothing is known. ``pandas.DataFrame(study.table)`` makes a data frame.
+    points : int
+        The number of all points.
+    arrangement : {"grid", "zip", "random", "sobol"}, default "grid"
+        The choice of the points.
+    stopped : str, default ""
+        The reason why some points have no row.
+    remarks : sequence of str, default ()
+        Warnings.
     """
 
     directory: Path
@@ -51,26 +66,27 @@ class Study:
 
     @property
     def outcomes(self) -> Outcomes:
-        """The outcome of every row, read from its run directory, and its problem built again, when it is asked for."""
+        """The outcome of every row; it is read from its run directory, and its problem is built, when it is
+        asked for."""
         return Outcomes(self.directory, self.table)
 
     @property
     def failed(self) -> int:
-        """How many points have no checked answer."""
+        """The number of points without a checked answer."""
         return sum(row["status"] == "failed" for row in self.table)
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How many points ended with each status."""
+        """The number of points with each status."""
         return Counter(str(row["status"]) for row in self.table)
 
     @property
     def cost_unit(self) -> str:
-        """The unit of the costs, where it is known and the same of all."""
+        """The unit of the costs, where it is known and the same for all."""
         return shared_unit(self.table)
 
     def summary(self) -> dict[str, Any]:
-        """The study in a few numbers, as plain data."""
+        """Return the study in a few numbers, as plain data."""
         return {
             "title": self.title,
             "directory": str(self.directory),
@@ -83,7 +99,8 @@ class Study:
 
 
 def shown(study: Study) -> tuple[list[str], list[list[str]]]:
-    """The table for a terminal: column names, and one row per point, or one per status where there are many."""
+    """Return the table for a terminal: names of the columns, and one row per point, or one per status where there are
+    many."""
     unit = f" [{study.cost_unit}]" if study.cost_unit else ""
     if len(study.table) > LINES:
         return _by_status(study.table, unit)
@@ -93,7 +110,7 @@ def shown(study: Study) -> tuple[list[str], list[list[str]]]:
 
 
 def short(row: Mapping[str, Any]) -> list[str]:
-    """What a reader wants to know of a point: status, cost, gap, share of time active, seconds."""
+    """Return the columns of a point on a terminal: status, cost, gap, share of time active, seconds."""
     return [
         str(row["status"]),
         _number(row.get("cost"), ".9g"),
@@ -104,7 +121,7 @@ def short(row: Mapping[str, Any]) -> list[str]:
 
 
 def remarks_of(study: Study) -> Iterator[str]:
-    """What is to be said below the table."""
+    """Yield the notes below the table."""
     counts = ", ".join(f"{count} {status}" for status, count in sorted(study.counts.items()))
     yield f"{len(study.table)} of {study.points} points: {counts or 'none yet'}"
     failed = [row for row in study.table if row["status"] == "failed"]
@@ -138,8 +155,10 @@ def _number(value: Any, form: str) -> str:
 
 @final
 class Outcomes(Sequence[Outcome]):
-    """The outcomes of a study, one for each row of its table. One of a point without a run raises `InputError`, which
-    says why."""
+    """The outcomes of a study, one for each row of its table.
+
+    The outcome of a point without a run raises `InputError` with the reason.
+    """
 
     def __init__(self, directory: Path, table: Sequence[Row]) -> None:
         self._directory, self._table = directory, table
@@ -164,7 +183,10 @@ class Outcomes(Sequence[Outcome]):
 
 
 def read_outcome(directory: Path, failure: str = "") -> Outcome:
-    """The outcome of a run, from its directory. The plugin files that its config names are loaded."""
+    """Return the outcome of a run, from its directory; the plugin files that its config names are loaded.
+
+    ``failure`` is the reason where there is no run, for the `InputError`.
+    """
     if not directory.is_dir() and failure:
         raise InputError(f"{directory.name}: there is no outcome: {failure}")
     run = stored_run(directory)
@@ -173,7 +195,7 @@ def read_outcome(directory: Path, failure: str = "") -> Outcome:
 
 
 def read_study(directory: str | Path) -> Study:
-    """The study in a directory, as data; raises `InputError` when there is none, or it cannot be understood."""
+    """Return the study in a directory, as data; raises `InputError` where there is none, or it cannot be understood."""
     path = Path(directory)
     if not (path / FILE).is_file():
         raise InputError(f"{path}: expected the directory of a study, got one without {FILE}")

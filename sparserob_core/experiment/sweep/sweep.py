@@ -1,4 +1,4 @@
-"""The walk of a study: what is finished is taken as it is, the other points go to the executor, and the table fills."""
+"""The run of a study: finished points are taken as they are, the others go to the executor, and the table grows."""
 
 from __future__ import annotations
 
@@ -42,21 +42,32 @@ from sparserob_core.experiment.sweep.table import COLUMNS, TABLE, Row, columns_o
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import ExecutorFactory
 
-PAUSE = 0.5  # seconds between two looks at what is running
+PAUSE = 0.5  # seconds between two reports of the points that run
 RENEWED = 2.0  # seconds between two versions of the table
-STILLBORN = 3  # executors whose workers die before any of them has begun a point
-LETTERS = 60  # of the name of a run directory, before its hash
-DIGITS = 12  # of the hash there
+STILLBORN = 3  # number of consecutive executors whose workers may die before they begin a point
+LETTERS = 60  # letters of the name of a run directory, before its hash
+DIGITS = 12  # digits of the hash in that name
 PARTIAL = ".partial"
 BEGUN_BY = re.compile(rf"-[0-9a-f]{{{DIGITS}}}\.(.*)\.(\d+){re.escape(PARTIAL)}")
-"""The end of the name of a run that is not over: the host and the process that have begun it."""
+"""End of the name of a run that is not over: the host and the process that began it."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """A study before it is run: every point of the ``plan``, the name of its run directory, and the hashes of those
-    that are to be run (``left``)."""
+    """A study before it is run.
+
+    Parameters
+    ----------
+    plan : Plan
+        The study.
+    points : sequence of Point
+        All of its points.
+    names : mapping
+        The name of the run directory, by the hash of the point.
+    left : frozenset of str
+        The hashes of the points that are not finished.
+    """
 
     plan: Plan
     points: Sequence[Point]
@@ -64,7 +75,7 @@ class Outline:
     left: frozenset[str]
 
     def summary(self) -> dict[str, Any]:
-        """The study as plain data."""
+        """Return the study as plain data."""
         keys = [axis.key for axis in self.plan.axes]
         return {
             "title": str(self.plan.base.data["title"]),
@@ -82,7 +93,7 @@ class Outline:
         }
 
     def shown(self) -> tuple[list[str], list[list[str]]]:
-        """The points for a terminal: column names, and one row per point."""
+        """Return the points for a terminal: names of the columns, and one row per point."""
         keys = [axis.key for axis in self.plan.axes]
         rows = [
             [
@@ -110,25 +121,52 @@ def sweep(
     notify: Notify = ignore,
     observers: Iterable[Observer] = (),
 ) -> Study:
-    """Run a config at every point of some axes: what ``sparserob sweep CONFIG key=a,b,c key=start:stop:count`` does.
+    """Run a config at every point of some axes, as ``sparserob sweep CONFIG key=a,b,c key=start:stop:count`` does.
 
-    ``config`` is a config or a problem (`as_config`), a study's own file (``sweep.yaml``), or the directory of a
-    study to go on with. ``axes`` maps keys to lists of values, or to texts such as ``"0:19:20"`` or
-    ``"log:1e-6:1:13"``; or they are texts ``key=values``. ``overrides`` hold for all points. ``points``: all
-    combinations (``"grid"``, the default), ``"zip"``, or ``number`` points at ``"random"`` or along ``"sobol"``.
-    ``executor``: a name, or a mapping with a name, unless the config's own is meant; the runs themselves are
-    serial, and no result depends on it. ``figures``: whether to draw every run. ``notify`` receives
-    `SweepProgress`. ``observers`` watch the study, from `SweepStarted` to `SweepFinished`; one that raises is
-    detached with a warning, and the study goes on.
+    A study of the same base in the directory ``out`` is continued. Points that are finished there, by the hash of their
+    config, are not run again; points that failed or ended at a time limit are. A point that fails gives a row with the
+    reason. An interrupt ends the runs that are going on, and the study has the rows that are known by then.
 
-    In ``out`` (``runs/NAME-sweep/STAMP-HASH`` unless given) a study of the same base is gone on with: what is finished
-    there, by the hash of its config, is not run again; what failed or ended at a time limit is. A point that fails is a
-    row with the reason. An interrupt abandons what is running: the study has the rows that are known by then.
-    ``point``: run only this one, a number from 0 in the order of the table, here and without an executor, into the
-    directory of the study, which any number of processes may fill at once; none of them writes the table, which
-    follows when the study is gone on with. The study there must be equal to the last value.
+    Parameters
+    ----------
+    config : str, Path, mapping, OptimalControlProblem or finished run
+        A config or a problem (`as_config`), a study's own file (``sweep.yaml``), or the directory of a study that is
+        continued.
+    axes : mapping or sequence of str, optional
+        The axes: a mapping of keys to lists of values, or to texts such as ``"0:19:20"`` or ``"log:1e-6:1:13"``; or
+        texts ``key=values``.
+    overrides : mapping or iterable of str, optional
+        Changes of the config for all points.
+    points : {"grid", "zip", "random", "sobol"}, optional
+        The choice of the points: all combinations (``grid``, the default), ``zip``, or ``number`` points at ``random``
+        or along a sequence of ``sobol``.
+    number : int, optional
+        The number of points that are drawn.
+    point : int, optional
+        The only point that is run, by its number from 0 in the order of the table. It is run here, without an executor,
+        into the directory ``out``, which any number of processes may fill at once. None of them writes the table, which
+        is written when the study is continued. A study that is there must be equal to this one in every value.
+    executor : str or mapping, optional
+        The executor; that of the config unless given. The runs themselves are serial, and no result depends on it.
+    out : str or Path, optional
+        The directory of the study; ``runs/NAME-sweep/STAMP-HASH`` unless given.
+    figures : bool, default False
+        Whether the figures of every run are drawn.
+    notify : callable, optional
+        A function that receives `SweepProgress`.
+    observers : iterable of Observer, default ()
+        Observers of the study, from `SweepStarted` to `SweepFinished`. One that raises an exception is detached with a
+        warning, and the study goes on.
 
-    Raises `InputError` before anything is run when an axis, a point's config or the directory is at fault.
+    Returns
+    -------
+    Study
+        The study with its table.
+
+    Raises
+    ------
+    InputError
+        If an axis, a point's config or the directory is at fault. It is raised before anything is run.
     """
     stated, out = _found(config, out)
     plan = make_plan(as_config(stated), axes, overrides, points=points, number=_number(points, number))
@@ -157,8 +195,8 @@ def sweep(
         raise
     finally:
         if walk is not None:
-            with suppress(KeyboardInterrupt):  # it ends the observers; the study is over
-                broadcast(walk.ending())  # the directory is free by then, for a page may stay for hours
+            with suppress(KeyboardInterrupt):  # an interrupt ends the observers: the study is over
+                broadcast(walk.ending())  # the lock is released before, since a page may be served for hours
 
 
 def outline(
@@ -171,7 +209,23 @@ def outline(
     out: str | Path | None = None,
     notify: Notify = ignore,
 ) -> Outline:
-    """What `sweep` would run with the same arguments; nothing is written. Raises `InputError` as it does."""
+    """Return the points that `sweep` would run with the same arguments; nothing is written.
+
+    Parameters
+    ----------
+    config, axes, points, number, executor, out, notify
+        As for `sweep`.
+
+    Returns
+    -------
+    Outline
+        The points, with those that are not finished in the directory ``out``.
+
+    Raises
+    ------
+    InputError
+        If an axis, a point's config or the directory is at fault.
+    """
     stated, out = _found(config, out)
     plan = make_plan(as_config(stated), axes, points=points, number=_number(points, number))
     checked = plan.checked(notify)
@@ -185,7 +239,7 @@ def outline(
 
 
 def _found(config: GivenConfig, out: str | Path | None) -> tuple[GivenConfig, str | Path | None]:
-    """The config, and where its study is: of the directory of a study its own file, and that directory."""
+    """Return the config and the directory of a study; of a study's directory its own file, and that directory."""
     if not isinstance(config, str | Path) or not Path(config).is_dir():
         return config, out
     directory = Path(config)
@@ -195,7 +249,7 @@ def _found(config: GivenConfig, out: str | Path | None) -> tuple[GivenConfig, st
 
 
 def _check_one(out: str | Path | None, executor: str | Mapping[str, Any] | None) -> None:
-    """Raise `InputError` for what makes no sense beside the number of a point."""
+    """Raise `InputError` for arguments that exclude the number of a point."""
     if out is None:
         raise InputError(path="point", expected="the directory of the study beside it (out)", got="none")
     if executor is not None:
@@ -203,7 +257,7 @@ def _check_one(out: str | Path | None, executor: str | Mapping[str, Any] | None)
 
 
 def _one_of(points: Sequence[Point], number: int) -> Point:
-    """A point by its number; of equal configs the first one, which names the run."""
+    """Return a point by its number; of equal configs it is the first one, which names the run."""
     if not is_whole(number, 0) or number >= len(points):
         raise InputError(path="point", expected=f"a whole number from 0 to {len(points) - 1}", got=repr(number))
     return next(point for point in points if point.hash == points[number].hash)
@@ -238,7 +292,8 @@ def _require_same_base(directory: Path, plan: Plan) -> None:
 
 
 def _require_same_study(directory: Path, plan: Plan) -> None:
-    """Raise `InputError` when the study there is another one: the number of a point would mean something else."""
+    """Raise `InputError` where the study in the directory is another one, in which the number would be another
+    point."""
     _require_same_base(directory, plan)
     there, here = ({axis.key: axis for axis in one.changes} for one in (read_plan(directory / FILE), plan))
     if read_plan(directory / FILE).written() != plan.written():
@@ -254,8 +309,10 @@ def _axes_text(changes: Mapping[str, Axis]) -> str:
 
 @final
 class _Walk:
-    """One call of `sweep`: the points by their hash, and what is known of each. ``alone``: of one point, beside others
-    that do the same; the table is not its own."""
+    """A call of `sweep`: the points by their hash, and the answers that are known.
+
+    ``alone`` means a single point, while other processes may run others: the table is then not written.
+    """
 
     def __init__(
         self,
@@ -275,7 +332,7 @@ class _Walk:
             self.places.setdefault(point.hash, []).append(place)
         self.directory = made.path.resolve()
         self.git = git_revision(plan.base.folder)
-        self.by_hash = {point.hash: point for point in reversed(points)}  # of equal configs the first one names the run
+        self.by_hash = {point.hash: point for point in reversed(points)}  # the first of equal configs names the run
         self.names = {point.hash: run_name(plan.axes, point) for point in self.by_hash.values()}
         self.copies = Counter(point.hash for point in points)
         self.answers: dict[str, Answer] = {}
@@ -285,7 +342,7 @@ class _Walk:
         self.due = self.began
 
     def run(self, factory: ExecutorFactory) -> Study:
-        """Everything that is not finished; then the table."""
+        """Run every point that is not finished, and write the table."""
         self._clear()
         waiting = self.left()
         self.pending = set(waiting)
@@ -300,7 +357,7 @@ class _Walk:
             self.stopped, self.pressed = str(pressed) or "interrupted from the keyboard", True
         finally:
             self._clear()
-            self._read(sorted(self.pending))  # a run that was over, whose worker was not heard any more
+            self._read(sorted(self.pending))  # runs that are over, whose workers could not report it any more
             self._write()
         return Study(
             directory=self.made.path,
@@ -326,18 +383,18 @@ class _Walk:
         )
 
     def ending(self) -> SweepFinished:
-        """What its observers hear last."""
+        """Return the last event for observers of the study."""
         return SweepFinished(
             rows=self._known(), seconds=time.monotonic() - self.began, stopped=self.stopped, pressed=self.pressed
         )
 
     def _known(self, but: Collection[str] = ()) -> dict[int, Row]:
-        """The rows that are known, by the places of their points, without those of some hashes."""
+        """Return the rows that are known, by the places of their points, without the hashes ``but``."""
         known = [digest for digest in self.answers if digest not in but and digest in self.places]
         return {place: self._row(self.points[place]) for digest in known for place in self.places[digest]}
 
     def left(self) -> list[str]:
-        """The hashes of the points that are to be run; of the others the answers are read."""
+        """Return the hashes of the points that must be run; the answers of the others are read."""
         self._read(dict.fromkeys(point.hash for point in self.points))
         left = []
         for digest in dict.fromkeys(point.hash for point in self.points):
@@ -347,7 +404,7 @@ class _Walk:
         return left
 
     def _read(self, digests: Iterable[str]) -> None:
-        """Take the answers to these points that stand in the directory."""
+        """Read the answers of these points from the directory."""
         found = {one.rpartition("-")[2]: one for one in _directories(self.directory / RUNS)}
         for digest in digests:
             name = found.get(digest[:DIGITS])
@@ -356,8 +413,11 @@ class _Walk:
                 self.names[digest], self.answers[digest] = name, Answer(summary)
 
     def _solve(self, factory: ExecutorFactory, waiting: list[str]) -> None:
-        """Hand out points until each has an answer. Where a worker dies, its executor is replaced, and the points that
-        had begun are tried again one by one: the one that kills its worker again fails, and no other."""
+        """Run points until each has an answer.
+
+        Where a worker dies, its executor is replaced, and the points that had begun are tried again one by one. Only a
+        point whose worker dies again fails.
+        """
         suspects, stillborn = list[str](), 0
         while waiting or suspects:
             if suspects:
@@ -373,7 +433,7 @@ class _Walk:
                 raise SparseRobError("the executor's workers die before they begin a point; is there memory for them?")
 
     def _round(self, factory: ExecutorFactory, batch: list[str]) -> list[str]:
-        """Run a batch on a fresh executor; returns the points that were lost since a worker died."""
+        """Run a batch on a new executor; returns the points that have no answer since a worker died."""
         lost: list[str] = []
         with _workers(factory) as executor:
             ended: SimpleQueue[Future[Answer]] = SimpleQueue()
@@ -397,7 +457,8 @@ class _Walk:
         return lost
 
     def _watching(self, digest: str) -> list[Observer]:
-        """Who watches the run of a point: somebody, where it is made in this process and the study is watched."""
+        """Return the observer of a point's run: one that reports its bounds, where the run is in this process and
+        observed."""
         if self.parallel or not self.broadcast.heard:
             return []
         place = self.places[digest][0]
@@ -424,7 +485,7 @@ class _Walk:
             raise KeyboardInterrupt
 
     def _take(self, digest: str, answer: Answer, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
-        """Take an answer, and say so."""
+        """Keep an answer, and report it."""
         self.answers[digest] = answer
         self.pending.discard(digest)
         self.new += 1
@@ -457,7 +518,7 @@ class _Walk:
         return row_of(values, answer.summary, self.names[point.hash], point.hash, answer.failure)
 
     def _write(self) -> None:
-        """The table as it is known now."""
+        """Write the table as it is known now."""
         if self.alone:
             return
         began, keys, rows = time.monotonic(), [axis.key for axis in self.plan.axes], self._rows()
@@ -466,11 +527,11 @@ class _Walk:
         self.due = time.monotonic() + RENEWED + 10.0 * (time.monotonic() - began)  # a long table is written less often
 
     def _clear(self) -> None:
-        """Remove what dead processes, and this one, have left of runs."""
+        """Remove the partial run directories of dead processes, and of this one."""
         for name in _directories(self.directory / RUNS, hidden=True):
             path = self.directory / RUNS / name
             begun = BEGUN_BY.search(name)
-            # a run is without a lock before its first file and after its last one: who has begun it is asked as well
+            # a run has no lock before its first file and after its last one: the process in its name is checked as well
             owners = [owner_of(path), *([(int(begun[2]), begun[1])] if begun else [])]
             if all(not owner[0] or owner == (os.getpid(), platform.node()) or is_dead(*owner) for owner in owners):
                 shutil.rmtree(path, ignore_errors=True)
@@ -496,7 +557,8 @@ class _Walk:
 
 
 def run_name(axes: Sequence[Axis], point: Point) -> str:
-    """The name of a point's directory: its values for a reader, and the beginning of its hash for the program."""
+    """Return the name of a point's directory: its values for a reader, and the beginning of its hash for the
+    program."""
     parts = []
     for axis, value in zip(axes, point.values, strict=True):
         steps = [str(step) for step in axis.path if step != "name"]
@@ -507,7 +569,7 @@ def run_name(axes: Sequence[Axis], point: Point) -> str:
 
 @contextmanager
 def _workers(factory: ExecutorFactory) -> Iterator[Any]:
-    """An executor whose end cannot hide that its workers died."""
+    """Open an executor, and ignore the error at its end that its workers died, which is handled elsewhere."""
     try:
         with factory.open() as executor:
             yield executor
@@ -522,7 +584,7 @@ def _directories(folder: Path, hidden: bool = False) -> list[str]:
 
 
 def _readable(directory: Path, digest: str) -> dict[str, Any] | None:
-    """The result of a run, if it is whole and of this config."""
+    """Return the result of a run, if it is complete and belongs to this config."""
     try:
         summary = read_summary(directory / "result.json")
     except InputError:
@@ -547,7 +609,7 @@ def _duration(seconds: float) -> str:
 
 
 def _drawn(study: Study) -> Study:
-    """The figure is an extra: where it cannot be drawn, a remark says so."""
+    """Draw the figure of a study; where it cannot be drawn, there is a warning."""
     from sparserob_core.experiment.sweep.figure import write_study_figure
 
     try:
@@ -557,6 +619,6 @@ def _drawn(study: Study) -> Study:
         return replace(study, remarks=(*study.remarks, "no figure: it was interrupted"))
     except SparseRobError as error:
         return replace(study, remarks=(*study.remarks, str(error)))
-    except Exception as error:  # noqa: BLE001  as said above
+    except Exception as error:  # noqa: BLE001  a figure may not end a study
         return replace(study, remarks=(*study.remarks, f"the figure could not be drawn: {named(error)}"))
     return study

@@ -1,5 +1,7 @@
-"""The table of a study: one row for every point, the axes and then what ``result.json`` says, as a file that anything
-can read."""
+"""The table of a study as a file that any program can read.
+
+It has one row for every point: the axes, then the entries of ``result.json``.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ FIRST = (
     "sparsity.fewest_active.upper",
 )
 LAST = ("stopped", "message", "run", "hash", "seconds")
-"""Columns at the end; ``seconds`` is the last one, for it alone differs when a study is repeated."""
+"""Columns at the end; ``seconds`` is the last one, as no other column differs when a study is repeated."""
 LEFT = frozenset({"title", "versions", "provenance", "config", "tolerances", "units", "worst.parameter", "seed"})
 MEANING = {
     "status": ("", "what was proven; see method.md"),
@@ -62,17 +64,32 @@ MEANING = {
     "hash": ("", "SHA-256 of the run's config, without where it was solved, who watched, its title and its limits"),
     "seconds": ("s", "what the method took"),
 }
-"""Unit and meaning of the columns. ``cost``, ``constraint`` and ``time``: the units in which the config states them;
-the columns of `UNITS` tell those that it names."""
+"""Unit and meaning of the columns. ``cost``, ``constraint`` and ``time`` stand for the units of the config; the columns
+of `UNITS` have those that it names."""
 UNITS = {"cost": "units.cost", "constraint": "units.worst", "time": "units.time"}
 TIMES = frozenset({"horizon", "from", "to", "delay", "latency"})
-"""Keys that are times, wherever they stand in a config's problem."""
+"""Keys whose values are times, anywhere in a config's problem."""
 
 
 def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str, digest: str, said: str = "") -> Row:
-    """A row: the values of the axes, and the numbers of those that are lists as ``axis.0``, then every number and text
-    of ``summary`` (``result.json``), those inside an object as ``object.name``. Without a summary the status is
-    ``failed``, and ``said`` says why."""
+    """Return the row of a point.
+
+    Parameters
+    ----------
+    axes : mapping
+        The values of the axes; a list of numbers also gives the columns ``axis.0``, ``axis.1``, and so on.
+    summary : mapping or None
+        The contents of ``result.json``. Every number and text is a column; that in an object is ``object.name``.
+    run, digest : str
+        The run directory, and the hash of the config.
+    said : str, default ""
+        The reason where there is no summary; the status is then ``failed``.
+
+    Returns
+    -------
+    dict
+        The row.
+    """
     found: Row = {"status": "failed", "message": said} if summary is None else {}
     for name, value in (summary or {}).items():
         inside = dict(_entries(name, value))
@@ -87,7 +104,7 @@ def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str,
 
 
 def _numbers(axes: Mapping[str, Any]) -> Row:
-    """The entries of values that are lists of numbers, each under the key that the config has for it."""
+    """Return the entries of values that are lists of numbers, each under the key that the config has for it."""
     lists = {key: value for key, value in axes.items() if isinstance(value, list | tuple)}
     return {
         f"{key}.{place}": one
@@ -98,7 +115,10 @@ def _numbers(axes: Mapping[str, Any]) -> Row:
 
 
 def _entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """What is inside an entry, under its full name; of objects within an object only those of ``sparsity``."""
+    """Yield the entries of a value with their full names.
+
+    An object within an object is entered only in ``sparsity``.
+    """
     if not isinstance(value, Mapping):
         yield name, value
         return
@@ -110,8 +130,11 @@ def _entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
-    """The columns of a table: the axes, each before its entries where it has some, what is known of every run in a
-    fixed order, then the rest by name."""
+    """Return the columns of a table.
+
+    First come the axes, each followed by its entries where it has some. The columns that every run has follow in a
+    fixed order, then the others by name, and the last ones.
+    """
     kept = list(rows)
     entries = {
         axis: max((sum(_entry_of(name, axes) == axis for name in row) for row in kept), default=0) for axis in axes
@@ -128,34 +151,39 @@ def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
 
 
 def _entry_of(name: str, axes: Sequence[str]) -> str | None:
-    """The axis of whose value a column holds one number."""
+    """Return the axis of whose value a column holds one number."""
     axis, _, place = name.rpartition(".")
     return axis if axis in axes and place.isdigit() and name not in axes else None
 
 
 def table_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
-    """The table as CSV (RFC 4180, line feeds): numbers as short as they can be read back exactly, lists and mappings as
-    JSON, nothing where nothing is known."""
+    """Return the table as CSV (RFC 4180, line feeds).
+
+    Numbers are as short as they can be read back exactly, lists and mappings are JSON, and unknown values are empty.
+    """
     names = columns_of(axes, rows)
     return _csv([names, *([_cell(row.get(name)) for name in names] for row in rows)])
 
 
 def shared_unit(rows: Iterable[Row], kind: str = "cost") -> str:
-    """The unit of the costs, constraints or times of `UNITS`, where every row that has one has the same; else empty."""
+    """Return the unit of the costs, constraints or times of `UNITS`; empty unless all rows with a cost have the same
+    one."""
     found = {str(row.get(UNITS[kind]) or "") for row in rows if row.get("cost") is not None}
     return found.pop() if len(found) == 1 else ""
 
 
 def axis_unit(key: str, rows: Iterable[Row]) -> str:
-    """The unit of an axis, a key of the config: that of times where it is one, and all rows have the same; else empty,
-    since what other keys are measured in depends on what they are entries of."""
+    """Return the unit of an axis, where its key is a time and all rows have the same unit of time.
+
+    It is empty for other keys: their units depend on the states or controls that they belong to.
+    """
     first, *steps = key.split(".")
     names = [step for step in steps if not step.isdigit()]
     return shared_unit(rows, "time") if first == "problem" and names and names[-1] in TIMES else ""
 
 
 def columns_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
-    """The unit and the meaning of every column, as CSV."""
+    """Return the unit and the meaning of every column, as CSV."""
     lines = [["column", "unit", "meaning"]]
     for name in columns_of(axes, rows):
         unit, meaning = MEANING.get(name, ("1", ""))
@@ -169,7 +197,10 @@ def columns_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
 
 
 def read_table(directory: Path) -> list[Row]:
-    """The rows of a study's ``table.csv``, its numbers as numbers; raises `InputError` when it cannot be understood."""
+    """Return the rows of a study's ``table.csv``, with its numbers as numbers.
+
+    Raises `InputError` where the table cannot be understood.
+    """
     file = directory / TABLE
     try:
         lines = list(csv.reader(io.StringIO(file.read_text(encoding="utf-8"), newline=""), strict=True))

@@ -1,1 +1,1 @@
-"""Matrices that stand in a file beside a config, and in one text within it."""
+"""Matrices in a file that belongs to a config, and matrices as one text within a config."""

@@ -1,4 +1,4 @@
-"""The one reader of ``.npz`` files: plain numbers and text, never code."""
+"""The only reader of ``.npz`` files: plain numbers and text, never code."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 LARGEST = 2**31
-"""Bytes of arrays in one file, at most: no run writes as many, and a small file can pretend to hold any number."""
+"""Largest number of bytes of the arrays in one file. No run writes as many, and a small file can claim any number."""
 
 
 def read_arrays(file: Path, largest: int | None = None) -> dict[str, Array]:
-    """The arrays of an ``.npz`` file, none when there is no such file; raises `InputError` when it cannot be read, or
-    takes more than ``largest`` bytes in all, `LARGEST` unless given."""
+    """Return the arrays of an ``.npz`` file by name; none where there is no such file.
+
+    Raises `InputError` where the file cannot be read, or its arrays take more than ``largest`` bytes (`LARGEST` unless
+    given).
+    """
     if not file.is_file():
         return {}
     try:

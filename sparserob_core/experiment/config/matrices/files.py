@@ -1,4 +1,4 @@
-"""``{file: plant.npz, name: A}`` in a config: data only, read once, and from then on the numbers themselves."""
+"""Matrices from files, ``{file: plant.npz, name: A}``: data only, whose numbers replace the entry of the config."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ from sparserob_core.sip.convex_set import Array
 
 KEYS = {"file", "name"}
 PARTS = ("data", "indices", "indptr", "shape")
-LARGEST = 2**28  # bytes of the arrays of a file; ten times less refuses dense matrices of 2000 states
-# Characters of all matrices of a config, which is read back as one text of at most four million: ten times more takes
-# a minute to read, a tenth refuses dense matrices of 200 states.
+LARGEST = 2**28  # bytes of the arrays of a file; a tenth of it would refuse dense matrices of 2000 states
+# Characters of all matrices of a config, which is read back as one text of at most four million. Ten times more takes
+# a minute to read; a tenth would refuse dense matrices of 200 states.
 MOST_TEXT = 3_500_000
 SUFFIX = ".npz"
 
 
 def resolve(data: dict[str, Any], folder: Callable[[Path], File]) -> Iterator[Complaint]:
-    """Put the numbers in the place of every ``{file: ..., name: ...}`` below the problem, relative to the ``folder`` of
-    its key; what is wrong with one, with its key."""
+    """Replace every ``{file: ..., name: ...}`` of the problem by the numbers of the file; yields the faults.
+
+    ``folder`` maps the path of a key to the folder that its file is relative to.
+    """
     known: dict[File, dict[str, Array]] = {}
     size = 0
     for path, holder, key in list(_references(data.get("problem"), ("problem",))):
@@ -43,7 +45,8 @@ def resolve(data: dict[str, Any], folder: Callable[[Path], File]) -> Iterator[Co
 
 
 def _references(data: Any, path: Path) -> Iterator[tuple[Path, Any, Any]]:
-    """Where a matrix from a file stands: its path, what holds it, and the key there."""
+    """Yield the places of matrices from files: the path, the list or mapping that holds the entry, and its key
+    there."""
     entries = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
     for key, value in entries:
         if isinstance(value, Mapping) and set(value) == KEYS:
@@ -71,8 +74,10 @@ def _read(given: Mapping[str, object], folder: File, known: dict[File, dict[str,
 
 
 def matrix_in(arrays: Mapping[str, Array], name: str) -> Packed:
-    """The matrix of that name: an array of one or two axes, of one a column, or a sparse one in four parts. Raises
-    `InputError` that begins with the name of the array at fault."""
+    """Return the matrix of a name among arrays: a dense array, or a sparse matrix in four arrays.
+
+    An array of one axis is a column. Raises `InputError` that begins with the name of the array at fault.
+    """
     if name in arrays:
         dense = _numbers(arrays, name, "fiu")
         if dense.ndim not in (1, 2) or not dense.size:

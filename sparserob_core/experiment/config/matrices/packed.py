@@ -1,8 +1,10 @@
-"""A matrix as one text, ``{shape: [rows, columns], csr: ...}``: what stands in a resolved config for numbers that a
-file or a sparse array held, so that a run directory needs no other file, and its digest is one of the numbers.
+"""A matrix as one text: ``{shape: [rows, columns], csr: ...}``, or ``dense`` instead of ``csr``.
 
-The text is base64 of little-endian numbers: of ``csr`` the row pointers and the column indices, four bytes each, then
-the entries, eight bytes each; of ``dense`` the entries, row by row. It is the shorter of the two.
+A resolved config has it in place of the numbers of a file or of a sparse array. A run directory then needs no other
+file, and the digest of its config is one of the numbers.
+
+The text is base64 of little-endian numbers. ``csr`` has the row pointers and the column indices, four bytes each, then
+the entries, eight bytes each. ``dense`` has the entries row by row. The shorter text of the two is written.
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from pydantic_core import core_schema
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
-# Entries of a matrix, zeros included: it becomes a dense one. Ten times more are 320 MB for every copy, and no plant of
-# so many states is solved; a tenth would refuse plants of a thousand states.
+# Entries of a matrix, with its zeros, as it becomes a dense one. Ten times more are 320 MB for every copy, and no plant
+# of so many states is solved; a tenth would refuse plants of a thousand states.
 MOST = 4_000_000
 CSR, DENSE = "csr", "dense"
 Whole: TypeAlias = npt.NDArray[np.integer[Any]]
@@ -30,7 +32,7 @@ Whole: TypeAlias = npt.NDArray[np.integer[Any]]
 
 @final
 class Packed(list[list[float]]):
-    """The rows of a matrix that is written as one text again."""
+    """The rows of a matrix that is written back as one text."""
 
     @property
     def array(self) -> Array:
@@ -39,14 +41,14 @@ class Packed(list[list[float]]):
 
     @property
     def column(self) -> list[float]:
-        """The numbers of a matrix of one column; raises `InputError` for another one."""
+        """The numbers of a matrix with one column; raises `InputError` for another matrix."""
         if any(len(row) != 1 for row in self):
             raise InputError(expected="one column", got=f"{len(self[0])}")
         return [row[0] for row in self]
 
 
 def pack(matrix: Array) -> dict[str, Any]:
-    """The same numbers as data of a config."""
+    """Return a matrix as data of a config."""
     rows, columns = np.nonzero(matrix)
     pointers = np.searchsorted(rows, np.arange(len(matrix) + 1))
     sparse = [pointers.astype("<i4"), columns.astype("<i4"), matrix[rows, columns].astype("<f8")]
@@ -56,7 +58,7 @@ def pack(matrix: Array) -> dict[str, Any]:
 
 
 def unpack(data: Mapping[str, Any]) -> Packed:
-    """The matrix that is written so; raises `InputError` that begins with the key at fault."""
+    """Return the matrix of data of a config; raises `InputError` that begins with the key at fault."""
     kinds = [kind for kind in (CSR, DENSE) if kind in data]
     if len(kinds) != 1 or set(data) != {"shape", *kinds}:
         raise InputError(
@@ -82,7 +84,7 @@ def unpack(data: Mapping[str, Any]) -> Packed:
 
 
 def shape_of(given: object, where: str) -> tuple[int, int]:
-    """Two positive numbers of rows and columns that are not too many; raises `InputError`."""
+    """Return the numbers of rows and columns; raises `InputError` unless they are positive and not too large."""
     sizes = list(given) if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) else []
     whole = [isinstance(size, int | np.integer) and not isinstance(size, bool) and size > 0 for size in sizes]
     if len(sizes) != 2 or not all(whole):
@@ -94,8 +96,29 @@ def shape_of(given: object, where: str) -> tuple[int, int]:
 
 
 def spread(shape: tuple[int, int], values: Array, indices: Whole, pointers: Whole, where: str) -> Array:
-    """The dense matrix of a compressed sparse one, entries at one place added up; raises `InputError` for pointers and
-    indices that are none."""
+    """Return a compressed sparse matrix as a dense one.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        The numbers of rows and columns.
+    values, indices : array
+        The entries and their columns. Entries at the same place are added up.
+    pointers : array (rows + 1,)
+        The row pointers.
+    where : str
+        The key of the matrix, for errors.
+
+    Returns
+    -------
+    array (rows, columns)
+        The matrix.
+
+    Raises
+    ------
+    InputError
+        If pointers and indices do not fit.
+    """
     rows, columns = shape
     fits = pointers.shape == (rows + 1,) and values.ndim == 1 and values.shape == indices.shape
     if not fits or pointers[0] != 0 or pointers[-1] != values.size or (np.diff(pointers) < 0).any():
@@ -111,7 +134,7 @@ def spread(shape: tuple[int, int], values: Array, indices: Whole, pointers: Whol
 
 
 def checked(matrix: Array, where: str) -> Packed:
-    """The rows of a matrix of finite numbers; raises `InputError`."""
+    """Return the rows of a matrix of finite numbers; raises `InputError` for other numbers."""
     if not np.isfinite(matrix).all():
         place = tuple(int(i) + 1 for i in np.argwhere(~np.isfinite(matrix))[0])
         raise InputError(path=where, expected="finite numbers", got=f"{matrix[place[0] - 1, place[1] - 1]} at {place}")
@@ -121,8 +144,10 @@ def checked(matrix: Array, where: str) -> Packed:
 @final
 @dataclass(frozen=True)
 class OrPacked:
-    """Marks rows of a config that may also be a matrix from a file, or one in one text; ``column``: numbers that may be
-    one of one column."""
+    """The mark of rows of a config that may also be a matrix from a file, or one in one text.
+
+    With ``column`` it marks a list of numbers, which may be a matrix of one column.
+    """
 
     column: bool = False
 

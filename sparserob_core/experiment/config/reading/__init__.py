@@ -1,1 +1,1 @@
-"""From a file, a text or a mapping to the keys and values of a config, each with its place; and changes to them."""
+"""The reading of a config from a file, a text or a mapping, with the place of every key; and its overrides."""

@@ -1,5 +1,4 @@
-"""Changes to a config on the command line: ``key.sub=value``, where a number as key counts the entries of a list from
-0."""
+"""Overrides of a config: ``key.sub=value``, where a number as a key counts the entries of a list from 0."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ from sparserob_core.experiment.plugins.messages import shown
 
 @dataclass(frozen=True)
 class Override:
-    """``value`` for the key at ``path``; ``text`` as it was written."""
+    """A change of a config: the ``value`` for the key at ``path``; ``text`` is the override as it was written."""
 
     path: Path
     value: object
@@ -25,19 +24,22 @@ class Override:
 
     @property
     def quoted(self) -> str:
-        """The same override as it is to be written where its value is meant as text."""
+        """The text of the same override with a value that is read as text."""
         return quoted(self.text)
 
 
 def quoted(text: str) -> str:
-    """``key="value"``, quoted once more for a shell, so that the value is text."""
+    """Return ``key="value"``, quoted for a shell, so that the value is read as text."""
     key, _, value = text.partition("=")
     return shlex.quote(f"{key}={json.dumps(value.strip(), ensure_ascii=False)}")
 
 
 def parse_value(text: str, parse: Callable[[str], object]) -> object:
-    """The value of ``key=value``; what YAML would leave out as a comment, or cannot read, is an error that says how to
-    quote it."""
+    """Return the value of ``key=value``, read by ``parse``.
+
+    Raises `ConfigError` where YAML cannot read the value, or would drop a part of it as a comment; the error shows how
+    to quote it.
+    """
     given = text.partition("=")[2]
     try:
         value = parse(given)
@@ -51,7 +53,7 @@ def parse_value(text: str, parse: Callable[[str], object]) -> object:
         try:
             comment = parse(given[: mark.start()]) == value
         except ConfigError:
-            comment = False  # it stands within quotes
+            comment = False  # the mark is within quotes
         if comment:
             raise ConfigError(
                 f"override {shown(text)}: {shown(given[mark.start() :])} would be a comment, which is left out; "
@@ -63,7 +65,10 @@ def parse_value(text: str, parse: Callable[[str], object]) -> object:
 def parse_overrides(
     given: Mapping[str, object] | Iterable[str] | None, parse: Callable[[str], object]
 ) -> list[Override]:
-    """Overrides from ``key=value`` texts, whose values ``parse`` reads, or from a mapping of keys to values."""
+    """Return the overrides of texts ``key=value``, whose values ``parse`` reads, or of a mapping of keys to values.
+
+    Raises `ConfigError` for a text that is no override.
+    """
     if given is None:
         return []
     if isinstance(given, Mapping):
@@ -85,8 +90,10 @@ def _path(key: str) -> Path:
 
 
 def apply_override(data: dict[str, Any], override: Override) -> None:
-    """Set the value in place; keys between that are missing, or null, are made. Raises `ConfigError` when the path
-    leads nowhere."""
+    """Set the value of an override in the ``data`` of a config.
+
+    Keys on its path that are missing or null are added. Raises `ConfigError` where the path leads nowhere.
+    """
     node: Any = data
     for position, given in enumerate(override.path):
         last = position == len(override.path) - 1

@@ -1,4 +1,4 @@
-"""Reads and writes configs; the only module that knows YAML (version 1.2). Nothing in a config is ever executed."""
+"""The reader and writer of configs; the only module that knows YAML (version 1.2). Nothing in a config is executed."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from sparserob_core.experiment.config.matrices.packed import pack
 if TYPE_CHECKING:
     from ruamel.yaml import YAML
 
-# Bytes of a config, which may hold matrices as one text each; large data belongs in a file of arrays, or in a plugin
-# that makes it. Ten times more takes half a minute to read, a tenth is a dense matrix of 200 states.
+# Bytes of a config, which may hold matrices as one text each. Large data belongs in a file of arrays, or in a plugin
+# that makes it. Ten times more takes half a minute to read; a tenth is a dense matrix of 200 states.
 LARGEST = 4_000_000
-MOST_VALUES = 200_000  # values of a config, where an alias counts as all that it stands for
+MOST_VALUES = 200_000  # values of a config; an alias counts as all values that it stands for
 
 __all__ = ["Source", "read_source", "read_value", "require_readable", "write_yaml"]
 
@@ -30,9 +30,23 @@ __all__ = ["Source", "read_source", "read_value", "require_readable", "write_yam
 @final
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A config as it was given: its ``data``, and its ``text``, which says where each key of it stands. ``name`` is the
-    file as the user wrote it. Of one that extends a ``base`` the ``data`` hold what the base says too, and ``own`` what
-    it says itself."""
+    """A config as it was given.
+
+    Parameters
+    ----------
+    name : str
+        The file, as the user wrote it.
+    folder : Path
+        Its folder.
+    data : dict
+        The keys and values. Those of a config that extends another one include those of its ``base``.
+    text : str, default ""
+        The text of the file, which has the place of each key.
+    base : Source, optional
+        The config that it extends.
+    own : mapping
+        The keys and values that it has without its ``base``.
+    """
 
     name: str
     folder: File
@@ -52,18 +66,18 @@ class Source:
             return None
 
     def writer(self, path: Path) -> Source:
-        """The config of the chain that decides what stands at ``path``; this one, where none does."""
+        """Return the config of the chain that gives the value at ``path``; this config, where none does."""
         if self.base is None or _decides(self.own, path) or not _decides(self.base.data, path):
             return self
         return self.base.writer(path)
 
     def where(self, path: Path) -> str:
-        """``file:line:column`` of the key, or of the nearest one above it that was written."""
+        """Return ``file:line:column`` of a key, or of the nearest key above it that was written."""
         writer, (line, column) = self.writer(path), self.position(path)
         return writer.name if not writer.text else f"{writer.name}:{line + 1}:{column + 1}"
 
     def position(self, path: Path) -> tuple[int, int]:
-        """Line and column of the same, counted from 0; ``(0, 0)`` where positions are unknown."""
+        """Return line and column of a key, counted from 0; ``(0, 0)`` where positions are unknown."""
         node, place = self.writer(path).marks, (0, 0)
         for step in path:
             found = _position(node, step)
@@ -74,9 +88,9 @@ class Source:
 
 
 def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
-    """Read a config from a ``.yaml``, ``.json`` or ``.toml`` file, or take it from a mapping, or as it was read before.
+    """Read a config from a ``.yaml``, ``.json`` or ``.toml`` file, or take it from a mapping or a `Source`.
 
-    Raises `ConfigError` when there is no such file, it cannot be read, or it does not hold a mapping.
+    Raises `ConfigError` where there is no such file, where it cannot be read, and where it does not hold a mapping.
     """
     if isinstance(config, Source):
         return config
@@ -100,7 +114,7 @@ def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
 
 
 def require_readable(data: Mapping[str, Any], text: str) -> None:
-    """Raise `ConfigError` where a config, written as ``text``, is larger than what is read back."""
+    """Raise `ConfigError` where a config that was written as ``text`` is larger than `read_source` accepts."""
     size, values = len(text.encode()), _counted(data, {})
     if size > LARGEST or values > MOST_VALUES:
         raise ConfigError(
@@ -110,7 +124,7 @@ def require_readable(data: Mapping[str, Any], text: str) -> None:
 
 
 def read_value(text: str) -> object:
-    """The value of an override, as YAML."""
+    """Return the value of an override, read as YAML; raises `ConfigError` where it cannot be read."""
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
     if len(text) > LARGEST:
@@ -127,9 +141,9 @@ def read_value(text: str) -> object:
 
 
 def write_yaml(data: Mapping[str, Any], heading: str = "") -> str:
-    """A mapping as YAML; lists of plain values stand on one line."""
+    """Return a mapping as YAML with the ``heading`` as a comment; lists of plain values are written on one line."""
     yaml = _yaml("safe")
-    yaml.version = None  # 1.2 all the same, without the directive
+    yaml.version = None  # still version 1.2, but without the directive
     yaml.default_flow_style = None
     yaml.width = 140
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
@@ -194,7 +208,8 @@ def _parsed(file: File, text: str) -> Any:
 
 
 def _counted(data: object, known: dict[int, int]) -> int:
-    """How many values there are, those behind an alias as often as it is used; one that contains itself counts once."""
+    """Return the number of values, where an alias counts whenever it is used; a value that contains itself
+    counts once."""
     if not isinstance(data, Mapping | list):
         return 1
     if id(data) not in known:
@@ -222,7 +237,7 @@ def _position(node: Any, step: str | int) -> tuple[tuple[int, int], object] | No
 
 
 def _decides(data: Any, path: Path) -> bool:
-    """Whether there is a value at ``path``, or one above it that leaves no room for others."""
+    """Return whether there is a value at ``path``, or one above it that excludes keys below it."""
     for step in path:
         if not isinstance(data, Mapping):
             return True

@@ -1,1 +1,1 @@
-"""What was stated in Python, as the keys of a config that say the same."""
+"""The conversion of a problem that was written in Python into the keys of a config with the same meaning."""

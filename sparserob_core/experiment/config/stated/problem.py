@@ -1,6 +1,6 @@
-"""A problem that was stated in Python as the key `problem` of a config: data, never code.
+"""The key `problem` of a config for a problem that was written in Python: data, never code.
 
-What a config cannot say is refused with the key that it would stand at; nothing is left out in silence.
+A part that no config can describe is an error with the key at which it would stand; nothing is left out silently.
 """
 
 from __future__ import annotations
@@ -34,21 +34,24 @@ WRITTEN = {
     "measurements", "repeat", "execution", "disturbance_breakpoints",
     "commanded",
 }  # fmt: skip
-"""The fields of a problem that are written beside lists of constraints; another one is refused, not lost."""
+"""The fields of a problem that are written in addition to lists of constraints; any other field is an error."""
 CALLED = {"start": "from", "stop": "to"}
-"""Fields of a term that a config calls otherwise."""
-MANY = 2500  # entries of a matrix that nobody reads: of ten times more a config has as many values as it may have
+"""Fields of a term that have another name in a config."""
+MANY = 2500  # entries above which a matrix is packed: nobody reads more, and ten times more fill a config
 WRITTEN_OF_SYSTEM = {"phases", "parameters", "delay"}
 
 
 def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
-    """The key ``problem`` of a config, as the problem ``linear`` reads it."""
+    """Return the key ``problem`` of a config, as the problem ``linear`` reads it.
+
+    Raises `InputError` that begins with the key where no config can describe the problem.
+    """
     unknown = {one.name for one in fields(problem)} - WRITTEN - set(problem.lists)
     if unknown:
         raise InputError(path=sorted(unknown)[0], expected="a field that a config can say", got="another one")
     stated = {name: [entry for entry in entries if entry.stated] for name, entries in problem.lists.items()}
     fixed = bool(problem.repeat) and bool((widths(problem.initial_set, problem.system.states) == 0.0).any())
-    ends = problem.terminal[: len(problem.terminal) - fixed]  # what repeat adds is said by repeat
+    ends = problem.terminal[: len(problem.terminal) - fixed]  # the key repeat adds its own end again
     keys: dict[str, Any] = {
         "name": "linear",
         "system": _system_keys(problem.system),
@@ -78,8 +81,10 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
 
 
 def _disturbance_keys(problem: OptimalControlProblem, system: dict[str, Any]) -> Any:
-    """The set of the disturbance; where no kind of set is a product of others, a list, which takes the columns of ``E``
-    out of the keys of the ``system``."""
+    """Return the key of the disturbance: its set, or a list where no kind of set is such a product of others.
+
+    A list takes the columns of ``E`` out of the keys of the ``system``.
+    """
     bound = problem.disturbance
     if not isinstance(bound, Product):
         assert bound is not None
@@ -101,14 +106,16 @@ def _disturbance_keys(problem: OptimalControlProblem, system: dict[str, Any]) ->
 
 
 def _class_of(problem: OptimalControlProblem, part: int) -> str:
-    """The class of a part of the disturbance."""
+    """Return the class of a part of the disturbance."""
     kinds = problem.disturbance_class
     return kinds if isinstance(kinds, str) else kinds[part]
 
 
 def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
-    """A set as a config writes it: the key of its kind, with what it is built from. Raises `InputError` where no kind
-    that is registered has such sets."""
+    """Return a set as a config writes it: the key of its kind, with the options from which it is built.
+
+    Raises `InputError` where no registered kind has such sets; ``where`` is the key in the message.
+    """
     registry = load_registry()
     for kind in registry.names(SetPlugin.kind):
         factory = registry.get(SetPlugin.kind, kind).options_type()
@@ -140,14 +147,14 @@ def _matrix_keys(phase: Phase) -> dict[str, Any]:
 
 
 def _defined_keys(phases: Sequence[Phase]) -> dict[str, Any]:
-    """What the entries of phases use by name; of several, which share it, that of any."""
+    """Return the definitions that the entries of phases use; all phases share them."""
     entries = [getattr(one, name) for one in phases for name in ("A", "B", "E", "c")]
     defined = next((one.defined for one in entries if isinstance(one, ExpressionMatrix) and one.defined), ())
     return {"define": {name: one.text for name, one in defined}} if defined else {}
 
 
 def _rows(phase: Phase, name: str) -> Any:
-    """Rows of numbers and expressions, or large ones in one text."""
+    """Return the rows of numbers and expressions of a matrix; a large matrix is packed into one text."""
     given = getattr(phase, name)
     if isinstance(given, ExpressionMatrix):
         return [[entry.text for entry in row] for row in given.entries]
@@ -179,8 +186,10 @@ def _initial_keys(problem: OptimalControlProblem) -> Any:
 
 
 def _term_keys(where: str, term: Term) -> dict[str, Any]:
-    """A key for every field of a term that is told, a set by its kind; a bound that is infinite is none, nor is an end
-    that follows the horizon."""
+    """Return a key for every field of a term that has a value, and for a set the key of its kind.
+
+    An infinite bound is null, and an end that follows the horizon is not written.
+    """
     told = {one.name: value for one in fields(cast("Any", term)) if (value := getattr(term, one.name)) is not None}
     keys: dict[str, Any] = {}
     if isinstance(term, MixedConstraint):
@@ -199,7 +208,7 @@ def _term_keys(where: str, term: Term) -> dict[str, Any]:
 
 
 def _listed(value: Any) -> Any:
-    """Numbers as lists of them, none where they are not finite."""
+    """Return numbers as nested lists, with null where they are not finite."""
     numbers = np.asarray(value, dtype=float)
     found = numbers.astype(object)
     found[~np.isfinite(numbers)] = None

@@ -1,4 +1,4 @@
-"""What a problem is solved with, as the keys beside it, and both as one config."""
+"""The keys of a config for the components with which a problem is solved, and the complete config."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.guards import unguarded
 from sparserob_core.options import Options
 
-NAME = "problem"  # in messages, and of the folder of its runs: a title may hold anything
+NAME = "problem"  # its name in messages and in the folder of its runs, for a title may hold any character
 
 
 def source_of(problem: OptimalControlProblem, beside: Mapping[str, Any] | None = None) -> Source:
-    """The config of a problem, with the other keys ``beside`` it; raises `InputError` that begins with the key where it
-    cannot be said."""
+    """Return the config of a problem together with the other keys ``beside`` it.
+
+    Raises `InputError` that begins with the key where no config can describe the problem.
+    """
     title = {"title": problem.title} if problem.title else {}
     try:
         stated = problem_keys(problem)
@@ -32,8 +34,11 @@ def source_of(problem: OptimalControlProblem, beside: Mapping[str, Any] | None =
 
 
 def component_keys(registry: Registry, kind: str, choice: object) -> dict[str, Any]:
-    """The entry of a component that was chosen by its name, by a mapping, or as an object: then that of the record
-    whose class it is. Raises `InputError` where there is none."""
+    """Return the entry of a config for a component.
+
+    ``choice`` is its name, a mapping, or an object, whose entry is that of the record with its class. Raises
+    `InputError` where no record has that class.
+    """
     choice = unguarded(choice)
     if isinstance(choice, str):
         return {"name": choice}
@@ -48,7 +53,10 @@ def component_keys(registry: Registry, kind: str, choice: object) -> dict[str, A
 
 
 def dictionary_keys(registry: Registry, which: str, choice: object) -> dict[str, Any]:
-    """The entry of a dictionary; one that was made in Python must be of indicators, on pieces of any length."""
+    """Return the entry of a config for a dictionary.
+
+    A dictionary object must consist of indicators, on pieces of any length; raises `InputError` for another one.
+    """
     if not isinstance(choice, Dictionary):
         return component_keys(registry, "dictionary", choice)
     pieces = choice.pieces

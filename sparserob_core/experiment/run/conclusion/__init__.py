@@ -1,1 +1,1 @@
-"""What a run makes of a result before it is written down: bounds without rounding, times of action, causal policies."""
+"""The last steps of a run before its result is written: exact bounds, times of action, bounds for causal policies."""

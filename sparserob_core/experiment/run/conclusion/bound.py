@@ -1,4 +1,4 @@
-"""The lower bound that a run writes: what rounding may have raised is taken off, or it is derived without rounding."""
+"""The lower bound that a run writes: reduced by its rounding errors, or derived without any."""
 
 from __future__ import annotations
 
@@ -19,18 +19,22 @@ from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result
 
-SECONDS = 10.0  # for a bound in ball arithmetic where another one holds as well; where none does it takes what it takes
+SECONDS = 10.0  # for a bound in ball arithmetic, where another bound holds too; where none does there is no limit
 NO_TIME = "there was no time to see what the multipliers prove without rounding"
 ROUNDING = 1e-12  # of a cost
 CROSSED = (
     "the lower bound {:.12g} that its multipliers prove is above the cost {:.12g} of a decision that was proven, by"
     " more than the tolerances of the proofs allow: one of the two is wrong, and neither is claimed; {}"
 )
-INWARDS = 1e-13  # of it, so that whoever derives it with another precision does not find less
+INWARDS = 1e-13  # share of the bound that is taken off, so that a check with another precision derives no smaller one
 
 
 def bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -> Result:
-    """The same result with a lower bound that its multipliers prove, and with a word on what is not proven of it."""
+    """Return a result with the lower bound that its multipliers prove, and with the notes on what is not proven of it.
+
+    The status is that of the new bound. It is ``failed`` where the bound is above the cost by more than the tolerances
+    of the proofs allow.
+    """
     model = experiment.transcription
     if result.status == "undecided" and not np.isfinite(result.dual.bound):
         result = replace(result, lower_bound=0.0)  # no term of a cost is negative, and nothing else is proven
@@ -39,8 +43,11 @@ def bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -
 
 
 def unbounded(result: Result) -> Result:
-    """The same result where there was no time to see what its multipliers prove: no term of a cost is negative, and
-    nothing else is known from below; that nothing is feasible is not known either."""
+    """Return a result without multipliers, for a run that has no time to see what they prove.
+
+    The lower bound is 0, as no term of a cost is negative. An infeasible result becomes ``undecided``, a certified one
+    ``verified``.
+    """
     bare = replace(result, dual=NO_BOUND, lower_bound=0.0)
     if result.status == "infeasible":
         return replace(bare, status="undecided", message=NO_TIME, infeasible=None, decision=None)
@@ -50,14 +57,17 @@ def unbounded(result: Result) -> Result:
 
 
 def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -> Result:
-    """The same result with a lower bound that its multipliers prove.
+    """Return a result with the lower bound that its multipliers prove.
 
-    Running bounds of rounding are cheap, but where multipliers are large, as those of nearly parallel rows are, they
-    may be all that keeps the gap open. There the bound is derived from the same multipliers in ball arithmetic, which
-    leaves out no rounding, in the rows neither. So it is where the worst deviations of a policy are found by support
-    points of sets that are no boxes: what they are off by is in no running bound. And beside errors of execution, whose
-    integrals a running bound estimates by shares: there no other bound is told, however long it takes, and where the
-    time of the run is over before it raises `sparserob_core.sip.limits.deadline.OutOfTime`.
+    Running bounds of rounding errors are cheap. Where multipliers are large, as those of nearly parallel rows are,
+    these bounds may be all that keeps the gap open. The bound is then derived from the same multipliers in ball
+    arithmetic, which omits no rounding error, nor any in the rows.
+
+    Ball arithmetic is also used in two cases in which running bounds omit an error. The first: support points of sets
+    that are no boxes give the worst deviations of a policy. No running bound has the error of these points. The second:
+    there are errors of execution, whose integrals a running bound estimates by shares. No other bound is reported in
+    these cases, however long it takes. Raises `sparserob_core.sip.limits.deadline.OutOfTime` where the time of the run
+    is over before.
     """
     tolerance = experiment.gap_tolerance
     prices = None if any(counting(experiment.loaded)) else experiment.program.finite.weights
@@ -96,8 +106,10 @@ def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) 
 
 
 def _allowed(result: Result) -> float:
-    """By how much the bound may be above the cost: multiplier times tolerance of every row (`sip.working.ledger.alarm`,
-    which has judged the bound before, in the program's own units)."""
+    """Return by how much the lower bound may be above the cost: the sum of multiplier times tolerance over all rows.
+
+    `sip.working.ledger.alarm` has judged the bound before, in the program's own units.
+    """
     units = {proof.family: proof.units for proof in result.proofs}
     allowed = np.inf if result.dual.mu.size else ROUNDING * abs(result.cost)
     for cut in result.dual.cuts:

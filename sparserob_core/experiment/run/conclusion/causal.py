@@ -1,4 +1,4 @@
-"""What no causal policy can do, beside what a policy does: sought after a run, and derived without rounding."""
+"""The bound for every causal policy: searched after a run under feedback, and derived without rounding errors."""
 
 from __future__ import annotations
 
@@ -27,8 +27,11 @@ WORDS = "; nor does any other causal policy with this dictionary exist: {} signa
 
 
 def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
-    """The result with a bound against every causal policy, where it has a policy and costs what absolute
-    values do; a run that was stopped seeks none."""
+    """Return a result with a lower bound of the cost of every causal policy.
+
+    The bound is searched where the result has a policy and its cost is that of absolute values. Otherwise the result is
+    returned as it is. So is that of a run that failed, was stopped, or has no time left.
+    """
     model = result.model
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
         return result
@@ -41,7 +44,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
         search = searched(model, result.decision, active(model, result))
         limits = Limits.of(charge, [result], model.program.n, lambda: tools.deadline.passed)
         cost = result.cost if result.status in ("certified", "verified") else np.inf
-        for hides in (True, False):  # what a noise hides may be more than balls can show of a plant that grows fast
+        for hides in (True, False):  # of an unstable plant, balls may be too wide to show what a noise hides
             found = search.least_cost(cost, limits, hides)
             nothing = replace(result, causal=CausalBound(-np.inf, ended=limits.ended))
             if found is None:
@@ -56,7 +59,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
         return result
     if derived is None:
         return nothing
-    if not stated.rows:  # no control costs less than nothing: news where the policy costs as little
+    if not stated.rows:  # every cost is at least 0: worth reporting only where the cost of the policy is 0
         return replace(result, causal=CausalBound(0.0, ended=limits.ended)) if cost == 0.0 else nothing
     if none:
         said = WORDS.format(len(stated.signals)) if result.status == "infeasible" else ""
@@ -65,13 +68,16 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
 
 
 def _from(rest: Array, signal: Array) -> Array:
-    """The deviations of a disturbance ``(mw, blocks)``; ``rest`` has those of the initial state after it."""
+    """Return the deviations of a disturbance ``signal (mw, blocks)`` from its rest, as one vector.
+
+    ``rest`` holds the values at rest of the disturbance, followed by those of the initial state.
+    """
     found: Array = signal.T.ravel() - rest[: signal.size]
     return found
 
 
 def active(model: Transcription, result: Result) -> list[tuple[str, float, Array | None]]:
-    """Names, times and deviations of the constraints that the bound of a result rests on."""
+    """Return the name, the time and the deviations of each constraint that the lower bound of a result rests on."""
     rest, found = model.answering.loop.spread.middle, []
     for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         if said is not None:
@@ -83,9 +89,12 @@ def active(model: Transcription, result: Result) -> list[tuple[str, float, Array
 def searched(
     model: Transcription, decision: Array | None, rests: list[tuple[str, float, Array | None]]
 ) -> CausalSearch:
-    """The search for a bound, beside a policy's ``decision`` and what its own bound ``rests`` on. Of measurable
-    disturbances those are looked at that are constant on the pieces of the grid: what no policy can do against these,
-    none can do against all."""
+    """Return the search for a bound, which begins with a policy's ``decision`` and the constraints ``rests`` of its
+    bound.
+
+    For measurable disturbances the search takes those that are constant on the pieces of the grid, and begins without
+    the decision. A cost that no policy can avoid under these, none can avoid under all.
+    """
     from sparserob_core.control.studies.causal import CausalSearch
 
     if model.answering.loop.measurable is None:
@@ -98,8 +107,25 @@ def searched(
 def proven(
     model: Transcription, problem: OptimalControlProblem, stated: CausalBound, deadline: Deadline | None = None
 ) -> float | None:
-    """The lower bound of the cost that the multipliers prove, rounded downwards; where none is to exist, by how much
-    every policy misses their sum. ``None`` where that is not positive, and where it is not derived."""
+    """Return the number that the multipliers of a causal bound prove, rounded downwards.
+
+    Parameters
+    ----------
+    model : Transcription
+        The problem on its dictionaries.
+    problem : OptimalControlProblem
+        The problem for which the bound is derived.
+    stated : CausalBound
+        The bound, with its signals and multipliers.
+    deadline : Deadline, optional
+        The end of the time; the check takes at most `SECONDS`.
+
+    Returns
+    -------
+    float or None
+        The lower bound of the cost. Where no policy is claimed to exist: the amount by which every policy violates the
+        sum of the constraints, or ``None`` where that is not positive. ``None`` also where nothing was derived.
+    """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import derived_causal_bound
     from sparserob_core.checker.outcome import Broken, Clock, Unchecked

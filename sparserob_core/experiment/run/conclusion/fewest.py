@@ -1,4 +1,4 @@
-"""How little any admissible control must act: the interval that a run reports beside its own control."""
+"""The least time of action: bounds of it over all admissible controls, reported with the control of a run."""
 
 from __future__ import annotations
 
@@ -20,24 +20,27 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.working.counting import count, share_of, whole
 
-INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding does not find less
+INWARDS = 1e-9  # share of a bound that is taken off, so that a check with another rounding derives no smaller one
 ROUNDS, CELLS = 30, 64
-"""Rounds, and cells of a proof, that the other program may take where the run's own took fewer. Of ten times fewer
-rounds, a control in a ball is not met (it takes some twenty tangents); of ten times fewer cells, a vertex of a problem
-whose own control hardly moves is not proven; of ten times more, cells of parameters, which take long, are examined for
-longer than the run took."""
+"""Rounds, and cells of a proof, that the other program may take where the run's own took fewer. With ten times fewer
+rounds a control in a ball is not reached, as it takes some twenty tangents. With ten times fewer cells a vertex is not
+proven where the control of the run hardly moves. With ten times more, cells of parameters, which are slow, are examined
+for longer than the run took."""
 ENDED, PROVEN = ("infeasible", "failed"), ("certified", "verified")
 
 
 def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -> Result:
-    """The result with what is proven of the least share of time that any admissible control of the dictionary must act.
+    """Return a result with bounds of the least share of time for which any admissible control of the dictionary must
+    act.
 
-    Below by the lower bound of the cost where the convex cost below the count is a multiple of it, above by the control
-    that is returned, where that is proven. Where it is no multiple, or that control no vertex, by a program of its own,
-    which begins with the constraints that the result rests on, and by a vertex of it. That takes no more rounds, and
-    proofs of no more cells, than the run itself, whatever there is to be gained: where it ends early, its lower bound
-    holds as far as it came, and the upper one is that of the run's own control. A run that was stopped solves nothing
-    more.
+    The lower bound comes from that of the cost, where the convex cost that underestimates the count is a multiple of
+    it. The upper bound comes from the control of the result, where this is proven. Where the cost is no such multiple,
+    or the control is no vertex, a second program gives the lower bound and one of its vertices the upper one. This
+    program begins with the constraints that the result rests on.
+
+    The second program takes no more rounds than the run did, and its proofs no more cells, or `ROUNDS` and `CELLS`
+    where these are more. Where it ends early, its lower bound holds as far as it was proven, and the upper bound is
+    that of the run's control. It is not solved for a run that was stopped.
     """
     program, proven = experiment.program, result.status in PROVEN
     if result.status in ENDED or program.activity is None or result.decision is None:
@@ -47,14 +50,14 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
     if result.sparsest is not None and result.sparsest.letters is None:  # its own bounds are those of the count
         upper = _share(program, result.cost) if proven else None
         return replace(result, activity=Activity(_share(program, result.lower_bound) or 0.0, upper, norm=norm))
-    # the number of a sample tells nobody else
+    # a cut of a sample is known by its number only, from which a check cannot derive its row
     told = result.sparsest is None and all(cut.formulation != "sampled" for cut in result.dual.cuts)
     factor = _factor(experiment) if told else None
     least = -np.inf if factor is None else _safe(program, factor * result.lower_bound)
     most, other = count(program, np.asarray(result.decision)) if proven else np.inf, None
     if factor is None or (proven and not is_vertex(program, result)):
         other = _other(experiment, result, tools, most)
-    if other is not None:  # the relaxed programs of the method are what they were
+    if other is not None:  # only the account of the solver changes, not the relaxed programs of the method
         result = replace(result, solved_by=result.charged([other]).solved_by)
     activity = Activity(_share(program, least) or 0.0, _share(program, most), norm=norm)
     if other is not None and _safe(program, other.lower_bound) > least:
@@ -68,14 +71,18 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
 
 
 def _admissible(program: SemiInfiniteProgram, other: Result, most: float) -> bool:
-    """Whether another decision counts less than ``most`` and is proven, family by family."""
+    """Return whether another decision counts less than ``most`` and is proven for every family of constraints."""
     proven = other.status in PROVEN and len(other.proofs) == len(program.families)
     return proven and np.isfinite(most) and count(program, np.asarray(other.decision)) < most * (1.0 - INWARDS)
 
 
 def _factor(experiment: ControlExperiment) -> float | None:
-    """The count is at least this times the cost; with vectors of channels that act together by the longest that each
-    can be, at the highest of its weights, for ``[u != 0] >= |u| / max |u|``. ``None`` where the cost says nothing."""
+    """Return a factor such that the count is at least this factor times the cost; ``None`` where the cost gives no
+    bound.
+
+    For vectors of channels that act together it comes from ``[u != 0] >= |u| / max |u|``: the largest norm of each
+    vector, at the highest of its weights.
+    """
     program, cost = experiment.program, experiment.problem.cost
     if program.finite.blocks is None or cost.is_quadratic or not cost.l1:
         return multiple(program)
@@ -93,7 +100,7 @@ def _factor(experiment: ControlExperiment) -> float | None:
 
 
 def longest(bound: ConvexSet, channels: Sequence[int]) -> float:
-    """At least how long the vector of some channels can be: exact for a box and for a Euclidean ball."""
+    """Return an upper bound of the norm of the vector of some channels; it is exact for a box and a Euclidean ball."""
     reach = float(np.linalg.norm(bound.reach(np.eye(bound.dimension))[list(channels)]))
     if isinstance(bound, NormBall) and bound.p == 2.0:
         return min(reach, bound.radius + float(np.linalg.norm(bound.centre[list(channels)])))
@@ -109,7 +116,7 @@ def _share(program: SemiInfiniteProgram, counted: float) -> float | None:
 
 
 def _other(experiment: ControlExperiment, result: Result, tools: Tools, most: float) -> Result | None:
-    """The program whose cost is below the count, solved; ``None`` where it gives nothing."""
+    """Return the result of the program whose cost is below the count; ``None`` where it gives nothing."""
     if result.stopped or tools.deadline.passed:
         return None
     try:

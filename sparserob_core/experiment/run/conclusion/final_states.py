@@ -11,7 +11,7 @@ from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result
 
 SECONDS = 20.0  # for an enclosure in ball arithmetic
-OUTWARDS = 1.0 + 1e-12  # so that whoever derives the errors with another precision does not find more
+OUTWARDS = 1.0 + 1e-12  # factor of the errors, so that a check with another precision derives no larger ones
 
 
 def with_final_states(model: Transcription, result: Result, tolerance: float | None) -> Result:
@@ -48,7 +48,8 @@ def with_final_states(model: Transcription, result: Result, tolerance: float | N
 
 
 def _enclosed(model: Transcription, result: Result) -> np.ndarray | None:
-    """The largest errors of the fixed final states ``(e,)``, in the user's units; ``None`` where they are not found."""
+    """Return the largest errors of the fixed final states ``(e,)``, in the user's units; ``None`` where they are not
+    found."""
     from flint import ctx
 
     from sparserob_core.checker.claims.case import Case
