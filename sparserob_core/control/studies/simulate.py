@@ -22,6 +22,13 @@ MANY = 10_000  # pieces, from which no times inside are looked at where the syst
 HELD = 2_000_000  # numbers of signals, or of transition matrices, that are held at once
 
 
+def times_inside(times: Array, breakpoints: Array) -> int:
+    """Return the smallest number of increasing ``times (T,)`` that lie strictly between two neighbouring
+    ``breakpoints (K + 1,)``."""
+    ends = np.searchsorted(times, breakpoints[1:], side="left")
+    return int((ends - np.searchsorted(times, breakpoints[:-1], side="right")).min())
+
+
 def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> Array:
     """The breakpoints, ``more (k,)`` times, and times inside every piece: three of them, or more where the system moves
     on it, and fewer where there are many pieces; ``(T,)``."""

@@ -11,12 +11,18 @@ from typing import cast
 import numpy as np
 
 from sparserob_core.arguments import whole
-from sparserob_core.control.constraints.flat import INSIDE
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, ParametersInTime, Uncertainty, noises
-from sparserob_core.control.studies.simulate import delivered, fine_times, finer, trajectories_at_once, walk
+from sparserob_core.control.studies.simulate import (
+    delivered,
+    fine_times,
+    finer,
+    times_inside,
+    trajectories_at_once,
+    walk,
+)
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.adversary import (
@@ -184,7 +190,7 @@ def _sampled(
         trajectories=count,
         seed=seed,
         times=times.size,
-        inside=INSIDE,
+        inside=times_inside(times, response.grid.breakpoints),
         constraints=shares,
         any_violated=_together(shares, out) if len(shares) > 1 else None,
         shown=times[shown],
@@ -274,7 +280,7 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
         trajectories=len(shares),
         seed=0,
         times=times.size,
-        inside=INSIDE,
+        inside=times_inside(times, finished.experiment.transcription.response.grid.breakpoints),
         constraints=shares,
         any_violated=None,
         shown=times[shown],

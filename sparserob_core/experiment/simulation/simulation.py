@@ -211,8 +211,8 @@ class Simulation:
                 f"and the intervals are about this law only ({LAWS[self.law]})"
             )
             yield (
-                f"every trajectory was looked at at {self.times} times, at least {self.inside} of them inside every"
-                " piece, not between them"
+                f"every trajectory was looked at at {self.times} times, at least {self.inside or 'none'} of them inside"
+                " every piece, not between them"
             )
         worst = max(self.constraints, key=lambda one: one.worst, default=None)
         if self.contradicts:

@@ -3,6 +3,7 @@ nothing worse than the proven worst case."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -20,7 +21,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.control.studies.laws import Uncertainty, admissibility
-from sparserob_core.control.studies.simulate import fine_times, finer, walk
+from sparserob_core.control.studies.simulate import fine_times, finer, times_inside, walk
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.simulation.simulation import clopper_pearson
 from tests.support.plants import held, indicators, random_system, simulated, uniform, walsh
@@ -211,6 +212,10 @@ def test_trajectories_agree_with_an_integrator_and_with_augmented_exponentials(n
         grid = model.response.grid
         paths = np.stack(list(walk(fine, u[:, grid.control_piece], np.zeros((3, 0)), w[:, :, grid.disturbance_piece])))
         assert {0.0, 0.123, 1.5} <= set(times.tolist())
+        ends = itertools.pairwise(model.response.grid.breakpoints.tolist())
+        assert times_inside(times, model.response.grid.breakpoints) == min(
+            sum(a < time < b for time in times.tolist()) for a, b in ends
+        )
         for position in (0, 3, times.size // 2, times.size - 1):
             exact = simulated(
                 system.phases[0].A,
