@@ -151,9 +151,9 @@ class Batch:
 
     @cached_property
     def moves(self) -> np.ndarray:
-        """Rows ``(evaluation in the batch, coordinate)``, ``(k, 2)``: the coordinates in which each point differs from
-        the current point.
+        """Coordinates in which each point moved: rows ``(evaluation in the batch, coordinate)``, as ``(k, 2)``.
 
+        A point has moved in a coordinate where it differs from the current point.
         The current point is the last accepted point where the maximiser notes ``accepted``, and the previous point
         where it does not. The first point of a search has no current point, and has no rows.
         """
