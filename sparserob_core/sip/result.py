@@ -195,7 +195,7 @@ class Result:
     worst : WorstConstraint, optional
         The most violated constraint at the decision.
     indices : sequence of Cut
-        Constraints that the last relaxed program imposed.
+        Imposed constraints of the last relaxed program, with their multipliers.
     counts : mapping of str to int
         Numbers of programs, rounds and the like.
     solved_by : mapping of str to int

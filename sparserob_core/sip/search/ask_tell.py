@@ -32,7 +32,7 @@ Key: TypeAlias = tuple[float, ...]
 
 FORMAT = 1
 WORDS = {np.inf: "inf", -np.inf: "-inf"}
-GRACE = 5.0  # seconds that a maximiser may take to end; one of its steps in many coordinates may take a tenth of it
+GRACE = 5.0  # seconds that a maximiser may take to end; in many coordinates one of its steps may take a tenth or more
 LATER = {  # keys that older states lack, with their defaults
     "minimise": False,
     "integer": [],
